@@ -22,7 +22,7 @@ import tifffile
 import xarray as xr
 
 from dbthermal import __main__ as command_line
-from dbthermal import simulation, store
+from dbthermal import schema, simulation, store
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -167,17 +167,26 @@ def test_info_of_stores_and_files(results: Path) -> None:
 def test_raw_files_need_their_form(results: Path) -> None:
     """Raw numbers of a stated form, and lists with a '+', give the same capture."""
     stack = tifffile.imread(results / "a.tif")[:40]
-    (stack.astype(">u2")).tofile(results / "a.raw")
-    np.save(results / "a.npy", stack)
+    for name, part in {"a": stack, "c": stack + 1}.items():
+        part.astype(">u2").tofile(results / f"{name}.raw")
+        np.save(results / f"{name}.npy", part)
     for place in (0, 1):
         tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
     form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
-    done(results, "import", "a.raw", "a.raw", *form, "-o", "numbers.zarr")
-    parts = ["part0.tif", "part1.tif", "+", "a.npy"]
+    done(results, "import", "a.raw", "c.raw", *form, "-o", "numbers.zarr")
+    parts = ["part0.tif", "part1.tif", "+", "c.npy"]
     done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
     for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
-        np.testing.assert_array_equal(counts.values, [stack, stack])
+        np.testing.assert_array_equal(counts.values, [stack, stack + 1])
+    line = refused(results, "import", "a.raw", "a.raw", *form, "-o", "x.zarr")
+    assert "Same counts in both recordings" in line
+    for name in "ac":
+        np.save(results / f"short_{name}.npy", np.load(results / f"{name}.npy")[:5])
+    names = ["import", "short_a.npy", "short_c.npy", "--offset", "0", *STATED, "-o", "short.zarr"]
+    found = run(results, *names)
+    assert found.returncode == 0, found.stderr
+    assert "Warning: The capture has 5 frames. Must be at least 32" in found.stderr
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
     assert "Invalid byte_order" in line
 
@@ -206,9 +215,26 @@ def test_curves_films_pictures(results: Path) -> None:
     assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
+    assert rows[0][-1] == "pixel 12 16 status"
+    assert {row[-1] for row in rows[1:]} == {"no_flag"}
+    status = result["status"].values
+    worst = np.argwhere(status & schema.Status.DEAD_PIXEL)[0].tolist()
+    places = ["--pixel", *map(str, worst), "--region", "0", "24", "0", "32"]
+    done(results, "export", "result.zarr", *places, "-o", "places.csv")
+    with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
+        last = [*csv.DictReader(stream)][-1]
+    assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
+    whole = "rows 0 to 24, columns 0 to 32, measured"
+    assert last[f"{whole} status"] == "no_flag"
+    assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc"):
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
+    np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
+    (results / "out.tif").unlink()
+    line = refused(results, "export", "result.zarr", "-o", "out.tif")
+    assert "There is something at 'out_status.tif'" in line
     with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
