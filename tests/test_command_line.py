@@ -23,7 +23,7 @@ import tifffile
 import xarray as xr
 
 from dbthermal import __main__ as command_line
-from dbthermal import simulation, store
+from dbthermal import schema, simulation, store
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -168,17 +168,26 @@ def test_info_of_stores_and_files(results: Path) -> None:
 def test_raw_files_need_their_form(results: Path) -> None:
     """Raw numbers of a stated form, and lists with a '+', give the same capture."""
     stack = tifffile.imread(results / "a.tif")[:40]
-    (stack.astype(">u2")).tofile(results / "a.raw")
-    np.save(results / "a.npy", stack)
+    for name, part in {"a": stack, "c": stack + 1}.items():
+        part.astype(">u2").tofile(results / f"{name}.raw")
+        np.save(results / f"{name}.npy", part)
     for place in (0, 1):
         tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
     form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
-    done(results, "import", "a.raw", "a.raw", *form, "-o", "numbers.zarr")
-    parts = ["part0.tif", "part1.tif", "+", "a.npy"]
+    done(results, "import", "a.raw", "c.raw", *form, "-o", "numbers.zarr")
+    parts = ["part0.tif", "part1.tif", "+", "c.npy"]
     done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
     for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
-        np.testing.assert_array_equal(counts.values, [stack, stack])
+        np.testing.assert_array_equal(counts.values, [stack, stack + 1])
+    line = refused(results, "import", "a.raw", "a.raw", *form, "-o", "x.zarr")
+    assert "Same counts in both recordings" in line
+    for name in "ac":
+        np.save(results / f"short_{name}.npy", np.load(results / f"{name}.npy")[:5])
+    names = ["import", "short_a.npy", "short_c.npy", "--offset", "0", *STATED, "-o", "short.zarr"]
+    found = run(results, *names)
+    assert found.returncode == 0, found.stderr
+    assert "Warning: The capture has 5 frames. Must be at least 32" in found.stderr
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
     assert "Invalid byte_order" in line
 
@@ -207,9 +216,26 @@ def test_curves_films_pictures(results: Path) -> None:
     assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
+    assert rows[0][-1] == "pixel 12 16 status"
+    assert {row[-1] for row in rows[1:]} == {"no_flag"}
+    status = result["status"].values
+    worst = np.argwhere(status & schema.Status.DEAD_PIXEL)[0].tolist()
+    places = ["--pixel", *map(str, worst), "--region", "0", "24", "0", "32"]
+    done(results, "export", "result.zarr", *places, "-o", "places.csv")
+    with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
+        last = [*csv.DictReader(stream)][-1]
+    assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
+    whole = "rows 0 to 24, columns 0 to 32, measured"
+    assert last[f"{whole} status"] == "no_flag"
+    assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc"):
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
+    np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
+    (results / "out.tif").unlink()
+    line = refused(results, "export", "result.zarr", "-o", "out.tif")
+    assert "There is something at 'out_status.tif'" in line
     with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
@@ -335,6 +361,13 @@ REFUSED = {
     ),
     "Damaged TIFF": f"{ONE} -o x.zarr".replace("b.", "text."),
     "Invalid unit": f"{ONE} --unit celsius -o x.zarr",
+    "Same counts in both recordings": f"{ONE} --offset 0 -o x.zarr".replace("b.", "a."),
+    "Warning: The medians of both bands, over 100": (
+        f"{ONE} --offset 0 -o hundredths.zarr".replace("a.", "warm.").replace("b.", "cold.")
+    ),
+    "Warning: The capture has 5 frames": (
+        f"{ONE} --offset 0 -o five.zarr".replace("a.", "five.").replace("b.", "few.")
+    ),
     "Different sizes ... of the bands": f"{ONE} --offset 0 -o x.zarr".replace("b.", "small."),
     "Unknown dates of the recordings": f"{ONE} -o x.zarr",
     "Invalid offset ... do not overlap": f"{ONE} --offset 500 -o x.zarr",
@@ -357,6 +390,14 @@ def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
     """Every message that docs/own_captures.md lists is what a command answers to such a mistake."""
     stack = tifffile.imread(results / "b.tif")
     mistakes = {"8": stack.astype("u1"), "f": stack / np.float32(100), "small": stack[:, :-1]}
+    kelvin = np.linspace(29300, 29700, stack[0].size).reshape(stack[0].shape).astype("u2")
+    hundredths = np.repeat(kelvin[np.newaxis], 40, axis=0)
+    mistakes |= {
+        "warm": hundredths,
+        "cold": hundredths - np.uint16(9),
+        "five": stack[:5],
+        "few": stack[5:10],
+    }
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
     (results / "text.tif").write_text("hello", encoding="utf-8")

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
 from dbthermal._cli import PLUS, is_source, leaves
+from dbthermal._warnings import warned
 
 _MADE_BY = {
     "capture": "import",
@@ -19,6 +20,7 @@ _MADE_BY = {
     "response": "calibrate",
     "separated": "separate",
 }
+_FEWEST = 32  # frames of a capture
 _TIFF = {".tif", ".tiff", ".btf"}
 _NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
 _ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
@@ -93,7 +95,11 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     """Command `import`."""
-    return saved(capture(options.files, options, options.offset), options)
+    made = capture(options.files, options, options.offset)
+    if (frames := made.sizes["time"]) < _FEWEST:
+        rule = f"Must be at least {_FEWEST} to be separated, better 200 to 400"
+        made = warned(made, f"The capture has {frames} frames. {rule}.")
+    return saved(made, options)
 
 
 def saved(
