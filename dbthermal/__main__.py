@@ -80,7 +80,7 @@ shown path*             its capture, and the cameras' response, to be shown besi
 materials text*         as listed by 'data'; all by default
 --output path!          what is made: store *.zarr, or of the kind that the examples below have
 --overwrite flag        replace the output
---dry-run flag          only say what would be read and written
+--dry-run flag          only say what would be read, with sizes, and written
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
 --bands text2           names of both bands: 8-14 9.5
@@ -321,7 +321,8 @@ def _carry_out(options: argparse.Namespace) -> int:
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     if options.dry_run:
-        summary = {"would_read": [*map(str, sources)], "would_write": [*map(str, targets)]}
+        foreseen = import_module("dbthermal._cli.steps").foreseen
+        summary = foreseen(options, sources, targets)
     else:
         began = time.monotonic()
         summary = _function(options)(options)

@@ -284,7 +284,14 @@ def test_nothing_is_overwritten(results: Path) -> None:
     """A dry run writes nothing; an output that is there is kept, unless it may be replaced."""
     command = ["correct", "scene.zarr", "nuc.zarr", "-o", "again.zarr"]
     planned = done(results, *command, "--dry-run")
-    assert planned == {"would_read": ["scene.zarr", "nuc.zarr"], "would_write": ["again.zarr"]}
+    assert planned["would_write"] == ["again.zarr"]
+    assert planned["would_read"]["scene.zarr"]["sizes"] == {
+        "band": 2,
+        "time": 200,
+        "y": 24,
+        "x": 32,
+    }
+    assert planned["would_read"]["nuc.zarr"]["stage"] == "correction"
     assert not (results / "again.zarr").exists()
     shutil.copytree(results / "response.zarr", results / "again.zarr")
     before = store.checksum(results / "again.zarr")
@@ -313,6 +320,20 @@ def test_no_correction_must_be_stated(results: Path) -> None:
     assert max(store.open_dataset(results / "corrected.zarr").attrs["fixed_pattern"]) < 0.5
     raw = store.open_dataset(results / "scene.zarr")["counts"][:, 0]
     np.testing.assert_allclose(made["counts"][:, 0], raw)
+
+
+def test_a_dry_run_says_what_is_at_hand(results: Path) -> None:
+    """Stages, bands and frames of stores and files, and what a separation takes; nothing is made."""
+    command = ["separate", "aligned.zarr", "response.zarr", "-o", "dry.zarr", "--dry-run"]
+    planned = done(results, *command)
+    stages = {path: one["stage"] for path, one in planned["would_read"].items()}
+    assert stages == {"aligned.zarr": "corrected", "response.zarr": "response"}
+    assert 0.45 < planned["memory_at_most_GB"] < 1
+    made = done(results, "import", "a.tif", "b.tif", *STATED, "--offset", "0", *command[-3:])
+    assert made["would_read"]["a.tif"] == {"bytes": (results / "a.tif").stat().st_size}
+    assert made["would_be"]["bands"] == ["8-14", "9.5"]
+    assert made["would_be"]["sizes"]["time"] == 200
+    assert not (results / "dry.zarr").exists()
 
 
 def test_refusals_are_one_line(results: Path) -> None:

@@ -141,8 +141,8 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     return {str(paths[0]): summary(dataset, everything=True)}
 
 
-def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
-    """Stage, sizes, clock, bands and flags of a dataset; and everything else, if that is wanted."""
+def outline(dataset: xr.Dataset) -> dict[str, Any]:
+    """Stage, sizes, bands and clock of a dataset."""
     said: dict[str, Any] = {"stage": _stage(dataset), "sizes": dict(dataset.sizes)}
     if "band" in dataset.coords:
         said["bands"] = [str(band) for band in np.atleast_1d(dataset["band"].values)]
@@ -150,6 +150,12 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
         time = dataset["time"].values
         said["seconds"] = round(float(time[-1] - time[0]), 6)
         said["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
+    return said
+
+
+def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
+    """Outline and flags of a dataset; and everything else, if that is wanted."""
+    said = outline(dataset)
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             said[f"{name}_shares"] = _shares(dataset[name])

@@ -1,6 +1,7 @@
 """Steps from a capture to a result, the plan of a capture, and the data of the package."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,19 @@ from dbthermal import (
     separation,
 )
 from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import capture, described, opened, provenance, saved, staged
+from dbthermal._cli.files import (
+    capture,
+    described,
+    opened,
+    outline,
+    provenance,
+    saved,
+    staged,
+)
 from dbthermal._warnings import warned
+from dbthermal.scene import _SAMPLE
 from dbthermal.separation._plausibility import against_response, hardly_measured
+from dbthermal.separation._run import _BASE
 
 _REGISTERED = 200  # frames whose mean is registered
 
@@ -189,6 +200,27 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
         result, source, response, result.get("material"), **_known(options)
     )
     return saved(completed, options)
+
+
+def foreseen(
+    options: argparse.Namespace, sources: list[Path], targets: list[Path]
+) -> dict[str, Any]:
+    """What a command would read and write, and the memory that a separation takes at most."""
+    read = dict[str, Any]()
+    for path in sources:
+        inside = [one for one in (path, *path.rglob("*")) if one.is_file()]
+        read[str(path)] = {"bytes": sum(one.stat().st_size for one in inside)}
+        if (path / "zarr.json").is_file():
+            read[str(path)] |= outline(opened(path))
+    said = {"would_read": read, "would_write": [*map(str, targets)]}
+    if options.command == "import":
+        said["would_be"] = outline(capture(options.files, options, options.offset))
+    if options.command == "separate":
+        sizes = read[str(options.capture)].get("sizes", {})
+        byte = _BASE + _SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
+        most = 3e9 if options.correction else 2e9 if options.method else math.inf  # by rows
+        said["memory_at_most_GB"] = round(min(byte, most) / 1e9, 1)
+    return said
 
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:
