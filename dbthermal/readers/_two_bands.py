@@ -126,7 +126,19 @@ def two_bands(
         "files": {name: dict(one.attrs) for name, one in zip(names, pair, strict=True)},
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
-    return warned(capture, *_temperatures(parts))
+    borders = [_border(part, name) for part, name in zip(parts, names, strict=True)]
+    return warned(capture, *_temperatures(parts), *filter(None, borders))
+
+
+def _border(part: npt.NDArray[np.uint16], name: str) -> str:
+    """Sentence on rows and columns at the border of a band that have one value in all frames."""
+    some = part[:: 1 + len(part) // _FRAMES]
+    padded = (some == some[0, 0, 0]) | (some == some[0, -1, -1])
+    rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
+    if rows == padded.shape[1] or not rows + columns:
+        return ""
+    found = f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
+    return f"{found}: a border, which is no measurement. Its pixels are flagged; better cropped."
 
 
 def _temperatures(parts: list[npt.NDArray[np.uint16]]) -> list[str]:

@@ -39,6 +39,18 @@ def pair(tmp_path: Path) -> tuple[xr.Dataset, xr.Dataset]:
     return first, recorded(tmp_path / "b.seq", scene(30) + 1, 1.5e9 + 0.25, 12.5, {0x58: 16000.0})
 
 
+def test_a_border_is_noticed() -> None:
+    """Rows and columns that pad an image are counted in a warning, which stays with the capture."""
+    pads = ((0, 0), (4, 4), (0, 3))
+    padded = [np.pad(scene(20) + n, pads, constant_values=n) for n in (0, 1)]
+    pair = [readers.array(one.astype("u2"), unit="count", clock=10.0) for one in padded]
+    expected = "8 rows and 3 columns of band '9.5' have one value in all frames: a border"
+    with pytest.warns(UserWarning, match="a border") as told:
+        capture = readers.two_bands(*pair, bands=BANDS, offset=0.0)
+    assert [str(one.message).startswith(expected) for one in told] == [False, True]
+    assert capture.attrs["warnings"] == [str(one.message) for one in told]
+
+
 def test_both_clocks_are_kept(pair: tuple[xr.Dataset, xr.Dataset], tmp_path: Path) -> None:
     """Each band keeps its frames and times; the shorter is filled, flagged, and without times."""
     capture = readers.two_bands(*pair, bands=BANDS)
