@@ -44,7 +44,6 @@ def test_rows_are_read_as_an_array(monkeypatch: pytest.MonkeyPatch, place: dict[
     assert max(rows.stop for rows in computed) <= np.max(wanted) + 1
 
 
-@pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Computed by rows, the counts, status and all else are those computed at once."""
     rng, rig, shape = np.random.default_rng(2), simulation.Rig(bad_fraction=0.01), (24, 28)
