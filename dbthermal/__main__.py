@@ -271,7 +271,15 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
+    told = set[str]()
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        """Print a warning, once."""
+        if str(message) not in told:
+            print(f"Warning: {message}", file=sys.stderr)
+        told.add(str(message))
+
+    warnings.showwarning = tell
     options = _parsed(arguments)
     try:
         return _carry_out(options)

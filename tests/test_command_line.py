@@ -493,6 +493,16 @@ def test_a_misspelt_name_is_recognised(results: Path, arguments: str, meant: str
     assert found.stderr.rstrip().endswith(f"Did you mean '{meant}'?")
 
 
+def test_a_warning_is_said_once(results: Path) -> None:
+    """A border in the files of every temperature is one line for each band."""
+    for name in ("a5", "b5", "a70", "b70"):
+        stack = np.pad(tifffile.imread(results / f"{name}.tif"), ((0, 0), (3, 0), (0, 0)))
+        tifffile.imwrite(results / f"padded_{name}.tif", stack, photometric="minisblack")
+    at = "--at 5C padded_a5.tif padded_b5.tif --at 70C padded_a70.tif padded_b70.tif"
+    found = run(results, "calibrate", *at.split(), *STATED, "-o", "border.zarr")
+    assert found.stderr.count("Warning: 3 rows and 0 columns of band") == 2
+
+
 def test_what_has_no_time_makes_no_curve(results: Path) -> None:
     """The names for a curve are those over time, which a map is not."""
     line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")

@@ -205,7 +205,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
 def foreseen(
     options: argparse.Namespace, sources: list[Path], targets: list[Path]
 ) -> dict[str, Any]:
-    """What a command would read and write, and the memory that a separation takes at most."""
+    """Inputs and outputs of a command, and the memory that a separation takes at most."""
     read = dict[str, Any]()
     for path in sources:
         inside = [one for one in (path, *path.rglob("*")) if one.is_file()]
