@@ -80,7 +80,7 @@ shown path*             its capture, and the cameras' response, to be shown besi
 materials text*         as listed by 'data'; all by default
 --output path!          what is made: store *.zarr, or of the kind that the examples below have
 --overwrite flag        replace the output
---dry-run flag          only say what would be read and written
+--dry-run flag          only say what would be read, with sizes, and written
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
 --bands text2           names of both bands: 8-14 9.5
@@ -271,7 +271,15 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
+    told = set[str]()
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        """Print a warning, once."""
+        if str(message) not in told:
+            print(f"Warning: {message}", file=sys.stderr)
+        told.add(str(message))
+
+    warnings.showwarning = tell
     options = _parsed(arguments)
     try:
         return _carry_out(options)
@@ -295,8 +303,7 @@ def _reason(error: Exception, command: str) -> str:
     extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
     if isinstance(error, ImportError) and extra:
         extra = command if command == "report" else extra  # which has all that it needs
-        rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
-        return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
+        return str(import_module("dbthermal._text").missing_library(error.name, extra))
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
         return message
@@ -322,7 +329,8 @@ def _carry_out(options: argparse.Namespace) -> int:
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     if options.dry_run:
-        summary = {"would_read": [*map(str, sources)], "would_write": [*map(str, targets)]}
+        foreseen = import_module("dbthermal._cli.steps").foreseen
+        summary = foreseen(options, sources, targets)
     else:
         began = time.monotonic()
         summary = _function(options)(options)

@@ -85,6 +85,12 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 
+def missing_library(name: str | None, extra: str) -> str:
+    """Message that a library is not installed, with the command that installs its extra."""
+    command = f"python -m pip install 'dbthermal[{extra}]'"
+    return f"Missing library '{name}', of the extra '{extra}'. Must be installed: {command}."
+
+
 def repeated(values: Iterable[Any]) -> list[Any]:
     """Values that occur more than once, in their order."""
     return [value for value, count in Counter(values).items() if count > 1]

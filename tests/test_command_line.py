@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import warnings
 from collections.abc import Sequence
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from io import StringIO
@@ -22,7 +23,7 @@ import tifffile
 import xarray as xr
 
 from dbthermal import __main__ as command_line
-from dbthermal import simulation, store
+from dbthermal import schema, simulation, store
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -167,17 +168,26 @@ def test_info_of_stores_and_files(results: Path) -> None:
 def test_raw_files_need_their_form(results: Path) -> None:
     """Raw numbers of a stated form, and lists with a '+', give the same capture."""
     stack = tifffile.imread(results / "a.tif")[:40]
-    (stack.astype(">u2")).tofile(results / "a.raw")
-    np.save(results / "a.npy", stack)
+    for name, part in {"a": stack, "c": stack + 1}.items():
+        part.astype(">u2").tofile(results / f"{name}.raw")
+        np.save(results / f"{name}.npy", part)
     for place in (0, 1):
         tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
     form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
-    done(results, "import", "a.raw", "a.raw", *form, "-o", "numbers.zarr")
-    parts = ["part0.tif", "part1.tif", "+", "a.npy"]
+    done(results, "import", "a.raw", "c.raw", *form, "-o", "numbers.zarr")
+    parts = ["part0.tif", "part1.tif", "+", "c.npy"]
     done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
     for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
-        np.testing.assert_array_equal(counts.values, [stack, stack])
+        np.testing.assert_array_equal(counts.values, [stack, stack + 1])
+    line = refused(results, "import", "a.raw", "a.raw", *form, "-o", "x.zarr")
+    assert "Same counts in both recordings" in line
+    for name in "ac":
+        np.save(results / f"short_{name}.npy", np.load(results / f"{name}.npy")[:5])
+    names = ["import", "short_a.npy", "short_c.npy", "--offset", "0", *STATED, "-o", "short.zarr"]
+    found = run(results, *names)
+    assert found.returncode == 0, found.stderr
+    assert "Warning: The capture has 5 frames. Must be at least 32" in found.stderr
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
     assert "Invalid byte_order" in line
 
@@ -206,9 +216,26 @@ def test_curves_films_pictures(results: Path) -> None:
     assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
+    assert rows[0][-1] == "pixel 12 16 status"
+    assert {row[-1] for row in rows[1:]} == {"no_flag"}
+    status = result["status"].values
+    worst = np.argwhere(status & schema.Status.DEAD_PIXEL)[0].tolist()
+    places = ["--pixel", *map(str, worst), "--region", "0", "24", "0", "32"]
+    done(results, "export", "result.zarr", *places, "-o", "places.csv")
+    with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
+        last = [*csv.DictReader(stream)][-1]
+    assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
+    whole = "rows 0 to 24, columns 0 to 32, measured"
+    assert last[f"{whole} status"] == "no_flag"
+    assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc"):
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
+    np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
+    (results / "out.tif").unlink()
+    line = refused(results, "export", "result.zarr", "-o", "out.tif")
+    assert "There is something at 'out_status.tif'" in line
     with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
@@ -257,7 +284,9 @@ def test_nothing_is_overwritten(results: Path) -> None:
     """A dry run writes nothing; an output that is there is kept, unless it may be replaced."""
     command = ["correct", "scene.zarr", "nuc.zarr", "-o", "again.zarr"]
     planned = done(results, *command, "--dry-run")
-    assert planned == {"would_read": ["scene.zarr", "nuc.zarr"], "would_write": ["again.zarr"]}
+    assert planned["would_write"] == ["again.zarr"]
+    assert planned["would_read"]["scene.zarr"]["sizes"]["time"] == 200
+    assert planned["would_read"]["nuc.zarr"]["stage"] == "correction"
     assert not (results / "again.zarr").exists()
     shutil.copytree(results / "response.zarr", results / "again.zarr")
     before = store.checksum(results / "again.zarr")
@@ -286,6 +315,20 @@ def test_no_correction_must_be_stated(results: Path) -> None:
     assert max(store.open_dataset(results / "corrected.zarr").attrs["fixed_pattern"]) < 0.5
     raw = store.open_dataset(results / "scene.zarr")["counts"][:, 0]
     np.testing.assert_allclose(made["counts"][:, 0], raw)
+
+
+def test_a_dry_run_says_what_is_at_hand(results: Path) -> None:
+    """Stages, bands and frames of what is read, and a separation's memory; nothing is made."""
+    command = ["separate", "aligned.zarr", "response.zarr", "-o", "dry.zarr", "--dry-run"]
+    planned = done(results, *command)
+    stages = {path: one["stage"] for path, one in planned["would_read"].items()}
+    assert stages == {"aligned.zarr": "corrected", "response.zarr": "response"}
+    assert 0.45 < planned["memory_at_most_GB"] < 1
+    made = done(results, "import", "a.tif", "b.tif", *STATED, "--offset", "0", *command[-3:])
+    assert made["would_read"]["a.tif"] == {"bytes": (results / "a.tif").stat().st_size}
+    assert made["would_be"]["bands"] == ["8-14", "9.5"]
+    assert made["would_be"]["sizes"]["time"] == 200
+    assert not (results / "dry.zarr").exists()
 
 
 def test_refusals_are_one_line(results: Path) -> None:
@@ -323,6 +366,90 @@ def test_missing_extras_are_named(
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert f"pip install 'dbthermal[{extra}]'" in line
+
+
+ONE = f"import a.tif b.tif {' '.join(STATED)}"
+SWEEP = f"calibrate {' '.join(STATED)} --at 5C a5.tif b5.tif --at 70C a70.tif b70.tif -o x.zarr"
+REFUSED = {
+    "Invalid TIFF ... Invalid bits of a pixel 8": f"{ONE} --offset 0 -o x.zarr".replace("b.", "8."),
+    "Invalid TIFF ... Must be 16-bit counts, not temperatures": f"{ONE} -o x.zarr".replace(
+        "b.", "f."
+    ),
+    "Damaged TIFF": f"{ONE} -o x.zarr".replace("b.", "text."),
+    "Invalid unit": f"{ONE} --unit celsius -o x.zarr",
+    "Same counts in both recordings": f"{ONE} --offset 0 -o x.zarr".replace("b.", "a."),
+    "Warning: The medians of both bands, over 100": (
+        f"{ONE} --offset 0 -o hundredths.zarr".replace("a.", "warm.").replace("b.", "cold.")
+    ),
+    "Warning: The capture has 5 frames": (
+        f"{ONE} --offset 0 -o five.zarr".replace("a.", "five.").replace("b.", "few.")
+    ),
+    "Different sizes ... of the bands": f"{ONE} --offset 0 -o x.zarr".replace("b.", "small."),
+    "Unknown dates of the recordings": f"{ONE} -o x.zarr",
+    "Invalid offset ... do not overlap": f"{ONE} --offset 500 -o x.zarr",
+    "Invalid levels ... Must rise with its temperature": f"{SWEEP} --at 278C a25.tif b25.tif",
+    "Invalid counts ... Planck curve": (
+        f"{SWEEP} --at 30C a25.tif b25.tif --at 45C a45.tif b45.tif"
+    ),
+    "Invalid correction of gain and offset: neither": "correct scene.zarr -o x.zarr",
+    "Warning: Fixed pattern of": "correct scene.zarr --corrected-by-camera -o none.zarr",
+    "Invalid clock": f"{ONE} --clock 0 -o x.zarr",
+    "Invalid capture ... of stage ... Must be of stage": "align scene.zarr -o x.zarr",
+    "Missing time offset ... no rapid change that both bands see": (
+        f"{ONE} --offset 3 -o later.zarr; correct later.zarr nuc.zarr -o late.zarr; "
+        "align late.zarr --register none -o x.zarr"
+    ),
+}
+
+
+def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
+    """Every message that docs/own_captures.md lists is what a command answers to such a mistake."""
+    stack = tifffile.imread(results / "b.tif")
+    mistakes = {"8": stack.astype("u1"), "f": stack / np.float32(100), "small": stack[:, :-1]}
+    kelvin = np.linspace(29300, 29700, stack[0].size).reshape(stack[0].shape).astype("u2")
+    hundredths = np.repeat(kelvin[np.newaxis], 40, axis=0)
+    mistakes |= {
+        "warm": hundredths,
+        "cold": hundredths - np.uint16(9),
+        "five": stack[:5],
+        "few": stack[5:10],
+    }
+    for name, wrong in mistakes.items():
+        tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    (results / "text.tif").write_text("hello", encoding="utf-8")
+    page = (ROOT / "docs" / "own_captures.md").read_text(encoding="utf-8")
+    table = page.partition("| the message begins")[2]
+    assert re.findall(r"(?m)^\| `(.+?)` \|", table) == [*REFUSED]
+    for message, commands in REFUSED.items():
+        for command in commands.split("; "):
+            with warnings.catch_warnings(action="always"):
+                _, _, error = said(results, *command.split())
+        begin = ".*".join(map(re.escape, message.split(" ... ")))
+        assert re.search(rf"(?m)^(dbthermal \w+: )?{begin}", error), error
+
+
+def test_compiling_is_noticed_once(tmp_path: Path) -> None:
+    """What is compiled anew, however much, is one line on the standard error."""
+    code = """if True:
+    from dbthermal._cli import compiling
+    from numba import njit
+    compiling.tell()
+    for power in (1, 2):
+        assert njit(lambda x: x**power)(3) == 3**power
+    """
+    found = run(tmp_path, "data", before=f"exec({code!r}); ")
+    told, took = found.stderr.splitlines()
+    assert told == "Compiling the separation, once after an installation: about a minute."
+    assert took.startswith("data: ")
+
+
+def test_the_explorer_says_what_it_lacks(tmp_path: Path) -> None:
+    """Without the explorer's extra, its notebook comes with the command that installs it."""
+    (tmp_path / "a.zarr").mkdir()
+    command = ["explore", "a.zarr", "--overwrite", "-o", "a.ipynb"]
+    for missing in ("anywidget", "jupyterlab"):
+        found = run(tmp_path, *command, before=f"sys.modules['{missing}'] = None; ")
+        assert "opened by: python -m pip install 'dbthermal[explorer]' jupyter" in found.stdout
 
 
 @pytest.mark.parametrize(
@@ -364,6 +491,16 @@ def test_a_misspelt_name_is_recognised(results: Path, arguments: str, meant: str
     found = run(results, *arguments.split())
     assert found.returncode > 0
     assert found.stderr.rstrip().endswith(f"Did you mean '{meant}'?")
+
+
+def test_a_warning_is_said_once(results: Path) -> None:
+    """A border in the files of every temperature is one line for each band."""
+    for name in ("a5", "b5", "a70", "b70"):
+        stack = np.pad(tifffile.imread(results / f"{name}.tif"), ((0, 0), (3, 0), (0, 0)))
+        tifffile.imwrite(results / f"padded_{name}.tif", stack, photometric="minisblack")
+    at = "--at 5C padded_a5.tif padded_b5.tif --at 70C padded_a70.tif padded_b70.tif"
+    found = run(results, "calibrate", *at.split(), *STATED, "-o", "border.zarr")
+    assert found.stderr.count("Warning: 3 rows and 0 columns of band") == 2
 
 
 def test_what_has_no_time_makes_no_curve(results: Path) -> None:

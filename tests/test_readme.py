@@ -22,7 +22,7 @@ def test_the_ten_lines_run(
         np.linspace(273.15, 343.15, 8), dims="temperature", attrs={"units": "K"}
     )
     temperature = temperature.assign_coords(temperature=temperature)
-    store.save(counts(response, temperature).to_dataset(), tmp_path / "blackbody.zarr", {})
+    store.save(counts(response, temperature).to_dataset(name="level"), tmp_path / "nuc.zarr", {})
     store.save(corrected, tmp_path / "aligned.zarr", {})
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)

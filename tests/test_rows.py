@@ -44,7 +44,6 @@ def test_rows_are_read_as_an_array(monkeypatch: pytest.MonkeyPatch, place: dict[
     assert max(rows.stop for rows in computed) <= np.max(wanted) + 1
 
 
-@pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Computed by rows, the counts, status and all else are those computed at once."""
     rng, rig, shape = np.random.default_rng(2), simulation.Rig(bad_fraction=0.01), (24, 28)
@@ -79,3 +78,21 @@ def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch
         xr.testing.assert_identical(
             whole.drop_vars("pattern_std"), by_rows.load().drop_vars("pattern_std")
         )
+
+
+@pytest.mark.filterwarnings("ignore:Fixed pattern")
+def test_rows_without_a_good_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A border of one value makes no deviation unknown, and no warning of NumPy, by rows either."""
+    rng, rig, shape = np.random.default_rng(3), simulation.Rig(bad_fraction=0.0), (24, 28)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    scene = simulation.walkers(np.arange(60) / 10.0, shape, glass, rng)
+    detector = simulation.pattern(rig, shape, rng)
+    movies = simulation.blackbody_movies(rig, np.array([280.0, 310.0, 340.0]), 16, detector, rng)
+    fitted = correction.fit_correction(correction.blackbody_statistics(movies))
+    raw = simulation.capture(simulation.observe(scene, rig.response(), rng), detector)
+    raw["counts"].values[:, :, :8] = 0
+    whole = correction.correct_capture(raw, fitted)["pattern_std"].values
+    monkeypatch.setattr(_rows, "_BLOCK", 2 * 60 * 28 * 4)  # four rows
+    by_rows = correction.correct_capture(raw, fitted, lazy=True)["pattern_std"].values
+    assert np.all(whole > 0)
+    np.testing.assert_allclose(by_rows, whole, rtol=0.02)

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import explorer, store
+from dbthermal import explorer, schema, store
 from dbthermal._cli.files import opened, provenance
 
 
@@ -26,14 +27,23 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     if options.variable not in names:
         kind = f"variable '{options.variable}' for {suffix}"
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
-    with store.whole(options.output, suffix) as part:
-        return {str(options.output): _WRITERS[suffix](result, part, options)}
+    outputs = {options.output: options.variable}
+    if suffix in (".tif", *_PICTURES) and "status" in result and options.variable != "status":
+        outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
+    said = {}
+    for path, options.variable in outputs.items():
+        if path.exists() and not options.overwrite:
+            raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+        with store.whole(path, suffix) as part:
+            said[str(path)] = _WRITERS[suffix](result, part, options)
+    return said
 
 
 def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Mean, extremes, deviation and number of pixels of each place over time; else of the image.
+    """Mean, extremes, deviation, number of pixels and status of each place over time.
 
-    Flagged pixels count where they are named one by one, and not in a region.
+    Without a place of the image. Pixels that are named one by one count with their flags, which
+    are named; of a region only those that are measured, without one.
     """
     view, columns = explorer.View(result), dict[str, xr.DataArray]()
     height, width = view.shape
@@ -41,10 +51,14 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
     for top, bottom, left, right in boxes or [(0, height, 0, width)]:
         ((label, region),) = _regions(result, [(top, bottom, left, right)]).items()
         one = bottom - top == right - left == 1
-        curve = view.curve(options.variable, region, pixels="all" if one else "unflagged")
-        where = f"pixel {top} {left}" if one else label
+        curve = view.curve(options.variable, region, pixels="all" if one else "measured")
+        where = f"pixel {top} {left}" if one else f"{label}, measured"
         for name, values in curve.items():
             columns[f"{where} {name} [{values.attrs.get('units', '1')}]"] = values
+        bits = schema.Status(int(view.status[top, left]) if one else 0)
+        flags = " ".join(bit.label for bit in bits) or "no_flag"
+        flags = flags if "status" in view.panes else "unknown"
+        columns[f"{where} status"] = xr.full_like(curve["mean"], flags, dtype=object)
     xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
 
@@ -72,8 +86,12 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
 
 def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Variable at the last time, in degrees Celsius if it is a temperature."""
+    from dbthermal import figures  # noqa: PLC0415 - optional
     from dbthermal.figures import drawing  # noqa: PLC0415 - optional
 
+    if options.variable == "status":
+        store.save_figure(figures.status(result), path, provenance(options))
+        return {"shape": list(result["status"].shape)}
     one = result[options.variable]
     image = one.isel({dim: -1 for dim in one.dims if dim not in ("y", "x")})
     unit = one.attrs.get("units", "1")
@@ -95,6 +113,7 @@ def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, 
     plain = result.drop_encoding()
     for attrs in (plain.attrs, *(one.attrs for one in plain.variables.values())):
         long = {name: one for name, one in attrs.items() if isinstance(one, dict | bool | None)}
+        long |= {name: attrs[name] for name in ("warnings",) if name in attrs}
         attrs.update({name: json.dumps(one) for name, one in long.items()})
     plain.to_netcdf(path, engine="scipy")
     return {"variables": sorted(map(str, result.data_vars))}
@@ -118,8 +137,12 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
     with store.whole(options.output, ".ipynb") as part:
         part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
-    return {str(options.output): f"opened by: jupyter lab {options.output}"}
+    before = ""
+    if any(find_spec(one) is None for one in ("anywidget", "jupyterlab")):
+        before = "python -m pip install 'dbthermal[explorer]' jupyterlab; "
+    return {str(options.output): f"opened by: {before}jupyter lab {options.output}"}
 
 
+_PICTURES = (".png", ".pdf", ".svg")
 _WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
-_WRITERS |= dict.fromkeys((".png", ".pdf", ".svg"), _picture)
+_WRITERS |= dict.fromkeys(_PICTURES, _picture)

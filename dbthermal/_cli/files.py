@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
 from dbthermal._cli import PLUS, is_source, leaves
+from dbthermal._warnings import warned
 
 _MADE_BY = {
     "capture": "import",
@@ -19,6 +20,7 @@ _MADE_BY = {
     "response": "calibrate",
     "separated": "separate",
 }
+_FEWEST = 32  # frames of a capture
 _TIFF = {".tif", ".tiff", ".btf"}
 _NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
 _ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
@@ -93,7 +95,11 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     """Command `import`."""
-    return saved(capture(options.files, options, options.offset), options)
+    made = capture(options.files, options, options.offset)
+    if (frames := made.sizes["time"]) < _FEWEST:
+        rule = f"Must be at least {_FEWEST} to be separated, better 200 to 400"
+        made = warned(made, f"The capture has {frames} frames. {rule}.")
+    return saved(made, options)
 
 
 def saved(
@@ -135,8 +141,8 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     return {str(paths[0]): summary(dataset, everything=True)}
 
 
-def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
-    """Stage, sizes, clock, bands and flags of a dataset; and everything else, if that is wanted."""
+def outline(dataset: xr.Dataset) -> dict[str, Any]:
+    """Stage, sizes, bands and clock of a dataset."""
     said: dict[str, Any] = {"stage": _stage(dataset), "sizes": dict(dataset.sizes)}
     if "band" in dataset.coords:
         said["bands"] = [str(band) for band in np.atleast_1d(dataset["band"].values)]
@@ -144,6 +150,12 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
         time = dataset["time"].values
         said["seconds"] = round(float(time[-1] - time[0]), 6)
         said["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
+    return said
+
+
+def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
+    """Outline and flags of a dataset; and everything else, if that is wanted."""
+    said = outline(dataset)
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             said[f"{name}_shares"] = _shares(dataset[name])

@@ -1,6 +1,7 @@
 """Steps from a capture to a result, the plan of a capture, and the data of the package."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,19 @@ from dbthermal import (
     separation,
 )
 from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import capture, described, opened, provenance, saved, staged
+from dbthermal._cli.files import (
+    capture,
+    described,
+    opened,
+    outline,
+    provenance,
+    saved,
+    staged,
+)
 from dbthermal._warnings import warned
+from dbthermal.scene import _SAMPLE
 from dbthermal.separation._plausibility import against_response, hardly_measured
+from dbthermal.separation._run import _BASE
 
 _REGISTERED = 200  # frames whose mean is registered
 
@@ -116,6 +127,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         options.register = options.register or "homography"
     _refuse_unused(options)
     source, response, *fitted = staged(options, **stages)
+    _tell_of_compiling()
     response.load()
     known, shown = _known(options), sys.stderr.isatty()
     if options.correction:
@@ -167,6 +179,13 @@ def _refuse_unused(options: argparse.Namespace) -> None:
             raise ValueError(f"Unused option --{name}. Must be left out {why}.")
 
 
+def _tell_of_compiling() -> None:
+    """Notice from now on that the separation is compiled."""
+    from dbthermal._cli import compiling  # noqa: PLC0415 - takes long
+
+    compiling.tell()
+
+
 def _known(options: argparse.Namespace) -> dict[str, Any]:
     """Options of the completion, and the number of threads."""
     return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
@@ -176,10 +195,32 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (one.load() for one in staged(options, **stages))
+    _tell_of_compiling()
     completed = separation.complete(
         result, source, response, result.get("material"), **_known(options)
     )
     return saved(completed, options)
+
+
+def foreseen(
+    options: argparse.Namespace, sources: list[Path], targets: list[Path]
+) -> dict[str, Any]:
+    """Inputs and outputs of a command, and the memory that a separation takes at most."""
+    read = dict[str, Any]()
+    for path in sources:
+        inside = [one for one in (path, *path.rglob("*")) if one.is_file()]
+        read[str(path)] = {"bytes": sum(one.stat().st_size for one in inside)}
+        if (path / "zarr.json").is_file():
+            read[str(path)] |= outline(opened(path))
+    said = {"would_read": read, "would_write": [*map(str, targets)]}
+    if options.command == "import":
+        said["would_be"] = outline(capture(options.files, options, options.offset))
+    if options.command == "separate":
+        sizes = read[str(options.capture)].get("sizes", {})
+        byte = _BASE + _SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
+        most = 3e9 if options.correction else 2e9 if options.method else math.inf  # by rows
+        said["memory_at_most_GB"] = round(min(byte, most) / 1e9, 1)
+    return said
 
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:

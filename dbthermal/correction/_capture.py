@@ -128,8 +128,10 @@ def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.D
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
     whole = xr.concat(parts, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
-        squares = [part["pattern_std"].values ** 2 for part in parts]
-        whole["pattern_std"].values[:] = np.sqrt(np.mean(squares, axis=0))
+        squares = np.array([part["pattern_std"].values ** 2 for part in parts])
+        known = squares[np.isfinite(squares).all(axis=1)]  # not of a border without a good pixel
+        if len(known):
+            whole["pattern_std"].values[:] = np.sqrt(np.mean(known, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
     counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
     dead = sum(part.attrs["dead_pixels"] for part in parts)

@@ -334,7 +334,10 @@ def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> d
 
 
 def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr.DataArray:
-    """Deviation (band) [count] that a correction leaves at the levels of good pixels (y, x)."""
+    """Deviation (band) [count] that a correction leaves at the levels of good pixels (y, x).
+
+    NaN without any of these, as in the rows of a border.
+    """
     names = [str(name) for name in counts["band"].values]
     places = schema.band_positions(correction, names, "the correction")
     offset, gain, centre = (
@@ -342,8 +345,10 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     )
     step = max(1, int(np.cbrt(counts[0].size / _LEVELS)))
     some = counts[:, ::step, ::step, ::step].values.astype(np.float64)
-    level = np.square(some - centre.reshape(-1, 1, 1, 1))
-    level = level.mean(axis=(1, 2, 3), where=good[::step, ::step])
+    some = some[:, :, good[::step, ::step]]
+    level = np.full(len(some), np.nan)
+    if some.size:
+        level = np.square(some - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
     std = np.sqrt(offset**2 + gain**2 * level)
     return xr.DataArray(std, dims="band", attrs=schema.PATTERN_STD.attrs)
 

@@ -60,8 +60,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
     Pattern. What the mean picture has beside planes and edges, from one pixel to the next, is the
-    fixed pattern p of gains and offsets (by the mask of [1]_). A UserWarning says where it is more
-    than 5 m and no less than 0.7 of the same over two pixels, as detail behind a lens would be.
+    fixed pattern p of gains and offsets (by the mask of [1]_), and none, 0, where it is less than
+    0.7 of the same over two pixels, as of detail behind a lens. A UserWarning says where it is more
+    than 5 m in every segment.
 
     Parameters
     ----------
@@ -120,10 +121,12 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
-        level, still = np.empty(image), np.empty(image)
+        segments = np.unique(part)
+        level, still = np.empty(image), np.empty((segments.size, *image))
         for rows in _rows.blocks(movie.shape, _BLOCK):
             block = _samples(movie, rows)
-            level[rows], still[rows] = samples.noise(block), _mean(block)
+            level[rows] = samples.noise(block)
+            still[:, rows] = [_mean(block[part == one]) for one in segments]
         known = np.isfinite(level)
         if not known.any():
             raise ValueError(
@@ -133,7 +136,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         unjudged |= ~known
         usual = np.where(known, level, np.median(level[known]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
-        patterns.append(_pattern(still) / float(np.median(usual)))
+        patterns.append(min(map(_pattern, still)) / float(np.median(usual)))
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)

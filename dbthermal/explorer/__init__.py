@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
+from dbthermal._text import missing_library
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import View
 
@@ -28,9 +29,7 @@ def __getattr__(name: str) -> "type[Explorer]":
     try:
         from dbthermal.explorer._widget import Explorer  # noqa: PLC0415 - asks for the extra
     except ImportError as error:
-        raise ImportError(
-            f"Missing library '{error.name}'. Must be installed: pip install dbthermal[explorer]."
-        ) from error
+        raise ImportError(missing_library(error.name, "explorer")) from error
     return Explorer
 
 

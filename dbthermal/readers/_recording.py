@@ -189,5 +189,4 @@ def optional(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        command = f"python -m pip install 'dbthermal[{extra}]'"
-        raise ImportError(f"Missing library '{module}'. Must be installed: {command}.") from error
+        raise ImportError(texts.missing_library(module, extra)) from error

@@ -32,6 +32,11 @@ _DAMAGE: Final = (
     *(struct.error, OSError, MemoryError),
 )
 _ORDERS: Final = {"<": "little", ">": "big"}
+# A unit of the values in a description: as ImageJ, and as JSON, write it.
+_TEMPERATURES: Final = re.compile(
+    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?"""
+    r"""(m?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
+)
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
 
 
@@ -192,7 +197,10 @@ def _pages(path: Path) -> list[_Page]:
                 total += sum(length for _, length in pages[-1].spans)
                 if total > size:  # as of a chain of pages that returns to itself
                     raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
-            stated = _stated(str(file.pages[0].description))
+            description = str(file.pages[0].description)
+            if stated_unit := _TEMPERATURES.search(description):
+                recordings.check_unit(stated_unit.group(1), path.name)
+            stated = _stated(description)
             if not complaints.empty():  # which tifffile logs, and goes on
                 raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)

@@ -1,12 +1,20 @@
 """Two recordings as one capture of two bands."""
 
 from datetime import datetime
+from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import schema
+from dbthermal._warnings import warned
 from dbthermal.readers._recording import FileFlag
+
+_SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
+_FRAMES: Final = 16  # about as many of them tell
+_ALIKE: Final = 5.0  # between the medians of two bands [K]
 
 
 def two_bands(
@@ -44,7 +52,12 @@ def two_bands(
     ------
     TypeError, ValueError
         If a recording is not one of counts in one band, sizes differ, bands repeat, there is no
-        offset and no date, or the recordings do not overlap in time.
+        offset and no date, the recordings do not overlap in time, or they hold the same counts.
+
+    Warns
+    -----
+    UserWarning
+        If the counts of both bands read as the same temperatures in hundredths of a degree.
 
     Examples
     --------
@@ -52,7 +65,8 @@ def two_bands(
     >>> from dbthermal import readers
     >>> counts = np.arange(18000, 18060, dtype=np.uint16).reshape(5, 3, 4)
     >>> one = readers.array(counts, unit="count", clock=30.0)
-    >>> capture = two_bands(one, one.isel(time=slice(4)), bands=("8-14", "9.5"), offset=0.01)
+    >>> other = readers.array(counts[:4] + 900, unit="count", clock=30.0)
+    >>> capture = two_bands(one, other, bands=("8-14", "9.5"), offset=0.01)
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
@@ -82,6 +96,13 @@ def two_bands(
             f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
             "overlap. Must overlap; give offset= if a camera's clock is wrong."
         )
+    shared = min(one.sizes["time"] for one in pair)
+    parts = [one["counts"].values[:shared] for one in pair]
+    if shared > 1 and np.array_equal(parts[0], parts[1]):
+        raise ValueError(
+            f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
+            "is one file named twice?"
+        )
     frames = max(one.sizes["time"] for one in pair)
     counts = np.empty((2, frames, *shapes[0]), dtype=np.uint16)
     times = np.full((2, frames), np.nan)
@@ -104,7 +125,34 @@ def two_bands(
         "offset_by": "dates" if offset is None else "caller",
         "files": {name: dict(one.attrs) for name, one in zip(names, pair, strict=True)},
     }
-    return schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
+    capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
+    borders = [_border(part, name) for part, name in zip(parts, names, strict=True)]
+    return warned(capture, *_temperatures(parts), *filter(None, borders))
+
+
+def _border(part: npt.NDArray[np.uint16], name: str) -> str:
+    """Sentence on rows and columns at the border of a band that have one value in all frames."""
+    some = part[:: 1 + len(part) // _FRAMES]
+    padded = (some == some[0, 0, 0]) | (some == some[0, -1, -1])
+    rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
+    if rows == padded.shape[1] or not rows + columns:
+        return ""
+    found = f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
+    return f"{found}: a border, which is no measurement. Its pixels are flagged; better cropped."
+
+
+def _temperatures(parts: list[npt.NDArray[np.uint16]]) -> list[str]:
+    """Sentence on counts of two cameras that read as the same temperatures in hundredths."""
+    some = [part[:: 1 + len(part) // _FRAMES].ravel() for part in parts]
+    low, middle, high = np.percentile(some, [1, 50, 99], axis=1)
+    for zero, unit in ((0.0, "degC"), (zero_Celsius, "K")):
+        inside = np.all((low >= 100 * (zero + _SCENE[0])) & (high <= 100 * (zero + _SCENE[1])))
+        if inside and np.ptp(middle) < 100 * _ALIKE:
+            said = " and ".join(f"{one / 100:.1f}" for one in middle)
+            found = f"The medians of both bands, over 100, are temperatures: {said} {unit}"
+            rule = "Must be counts of the detector; should these be alike by chance, go on"
+            return [f"{found}. {rule}."]
+    return []
 
 
 def _check(one: xr.Dataset, name: str) -> None:

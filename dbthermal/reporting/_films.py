@@ -2,12 +2,15 @@
 
 import base64
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, Literal
 
 import matplotlib as mpl
+import matplotlib.image
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from markupsafe import Markup
 
@@ -49,10 +52,21 @@ def video(view: View, title: str, codec: Literal["vp9", "h264"], *, celsius: boo
         panels.append(figures.FilmPanel(values - zero, pane.label, f"[{unit}]"))
     span = float(view.time[-1] - view.time[0])
     rate = min(_FASTEST, max(1.0, (panels[0].values.sizes["time"] - 1) / span)) if span else 1.0
+    middle: list[npt.NDArray[np.uint8]] = []
+
+    def frames() -> Iterator[npt.NDArray[np.uint8]]:
+        """Frames of the film, of which the middle one is kept."""
+        number = panels[0].values.sizes["time"]
+        for index, frame in enumerate(figures.film(panels, title=title)):
+            if index == number // 2:
+                middle.append(frame)
+            yield frame
+
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "film.mp4"
-        store.save_video(figures.film(panels, title=title), path, {}, rate=rate, codec=codec)
-        return film_tag(path, "The scene. Gray: no value.")
+        path, poster = Path(folder) / "film.mp4", Path(folder) / "middle.png"
+        store.save_video(frames(), path, {}, rate=rate, codec=codec)
+        mpl.image.imsave(poster, middle[0])
+        return film_tag(path, "The scene. Gray: no value.", poster)
 
 
 def viewer(view: View, *, celsius: bool) -> Markup:

@@ -13,12 +13,13 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from dbthermal import store
+from dbthermal._text import missing_library
 
 try:
     from jinja2 import Environment, select_autoescape
     from markupsafe import Markup
 except ImportError as error:
-    raise ImportError("A report needs Jinja2: pip install dbthermal[report]") from error
+    raise ImportError(missing_library(error.name, "report")) from error
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def image_tag(image: Figure | str | Path, text: str) -> Markup:
     )
 
 
-def film_tag(path: str | Path, text: str) -> Markup:
+def film_tag(path: str | Path, text: str, poster: str | Path | None = None) -> Markup:
     """Film within the page.
 
     Parameters
@@ -141,12 +142,17 @@ def film_tag(path: str | Path, text: str) -> Markup:
         File ``*.mp4``, as from `store.save_video`.
     text : str
         Caption.
+    poster : str or Path, optional
+        File ``*.png`` that is shown before it plays; its first frame if not given.
     """
     content = base64.b64encode(Path(path).read_bytes()).decode()
+    still = base64.b64encode(Path(poster).read_bytes()).decode() if poster else ""
     return Markup(
-        '<figure><video controls loop muted playsinline src="data:video/mp4;base64,{}"></video>'
+        '<figure><video controls loop muted playsinline{} src="data:video/mp4;base64,{}"></video>'
         "<figcaption>{}</figcaption></figure>"
-    ).format(content, text)
+    ).format(
+        Markup(' poster="data:image/png;base64,{}"').format(still) if still else "", content, text
+    )
 
 
 def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from dbthermal import emissivity, figures, schema
 from dbthermal._arrays import Array
@@ -72,7 +73,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         Corrected capture (band, time, y, x) [count] and the cameras' response: the inputs are shown
         beside the result, as apparent temperatures if both are given.
     regions : mapping of str to explorer.Region, optional
-        Name to region; the whole image if there is none.
+        Name to region, such as ``{"left": explorer.Region("rectangle", ((10, 5), (40, 30)))}`` of
+        two corners (row, column), see `explorer.Region`; the whole image if there is none. Of a
+        region the pixels count that are measured, whose status has no flag.
     materials : Dataset, optional
         Stage `emissivity_table`, whose nearest materials are named; `emissivity.embedded_table` if
         not given.
@@ -90,7 +93,8 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     ImportError
         If a library of the extra `report` is not installed.
     TypeError, ValueError
-        As `explorer.View`; if there is no object temperature, or the path has another ending.
+        As `explorer.View`; if there is no object temperature, a region is not one, or the path has
+        another ending.
 
     Examples
     --------
@@ -107,12 +111,21 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
     result = view.data
+    for name, one in regions.items():
+        if not isinstance(one, Region):
+            raise TypeError(
+                f"Invalid region {name!r}, {one!r}. Must be an explorer.Region, such as "
+                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
+            )
     chosen = dict(regions) or {
-        "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
+        "measured pixels of the whole image": Region(
+            "rectangle", ((0, 0), (view.shape[0], view.shape[1]))
+        )
     }
     shown = [one for one in view.panes if one in FILMS or one.startswith("emissivity ")]
     curves = {
-        name: {pane: view.curve(pane, region) for pane in shown} for name, region in chosen.items()
+        name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
+        for name, region in chosen.items()
     }
     table_ = emissivity.embedded_table() if materials is None else materials
     (rows, columns), frames = view.shape, int(view.time.size)
@@ -172,8 +185,10 @@ def _regions(
         axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
-    yield image_tag(figure, "Means of the regions, and two standard deviations of these means.")
-    head = ["region", "pixels that count", f"object temperature [{unit}]", "its std [K]"]
+    yield image_tag(
+        figure, "Means of the regions' measured pixels, and two standard deviations of these means."
+    )
+    head = ["region", "measured pixels", f"object temperature [{unit}]", "its std [K]"]
     rows = []
     for region in chosen:
         curve = curves[region]["object_temperature"]
@@ -181,8 +196,8 @@ def _regions(
         rows.append([region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), std])
     yield table(head, rows)
     yield (
-        "Pixels with a flag do not count, but those that were completed do. Errors that the pixels "
-        "of a region share are not lessened by their number."
+        "Of a region only measured pixels count: none with a flag, and none that was completed. "
+        "Errors that the pixels of a region share are not lessened by their number."
     )
 
 
@@ -204,7 +219,8 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
             continue
         axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
         row, column = (float(one.mean()) for one in np.nonzero(mask))
-        axes[0, 0].text(column, row, name, color="white", ha="center", va="center", fontsize=9)
+        label = axes[0, 0].text(column, row, name, color="white", ha="center", va="center")
+        label.set_path_effects([withStroke(linewidth=2.5, foreground="black")])
     return figure
 
 
@@ -299,7 +315,7 @@ def _emissivities(regions: Mapping[str, Mapping[str, Any]]) -> Iterator[Markup |
     head = ["region", "nearest materials of the table (distance)"]
     yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
     yield (
-        "Means of the pixels that count. The distance is the root mean square over the bands, in "
+        "Means of the measured pixels. The distance is the root mean square over the bands, in "
         f"standard deviations, to which {_SPREAD} is added for what samples of a material differ. "
         "A near material is no identification: many share two emissivities."
     )

@@ -20,7 +20,7 @@ _REASONS: Final = 3  # flags that are named
 
 
 def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
-    """Where the counts of a capture, or their noise, are not those of its response."""
+    """Doubts about counts of a capture, or their noise, that do not fit its response."""
     found, ratios = list[str](), dict[str, float]()
     counts = schema.check(corrected, "corrected")["counts"]
     if counts.dtype.kind != "f":  # raw counts of pixels that differ

@@ -49,6 +49,7 @@ class _Corrector:
             self.thread.start()
 
 
+@pytest.mark.filterwarnings("ignore:Fixed pattern")  # of an emulated detector without correction
 @pytest.mark.parametrize("telemetry_rows", [2, 0])
 def test_a_correction_is_taken_out_of_its_band(telemetry_rows: int, tmp_path: Path) -> None:
     """A correction is removed from its own band; telemetry marks its first frozen frame."""

@@ -43,7 +43,7 @@ def test_files_of_numpy(tmp_path: Path, order: str, layout: Any) -> None:
 def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
     """A capture's store, which has no array of one band, is said to be a capture."""
     one = read(scene())
-    both = readers.two_bands(one, one, bands=("8-14", "9.5"), offset=0.0)
+    both = readers.two_bands(one, read(scene() + 1), bands=("8-14", "9.5"), offset=0.0)
     store.save(both, tmp_path / "scene.zarr", store.provenance({}))
     expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*two bands is a capture as it is"
     with pytest.raises(ValueError, match=expected):

@@ -96,6 +96,25 @@ def test_unit_must_be_stated(tmp_path: Path) -> None:
         read(path)
 
 
+@pytest.mark.parametrize(
+    "unit", ["C", "degC", "\N{DEGREE SIGN}C", "Celsius", "K", "mK", "centikelvin"]
+)
+def test_unit_of_the_description(tmp_path: Path, unit: str) -> None:
+    """A description whose values are temperatures is refused, as of ImageJ or JSON; others not."""
+    forms = [
+        f"ImageJ=1.54f\nunit=micron\nvunit={unit}\n",
+        f'{{"units": "{unit}"}}',
+        f"unit: {unit}",
+    ]
+    for form in forms:
+        write(tmp_path / "a.tif", scene(), description=form.encode())
+        with pytest.raises(ValueError, match=r"Invalid unit .* of 'a\.tif'\. Must be 'count'"):
+            read(tmp_path / "a.tif")
+    for form in ("unit=micron", "units: counts", "sensor temperature 30 C", "unit=cm"):
+        write(tmp_path / "a.tif", scene(), description=form)
+        read(tmp_path / "a.tif")
+
+
 def test_missing_pages(tmp_path: Path) -> None:
     """A stack that states more images than it holds is refused; so is a chain without an end."""
     write(path := tmp_path / "a.tif", scene())

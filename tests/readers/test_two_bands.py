@@ -36,7 +36,19 @@ def recorded(
 def pair(tmp_path: Path) -> tuple[xr.Dataset, xr.Dataset]:
     """Two recordings, the second with other constants, a quarter of a second later, and shorter."""
     first = recorded(tmp_path / "a.seq", scene(40), 1.5e9, 10.0)
-    return first, recorded(tmp_path / "b.seq", scene(30), 1.5e9 + 0.25, 12.5, {0x58: 16000.0})
+    return first, recorded(tmp_path / "b.seq", scene(30) + 1, 1.5e9 + 0.25, 12.5, {0x58: 16000.0})
+
+
+def test_a_border_is_noticed() -> None:
+    """Rows and columns that pad an image are counted in a warning, which stays with the capture."""
+    pads = ((0, 0), (4, 4), (0, 3))
+    padded = [np.pad(scene(20) + n, pads, constant_values=n) for n in (0, 1)]
+    pair = [readers.array(one.astype("u2"), unit="count", clock=10.0) for one in padded]
+    expected = "8 rows and 3 columns of band '9.5' have one value in all frames: a border"
+    with pytest.warns(UserWarning, match="a border") as told:
+        capture = readers.two_bands(*pair, bands=BANDS, offset=0.0)
+    assert [str(one.message).startswith(expected) for one in told] == [False, True]
+    assert capture.attrs["warnings"] == [str(one.message) for one in told]
 
 
 def test_both_clocks_are_kept(pair: tuple[xr.Dataset, xr.Dataset], tmp_path: Path) -> None:
@@ -55,6 +67,23 @@ def test_both_clocks_are_kept(pair: tuple[xr.Dataset, xr.Dataset], tmp_path: Pat
     store.save(capture, tmp_path / "capture.zarr", {})
     again = store.open_dataset(tmp_path / "capture.zarr")
     assert again.attrs["files"] == capture.attrs["files"]
+
+
+def test_one_camera_twice_is_refused(pair: tuple[xr.Dataset, xr.Dataset]) -> None:
+    """The same counts in both bands are one camera's, be one recording shorter."""
+    with pytest.raises(ValueError, match="is one file named twice"):
+        readers.two_bands(pair[0], pair[0].isel(time=slice(30)), bands=BANDS)
+
+
+@pytest.mark.parametrize(("zero", "unit"), [(0.0, "degC"), (273.15, "K")])
+def test_temperatures_in_hundredths_are_doubted(zero: float, unit: str) -> None:
+    """Whole numbers that read as one temperature in both bands are warned of, others are not."""
+    kelvin = zero + np.random.default_rng(1).normal(30.0, 2.0, (40, 6, 8))
+    counts = [np.rint(100 * (kelvin + apart)).astype(np.uint16) for apart in (0.0, 1.5, 20.0)]
+    one, same, other = (readers.array(part, unit="count", clock=10.0) for part in counts)
+    with pytest.warns(UserWarning, match=rf"over 100, are temperatures: .* {unit}\. Must be"):
+        readers.two_bands(one, same, bands=BANDS, offset=0.0)
+    readers.two_bands(one, other, bands=BANDS, offset=0.0)
 
 
 def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset]) -> None:

@@ -68,6 +68,21 @@ def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
     assert ">simulated<" in page
 
 
+def test_only_measured_pixels_count(tmp_path: Path) -> None:
+    """Completed emissivities, far off here, do not enter the mean of the whole image."""
+    data = scene()
+    data["emissivity"].values[:, 1, :8] = 0.99
+    data.attrs["warnings"] = ["Fixed pattern of 100."]
+    data.attrs["blackbody"] = "4 temperatures of 20.00, 40.00, 60.00, 85.00 degC"
+    dbthermal.report(data, tmp_path / "scene.html")
+    page = (tmp_path / "scene.html").read_text("utf-8")
+    found = numbers(page)["regions"]["measured pixels of the whole image"]
+    assert found["emissivity"]["9.5"] == pytest.approx(0.718)
+    assert "<strong>Fixed pattern of 100.</strong>" in page
+    assert "20.00, 40.00, 60.00, 85.00 degC" in page
+    assert 'poster="data:image/png;base64,' in page
+
+
 def test_same_result_gives_same_bytes(tmp_path: Path) -> None:
     """A result in memory and its store give the same page, twice."""
     store.save(scene(), tmp_path / "scene.zarr", {"commit": "unknown"})
@@ -111,6 +126,13 @@ def test_bad_input_is_named(data: xr.Dataset, name: str, message: str, tmp_path:
     with pytest.raises(ValueError, match=re.escape(message)):
         dbthermal.report(data, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_region_is_refused(tmp_path: Path) -> None:
+    """Numbers in place of a region are refused with a region as an example."""
+    regions: Any = {"left": (10, 40, 5, 30)}
+    with pytest.raises(TypeError, match=r"region 'left', \(10, 40, 5, 30\)\. Must be an explorer"):
+        dbthermal.report(scene(), tmp_path / "scene.html", regions=regions)
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
