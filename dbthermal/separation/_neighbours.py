@@ -26,7 +26,7 @@ from dbthermal.separation._tiles import Material
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
 # Deviations of the blur from which a neighbour has no part in a pixel.
-_REACH: Final = 2.0
+_REACH: Final = 3.0
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
@@ -84,7 +84,7 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
 def materials(
     inputs: Inputs, threads: Executor, bar: Any, *, every: bool = False
 ) -> Material | None:
-    """Ratios and emissivity as of `pool.materials`, of bands that are blurred alike.
+    """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
     Surveyed are the pixels that no neighbour's blur reaches. What twice the blur changes may be as
     much again beyond it: a variance. A material too narrow for it has that of the others.
@@ -99,28 +99,21 @@ def materials(
         alike = replace(inputs, displacement=replace(displacement, blur=blur))
         surveyed = np.where(inner, labels, -1).ravel()
         more = pool.materials(alike, threads, bar, every=every, surveyed=surveyed)
-        found = more if found is None or more is None else _beyond(found, more, inputs)
-    return found
+        found = more if found is None or more is None else _blurred(found, more, inputs)
+    return None if found is None else pool.materials(inputs, threads, bar, known=found)
 
 
-def _beyond(found: Material, more: Material, inputs: Inputs) -> Material:
-    """Materials of more blur, or else of less, with what it changes as a variance."""
-    noise = inputs.noise[inputs.bands][:, np.newaxis]
-    known, slope = np.isfinite(more.ratio[-1]), np.isfinite(more.emissivity)
-    ratio = np.where(known, more.ratio, found.ratio)
-    change = (more.ratio / found.ratio - 1.0)[1:]
-    change = np.where(known, change, np.nanmedian(np.abs(change), axis=1, keepdims=True))
+def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
+    """Materials with the ratios at more blur, and what it changes as a variance of them."""
+    noise, known = inputs.noise[inputs.bands][:, np.newaxis], np.isfinite(more.ratio[-1])
+    change = (more.ratio / less.ratio - 1.0)[1:]
+    usual = np.nanmedian(np.abs(change), axis=1, keepdims=True) if known.any() else 0.0
+    ratio = np.where(known, more.ratio, less.ratio)
     # Eq. 4, solved for sigma^2.
     error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
-    inverse = np.where(known, more.inverse_energy, found.inverse_energy)
-    off = np.where(slope, more.emissivity - found.emissivity, 0.0)
-    return Material(
-        ratio=ratio,
-        inverse_energy=inverse + ((change * ratio[1:]) ** 2 / error).max(axis=0),
-        emissivity=np.where(slope, more.emissivity, found.emissivity),
-        noise_variance=np.where(slope, more.noise_variance, found.noise_variance) + off**2,
-        drift_variance=np.where(slope, more.drift_variance, found.drift_variance),
-    )
+    off = (np.where(known, change, usual) * ratio[1:]) ** 2 / error
+    inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
+    return replace(less, ratio=ratio, inverse_energy=inverse)
 
 
 def shared(

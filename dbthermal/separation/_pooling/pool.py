@@ -36,18 +36,21 @@ def materials(
     *,
     every: bool = False,
     surveyed: Labels | None = None,
+    known: Material | None = None,
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
     Pixels that have an emissivity alone are a selection by their ratios: unless they are nearly
-    all, or `every` is set, all are surveyed again with the ratios of their material. Of labels
-    (pixel) other than its own, -1 for none, the pixels that are `surveyed` for it.
+    all, or `every` is set, all are surveyed again with the ratios of their material. The labels
+    (pixel) of those that are `surveyed`, -1 for others, if not all are. Ratios that are `known`
+    stay.
     """
     whole = inputs.labels
     if whole is None:
         return None
     labels = whole if surveyed is None else surveyed
     selected, blocks = select(labels), inputs.blocks
+    ratios = None if known is None else _of_labels(known, whole)
 
     def pooled(before: Material | None) -> tuple[Material | None, float]:
         """Materials, and the share of their pixels that have an emissivity."""
@@ -58,10 +61,12 @@ def materials(
         places = np.concatenate([place for place, _ in surveys])
         together = surveys[0][1].join([part for _, part in surveys[1:]])
         noise = inputs.noise[inputs.bands]
-        found = estimate(labels[places], int(whole.max()) + 1, together, noise)
+        found = estimate(labels[places], int(whole.max()) + 1, together, noise, ratios)
         told = np.isfinite(together.emissivity).sum() / max((together.frames > 0).sum(), 1)
         return expand(found, whole), told
 
+    if known is not None:
+        return pooled(replace(known, emissivity=np.full_like(known.emissivity, np.nan)))[0]
     material, told = pooled(None)
     if material is None or every or told > _MOST_TOLD:
         return material
@@ -110,14 +115,22 @@ def expand(materials: Material, labels: Labels) -> Material:
     return Material(*(np.where(labels >= 0, value[..., labels], np.nan) for value in values))
 
 
-def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Material:
+def _of_labels(material: Material, labels: Labels) -> Material:
+    """Materials from those at the pixels of given labels (pixel,): the inverse of `expand`."""
+    pixels = np.unique(labels, return_index=True)
+    return material.select_pixels(pixels[1][pixels[0] >= 0])
+
+
+def estimate(
+    labels: Labels, count: int, survey: Survey, noise: Array, known: Material | None = None
+) -> Material:
     r"""Ratios and emissivity of so many materials from surveyed pixels and their labels (pixel,).
 
     The scatters of the pixels are added, and their principal axis gives the material's ratios: the
     maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
     the pixels' own, corrected to the common ratios. A pixel that differs from its material by more
     than four standard deviations is left out. The noise is that of the bands (band,) [K]; NaN for a
-    material without information.
+    material without information. Ratios that are `known` are those.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # A pixel that takes a rapid object for the background has an energy beyond all others'.
@@ -137,8 +150,12 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
                 break
             used = np.where(outliers, -1, used)
         found = _ratios(used, count, survey, noise)
-        ratio = found.ratio
-        return Material(ratio, found.variance, *_emissivities(used, count, survey, ratio))
+        ratio, variance = found.ratio, found.variance
+        if known is not None:
+            told = np.isfinite(known.ratio[-1])
+            ratio = np.where(told, known.ratio, ratio)
+            variance = np.where(told, known.inverse_energy, variance)
+        return Material(ratio, variance, *_emissivities(used, count, survey, ratio))
 
 
 def _sum(labels: Labels, values: Array, count: int) -> Array:
