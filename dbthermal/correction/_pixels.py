@@ -136,7 +136,8 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         unjudged |= ~known
         usual = np.where(known, level, np.median(level[known]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
-        patterns.append(min(map(_pattern, still)) / float(np.median(usual)))
+        noise = float(np.median(usual))  # none in counts without noise, in units of which it is
+        patterns.append(min(map(_pattern, still)) / noise if noise > 0.0 else 0.0)
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)

@@ -275,7 +275,7 @@ def test_without_the_extra_its_name_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     """One line says what to install."""
     monkeypatch.delitem(sys.modules, "dbthermal.explorer._widget")
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    with pytest.raises(ImportError, match=r"pip install dbthermal\[explorer\]"):
+    with pytest.raises(ImportError, match=r"pip install 'dbthermal\[explorer\]'"):
         dbthermal.explore(separated())
 
 
