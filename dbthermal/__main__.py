@@ -304,6 +304,8 @@ def _reason(error: Exception, command: str) -> str:
     if isinstance(error, ImportError) and extra:
         extra = command if command == "report" else extra  # which has all that it needs
         return str(import_module("dbthermal._text").missing_library(error.name, extra))
+    if isinstance(error, FileNotFoundError) and error.filename:  # of the system, else our own
+        return f"No file or folder '{error.filename}'. Must exist."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
         return message

@@ -505,6 +505,10 @@ def test_a_warning_is_said_once(results: Path) -> None:
 
 def test_what_has_no_time_makes_no_curve(results: Path) -> None:
     """The names for a curve are those over time, which a map is not."""
+    line = refused(results, "export", "aligned.zarr", "-o", "x.csv")
+    assert "No variable with times and pixels in 'aligned.zarr'" in line
+    line = refused(results, "record", "nothing.yaml", "recordings")
+    assert "No file or folder 'nothing.yaml'" in line
     line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")
     assert "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper" in line
 

@@ -24,6 +24,9 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     names = sorted(map(str, result.data_vars))
     if suffix == ".csv":  # curves over time
         names = [name for name in names if result[name].dims == ("time", "y", "x")]
+        if not names:
+            rule = "Must be a result, as from: dbthermal separate"
+            raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
     if options.variable not in names:
         kind = f"variable '{options.variable}' for {suffix}"
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
