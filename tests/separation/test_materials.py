@@ -140,7 +140,9 @@ def test_borders_are_kept(name: str, shape: tuple[int, int], seed: int) -> None:
     assert share >= 0.99
     assert bleeding == 0
     assert labels.max() + 1 <= 4
-    assert np.mean(labels == NONE) < 0.02
+    # What lies at a border that is found within 2 pixels may belong to none.
+    inside = ndimage.maximum_filter(second, 7) == ndimage.minimum_filter(second, 7)
+    assert np.mean((labels == NONE)[inside]) < 0.02
 
 
 def test_borders_of_drawn_ratios_are_kept(small: Inputs) -> None:
