@@ -32,9 +32,11 @@ _REGISTERED: Final = 200
 # Times that clock and shift of the reflections are estimated in turn, at most, the step of the
 # clock at which that ends [frame], and the least share of a delay that is taken to be seen [1].
 _ROUNDS, _LATE, _FLAT = 6, 0.02, 0.125
-# Memory of the rows that are separated together, what a sample of a pixel takes there [byte], and
-# fewest rows; rows around them, in multiples of the shift.
-_MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 220, 4, 4.0
+# Memory of the rows that are separated together [byte], and fewest rows; rows around them, in
+# multiples of the shift.
+_MEMORY, _FEWEST, _SHIFTS = 2_500_000_000, 4, 4.0
+SAMPLE: Final = 220
+"""Memory that a sample of a pixel takes at most while it is separated [byte]."""
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
@@ -138,7 +140,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     if target is None:
         return separated(slice(0, aligned.sizes["y"]))
     counts = aligned["counts"]
-    rows = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]) - 2 * halo
+    rows = _MEMORY // (SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]) - 2 * halo
     samples = max(_FEWEST, rows) * counts.size // aligned.sizes["y"]
     blocks = _rows.blocks(counts.shape, samples)
     store.save_rows(map(separated, blocks), target, provenance or store.provenance({}))

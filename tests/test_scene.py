@@ -54,7 +54,7 @@ def test_blocks_of_rows_make_one_result(
 ) -> None:
     """Separated by several blocks, every pixel has its value, and the bars hold."""
     truth, raw, fitted, response = plate
-    monkeypatch.setattr(scene, "_MEMORY", 10 * scene._SAMPLE * raw["counts"][0, :, 0].size)
+    monkeypatch.setattr(scene, "_MEMORY", 10 * scene.SAMPLE * raw["counts"][0, :, 0].size)
     result = separate_capture(
         raw,
         fitted,

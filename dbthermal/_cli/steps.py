@@ -30,9 +30,8 @@ from dbthermal._cli.files import (
     staged,
 )
 from dbthermal._warnings import warned
-from dbthermal.scene import _SAMPLE
 from dbthermal.separation._plausibility import against_response, hardly_measured
-from dbthermal.separation._run import _BASE
+from dbthermal.separation._run import BASE
 
 _REGISTERED = 200  # frames whose mean is registered
 
@@ -217,7 +216,7 @@ def foreseen(
         said["would_be"] = outline(capture(options.files, options, options.offset))
     if options.command == "separate":
         sizes = read[str(options.capture)].get("sizes", {})
-        byte = _BASE + _SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
+        byte = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
         most = 3e9 if options.correction else 2e9 if options.method else math.inf  # by rows
         said["memory_at_most_GB"] = round(min(byte, most) / 1e9, 1)
     return said

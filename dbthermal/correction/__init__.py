@@ -7,13 +7,12 @@ is no measurement becomes NaN or is flagged, never filled. `alignment.register` 
 `alignment.align` follow, then `separation.solve`.
 """
 
-from dbthermal.correction._capture import correct_capture
+from dbthermal.correction._capture import correct_capture, corrected_by_camera
 from dbthermal.correction._nonuniformity import (
     DETECTOR_MAXIMUM,
     OUTLIER,
     blackbody_statistics,
     correct,
-    corrected_by_camera,
     fit_correction,
     renew_offset,
 )

@@ -180,36 +180,6 @@ def fit_correction(
     return xr.Dataset(schema.variables("correction", values), coords, attrs)
 
 
-def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
-    """State that each camera corrects gain and offset of its pixels itself.
-
-    Nothing in the counts proves it: of a camera that does not, each pixel would be off by kelvins.
-
-    Parameters
-    ----------
-    capture : Dataset
-        Stage `capture` of `schema`.
-
-    Returns
-    -------
-    Dataset
-        Stage `correction` for `correct_capture`: gain 1, offset 0 and no bad pixel (band, y, x);
-        attribute ``by_camera`` = 1. TypeError or ValueError if there is no capture.
-
-    Examples
-    --------
-    >>> import numpy as np, xarray as xr
-    >>> counts = (("band", "time", "y", "x"), np.full((1, 2, 2, 2), 18000, np.uint16))
-    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": [0.0, 0.1]})
-    >>> correct(capture, corrected_by_camera(capture)).gain_offset_corrected
-    0
-    """
-    ones = xr.ones_like(schema.check(capture, "capture")["counts"][:, 0], dtype=np.float64)
-    ones = ones.drop_vars("time", errors="ignore")
-    maps = {"gain": ones, "offset": 0 * ones, "bad": ones < 0}
-    return xr.Dataset(maps).drop_attrs().assign_attrs(by_camera=1)
-
-
 def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     r"""One-point correction: new offsets from one image of a uniform view, the gains kept.
 

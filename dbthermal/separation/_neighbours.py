@@ -99,19 +99,21 @@ def materials(
         alike = replace(inputs, displacement=replace(displacement, blur=blur))
         surveyed = np.where(inner, labels, -1).ravel()
         more = pool.materials(alike, threads, bar, every=every, surveyed=surveyed)
-        found = more if found is None or more is None else _blurred(found, more, inputs)
+        if more is not None:  # else all materials are too narrow
+            found = more if found is None else _blurred(found, more, inputs)
     return None if found is None else pool.materials(inputs, threads, bar, known=found)
 
 
 def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
     """Materials with the ratios at more blur, and what it changes as a variance of them."""
     noise, known = inputs.noise[inputs.bands][:, np.newaxis], np.isfinite(more.ratio[-1])
+    both = known & np.isfinite(less.ratio[-1])
     change = (more.ratio / less.ratio - 1.0)[1:]
-    usual = np.nanmedian(np.abs(change), axis=1, keepdims=True) if known.any() else 0.0
+    usual = np.median(np.abs(change[:, both]), axis=1, keepdims=True) if both.any() else 0.0
     ratio = np.where(known, more.ratio, less.ratio)
     # Eq. 4, solved for sigma^2.
     error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
-    off = (np.where(known, change, usual) * ratio[1:]) ** 2 / error
+    off = (np.where(both, change, usual) * ratio[1:]) ** 2 / error
     inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
     return replace(less, ratio=ratio, inverse_energy=inverse)
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # Memory [byte], from the peaks of processes with one thread and with two, of 350 to 3000 frames:
 # of a process that has imported and compiled all, and with torch;
-_BASE: Final = 450_000_000
+BASE: Final = 450_000_000
 # of a sample of a band that is read, and of one in the chunks of dask's beside that;
 _READ: Final = 4
 # of a sample of a band in a block: results (8), and those on the way to the disk;
@@ -283,13 +283,13 @@ def _share(
         samples = _READ * (rows + chunks) + _SAMPLE * height
         return samples * row + min(each * row * height, tile)
 
-    threads = 1 if executor or memory < _BASE + 2 * need(1) else 2
+    threads = 1 if executor or memory < BASE + 2 * need(1) else 2
     if isinstance(executor, ThreadPoolExecutor):
         threads = executor._max_workers
-    free = (memory - _BASE) / threads
+    free = (memory - BASE) / threads
     if free < need(1):
         raise ValueError(
-            f"Invalid memory {memory:g} byte. Must be at least {_BASE + threads * need(1):g} for "
+            f"Invalid memory {memory:g} byte. Must be at least {BASE + threads * need(1):g} for "
             f"one row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames"
             + (f", of a source in chunks of {chunk} rows." if lazy else ".")
         )

@@ -111,7 +111,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         alone = one(reflection_shift=reflection_shift)
     result, pooled = alone, None
     if materials is None and find_spec("skimage") is not None:
-        regions = pooling.others(pooling.regions(alone, corrected, response), alone)
+        found = pooling.materials(alone, corrected, response, borders=True)
+        regions = pooling.others(found, alone)
         pooled = pooling.without_borders(regions, alone, response)
         result = one(pool=pooled, reflection_shift=reflection_shift)
         joined = pooling.joined(regions, result, response)

@@ -22,7 +22,7 @@ from reproduction.experiments import whole
 RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
 MEMORY = (
-    _run._BASE + 9 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64 * 24
+    _run.BASE + 9 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64 * 24
 )  # byte: nine rows in a block
 
 

@@ -289,3 +289,17 @@ def test_displacements(emissivity: tuple[float, float], seeds: tuple[int, ...]) 
             assert got["good"] > 0.8
             assert got["rmse"] < 1.1 * one["rmse"]
             assert 0.92 < got["cover"] < 0.98
+
+
+def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
+    """Stripes of six columns keep their common ratio, of sharp bands, where none is wider."""
+    shift = np.zeros((2, *SMALL.shape))
+    shift[1] = 4.0
+    (_, capture), known = film(SMALL, shift, 3), field(shift)
+    stripes = np.arange(SMALL.shape[1]) // 6
+    labels = xr.DataArray(np.tile(stripes, (SMALL.shape[0], 1)), dims=("y", "x"))
+    pooled = separation.solve(capture, RIG.response(), pool=labels, reflection_shift=known)
+    alone = separation.solve(capture, RIG.response(), reflection_shift=known)
+    stds = [float(one["reflection_ratio_std"][1].median()) for one in (pooled, alone)]
+    print(f"deviation of the ratio: pooled {stds[0]:.3f}, alone {stds[1]:.3f}")
+    assert stds[0] < 0.5 * stds[1]

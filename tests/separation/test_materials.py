@@ -12,7 +12,7 @@ from scipy import ndimage
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
 from dbthermal.separation._pooling import feature_maps, region_merging
-from dbthermal.separation._pooling.materials import NONE, materials, regions, step, without_borders
+from dbthermal.separation._pooling.materials import NONE, materials, step, without_borders
 from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.simulation import Rig
 
@@ -286,7 +286,8 @@ def test_step_counts_in_standard_deviations() -> None:
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(list(SHAPES)))
 def test_labels_are_connected_and_ordered(seed: int, name: str) -> None:
     """Regions are ordered by size, and each is connected."""
-    labels = regions(*drawn(scene_of(where(name, (24, 40)), seed, frames=64), seed)).values
+    inputs = drawn(scene_of(where(name, (24, 40)), seed, frames=64), seed)
+    labels = materials(*inputs, borders=True).values
     sizes = np.bincount(labels[labels != NONE], minlength=1)
     assert np.all(np.diff(sizes) <= 0)
     for label in np.unique(labels[labels != NONE]):

@@ -71,6 +71,7 @@ def materials(
     *,
     error_rate: float = 0.01,
     resolution: float = 0.1,
+    borders: bool = False,
 ) -> xr.DataArray:
     r"""Label the pixels by material, for `solve(..., pool=labels)`.
 
@@ -88,6 +89,8 @@ def materials(
     resolution : float
         Relative difference of the ratio that must be seen before two regions are joined by their
         ratios [1]; materials closer than this may be joined.
+    borders : bool
+        Keep the pixels beside another material, whatever their own ratio.
 
     Returns
     -------
@@ -131,19 +134,6 @@ def materials(
     0
     >>> pooled = separation.solve(capture, response, pool=labels)
     """
-    found = regions(result, corrected, response, error_rate=error_rate, resolution=resolution)
-    return without_borders(found, result, response)
-
-
-def regions(
-    result: xr.Dataset,
-    corrected: xr.Dataset,
-    response: xr.Dataset,
-    *,
-    error_rate: float = 0.01,
-    resolution: float = 0.1,
-) -> xr.DataArray:
-    """Regions (y, x) of `materials`, with all that lies at their borders."""
     result = _checked(result, corrected, error_rate, resolution)
     if "segment" in corrected:  # means across a shutter event would show the pattern's step
         segments, counts = np.unique(corrected["segment"], return_counts=True)
@@ -167,7 +157,8 @@ def regions(
     linked, steps = _links(cells, pairs[vague], emitted, variance, change)
     regions.join_in_order(linked, steps)
     regions.join_alike(pairs, resolution)
-    return _labelled(cells, regions, result)
+    labels = _labelled(cells, regions, result)
+    return labels if borders else without_borders(labels, result, response)
 
 
 def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Dataset) -> xr.DataArray:

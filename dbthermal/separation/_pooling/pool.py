@@ -152,9 +152,9 @@ def estimate(
         found = _ratios(used, count, survey, noise)
         ratio, variance = found.ratio, found.variance
         if known is not None:
-            told = np.isfinite(known.ratio[-1])
-            ratio = np.where(told, known.ratio, ratio)
-            variance = np.where(told, known.inverse_energy, variance)
+            stated = np.isfinite(known.ratio[-1])
+            ratio = np.where(stated, known.ratio, ratio)
+            variance = np.where(stated, known.inverse_energy, variance)
         return Material(ratio, variance, *_emissivities(used, count, survey, ratio))
 
 
