@@ -20,7 +20,6 @@ _MADE_BY = {
     "response": "calibrate",
     "separated": "separate",
 }
-_FEWEST = 32  # frames of a capture
 _TIFF = {".tif", ".tiff", ".btf"}
 _NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
 _ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
@@ -95,9 +94,12 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     """Command `import`."""
+    from dbthermal import separation  # noqa: PLC0415 - takes long
+
     made = capture(options.files, options, options.offset)
-    if (frames := made.sizes["time"]) < _FEWEST:
-        rule = f"Must be at least {_FEWEST} to be separated, better 200 to 400"
+    fewest = separation.get_method("subspace").minimum_frames
+    if (frames := made.sizes["time"]) < fewest:
+        rule = f"Must be at least {fewest} to be separated, better 200 to 400"
         made = warned(made, f"The capture has {frames} frames. {rule}.")
     return saved(made, options)
 

@@ -37,7 +37,7 @@ _AROUND: Final = 5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Deviations of the blur beyond which it has no weight.
-_TAIL: Final = 3.0
+TAIL: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Displacement:
 
     def around(self, rows: slice) -> slice:
         """Rows of which some rows are made by the blur."""
-        reach = int(np.ceil(_TAIL * self.blur))
+        reach = int(np.ceil(TAIL * self.blur))
         return slice(max(rows.start - reach, 0), min(rows.stop + reach, self.shape[0]))
 
     def weights(self, rows: slice, source: slice) -> csr_array:
@@ -271,7 +271,7 @@ def _blurred(
 def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
     """Weights (row, row among) of a Gaussian, 0 in its tail."""
     away = np.subtract.outer(np.arange(rows.stop)[rows], np.arange(among.stop)[among]) / deviation
-    return np.where(abs(away) <= _TAIL, np.exp(-0.5 * away**2), 0.0)
+    return np.where(abs(away) <= TAIL, np.exp(-0.5 * away**2), 0.0)
 
 
 def _roughness(counts: Array) -> Array:

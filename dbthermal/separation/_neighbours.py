@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 from scipy.special import chdtri
 
 from dbthermal.schema import Status
+from dbthermal.separation._displaced import TAIL
 from dbthermal.separation._equations import Array, Mask
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
@@ -25,8 +26,6 @@ from dbthermal.separation._tiles import Material
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
-# Deviations of the blur from which a neighbour has no part in a pixel.
-_REACH: Final = 3.0
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
@@ -94,7 +93,7 @@ def materials(
     assert inputs.labels is not None
     labels, found = inputs.labels.reshape(displacement.shape), None
     for blur in (0.0, BLUR, 2.0 * BLUR):
-        size = 1 + 2 * int(np.ceil(_REACH * blur))
+        size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
         alike = replace(inputs, displacement=replace(displacement, blur=blur))
         surveyed = np.where(inner, labels, -1).ravel()
