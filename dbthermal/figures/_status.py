@@ -93,7 +93,7 @@ def status(result: xr.Dataset) -> Figure:
     good = f"{percent(shares[''])} of the pixels have no flag"
     good += f", {percent(frames)} but for some frames" if frames else ""
     good += f", {percent(completed)} are completed" if completed else ""
-    figure.suptitle(f"Status: {good}" + provenance_note(result))
+    figure.suptitle(f"Status: {good}{provenance_note(result)}", fontsize="medium")
     return figure
 
 
