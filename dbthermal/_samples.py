@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.special import bdtrc, ndtri
+from scipy.stats import norm
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MINIMUM_FRAMES
@@ -27,6 +28,18 @@ _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
 PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
+
+# Share of the stillest groups of frames, and how many there must be: noise is then known to 3 %.
+_STILLEST: Final = 0.1
+_FEWEST_STILL: Final = 1000
+# Ranks of the magnitudes that tell the noise, and of the next ones; outliers are beyond. Their mean
+# in a normal distribution, and the ratio of what both tell from which it is no noise.
+_RANKS: Final = np.array([0.0, 0.7, 0.95])
+_MEANS: Final = -2.0 * np.diff(norm.pdf(ndtri(0.5 + 0.5 * _RANKS))) / np.diff(_RANKS)
+_UNEQUAL: Final = 1.1
+# Factor from which a noise is another than the stated one; largest between bands of what moves.
+_LARGER: Final = 1.4
+_UNLIKE: Final = 5.0
 
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
@@ -61,9 +74,65 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
 
 
-def some_pixels(counts: xr.DataArray) -> npt.NDArray[Any]:
+def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
+    r"""
+    Noise (band) where signals (band, time, pixel) prove more than the stated (band), else NaN [K].
+
+    The second differences d of groups of three frames are independent where there is noise alone.
+    The stillest tenth of the groups is selected by what surrounds each in time, in all bands: the
+    second differences of its neighbours, and the third difference of their means, which a step in
+    between raises. Selected so, noise keeps its distribution. The mean of the smaller seven tenths
+    of the magnitudes tells the noise s. Nothing is proved if a larger one follows from the next
+    quarter, where rare motion shows first, or from how slopes differ between neighbouring groups,
+    for motion is slower than white noise.
+
+    What jumps at every frame is white, but jumps in all bands. If the excess over the stated noise
+    were motion, at most K times weaker in another band n, then
+
+    .. math:: \overline{d_m d_n} \ge (s_m^2 - \sigma_m^2) / K, \quad K = 5
+
+    If the covariance is smaller by three standard deviations, it is noise. One band that proves it
+    is enough: a quiet band's jumps may be lost in another's noise, and then do little.
+    """
+    # Without the frames that are copies; NaN differs from NaN.
+    new = np.all([np.any(band[1:] != band[:-1], axis=1) for band in signals], axis=0)
+    signals = signals[:, np.append(True, new)]
+    bands, groups = len(signals), signals.shape[1] // 3
+    if _STILLEST * (groups - 4) * signals.shape[2] < _FEWEST_STILL:
+        return np.full(bands, np.nan)
+    three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
+    means = three.mean(axis=2)
+    rapid = (three[:, :, 1] - 0.5 * (three[:, :, 0] + three[:, :, 2])) / np.sqrt(1.5)
+    slope = (three[:, :, 2] - three[:, :, 0]) / np.sqrt(2.0)
+    change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
+    third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
+    # A mean of three has a third of the noise's variance, their third difference 10 times that.
+    around = 0.3 * third**2
+    for first in (0, 1, 3, 4):
+        around += rapid[:, first : first + groups - 4] ** 2
+    rapid, change, around = (part.reshape(bands, -1) for part in (rapid[:, 2:-2], change, around))
+    valid = np.all(np.isfinite(rapid) & (around > 0), axis=0)  # NaN is not
+    number = int(_STILLEST * np.count_nonzero(valid))
+    if number < _FEWEST_STILL:
+        return np.full(bands, np.nan)
+    motion = around / np.median(around[:, valid], axis=1, keepdims=True)
+    stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
+    still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
+    ordered = np.sort(np.abs(still), axis=1)
+    noise = ordered[:, :middle].mean(axis=1) / _MEANS[0]
+    beyond = ordered[:, middle:last].mean(axis=1) / _MEANS[1]
+    slower = np.sort(np.abs(change[:, stillest]), axis=1)[:, :middle].mean(axis=1) / _MEANS[0]
+    inner = still[:, np.all(np.abs(still) < ordered[:, last : last + 1], axis=0)]
+    shared = np.cov(inner) + 3.0 * np.outer(noise, noise) / np.sqrt(number)
+    np.fill_diagonal(shared, np.inf)
+    proved = np.any(shared < (noise**2 - stated**2)[:, np.newaxis] / _UNLIKE, axis=1)
+    alike = (np.maximum(beyond, slower) < _UNEQUAL * noise) & (noise > _LARGER * stated)
+    return np.where(alike & np.any(alike & proved), noise, np.nan)
+
+
+def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
     """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / PIXELS)))
+    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / pixels)))
     some = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
     return np.asarray(some.reshape(*some.shape[:2], -1))
 

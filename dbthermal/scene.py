@@ -19,7 +19,9 @@ from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
+from dbthermal.separation._inputs import check
 from dbthermal.separation._separate import cameras_apart
+from dbthermal.separation._solve import get_method
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
@@ -119,6 +121,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         transform = register(corrected.isel(time=some), model=registration)
         aligning = {**aligning, "transform": transform}
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
+    if lazy:  # one noise for all blocks of rows
+        response = check(aligned, response, get_method("subspace"), "subspace").response
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
     halo = 1  # rows around others from which their object is told

@@ -15,6 +15,7 @@ from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
+from dbthermal._warnings import warned
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
@@ -26,8 +27,10 @@ Labels = npt.NDArray[np.intp]
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
-# Pixels from which the noise is estimated where the response has none, and a clock is judged.
+_SOURCE: Final = "noise_source"  # attribute: whether "response" or "capture" tells the noise
+# Pixels from which the noise is estimated, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
+_NOISE_SAMPLES: Final = 2**19  # of a band, at most
 _CLOCK_PIXELS: Final = 256
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
@@ -58,6 +61,7 @@ class Method:
 class Inputs:
     """Method, capture, responses, noise and known quantities, in the capture's band order."""
 
+    response: xr.Dataset  # with the noise that is used, for the whole capture and all its parts
     method: Method
     settings: Any  # of the type that the method has, or None
     seed: int  # of random starts
@@ -150,13 +154,14 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         dims = ("time",), ("y", "x"), ("time", "y", "x")
         used = _selection(capture, mask, "mask", "b", *dims)
         capture = capture.assign(mask=used.drop_vars(list(used.coords)))
-    noise = _noise(capture, response, curves)
+    response, noise = _noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
     value, covariance = _known_emissivity(
         corrected, emissivity, emissivity_std, emissivity_covariance
     )
     order = [int(band) for band in np.argsort(noise, kind="stable")]
     return Inputs(
+        response=response,
         method=method,
         settings=settings,
         seed=seed,
@@ -242,19 +247,42 @@ def _selection(
     return laid_on(array, capture, f"the {name}", "the capture")
 
 
-def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Array:
-    """Noise (band) [K] of the linearised signals, from the response or else from the capture."""
+def _noise(
+    capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]
+) -> tuple[xr.Dataset, Array]:
+    """Response with the noise that is used for all parts of a capture, and this (band) [K]."""
+    names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
+    factor, decided, doubts = _noise_factor(capture), response.attrs.get(_SOURCE), list[str]()
     if "noise" in response:
-        slopes = np.array([curve.reference_slope for curve in curves])
-        known = np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+        known = np.asarray(responses.noise(response, names) / slopes)
+        if decided == "capture":
+            return response, np.asarray(known * factor)
+        pixels = max(samples.PIXELS, min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"]))
+        counts = samples.some_pixels(capture["counts"], pixels)
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
-        rounding = samples.rounding_std(samples.some_pixels(capture["counts"])) / slopes
+        rounding = samples.rounding_std(counts) / slopes
         wide = np.sqrt(12.0) * rounding > known
-        return np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * _noise_factor(capture))
-    counts, frames = quality.sample(capture, _NOISE_PIXELS)
-    signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
-    return noises.estimate_bands(signals, capture["time"].values[frames])
+        stated = np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * factor)
+        signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
+        larger = samples.larger_noise(signals, stated)
+        if decided or np.isnan(larger).all():
+            return response.assign_attrs({_SOURCE: "response"}), stated
+        noise = np.where(np.isnan(larger), stated, larger)
+        doubts = [
+            f"The noise of band '{name}' is {one:.3g} K in the capture, {one / other:.2g} times "
+            f"the response's {other:.3g} K. The capture's is used: is the response of another "
+            "integration time or correction, or are two bands exchanged?"
+            for name, one, other in zip(names, noise, stated, strict=True)
+            if one > other
+        ]
+    else:
+        parts, frames = quality.sample(capture, _NOISE_PIXELS)
+        known_parts = [one.linearise(part) for one, part in zip(curves, parts, strict=True)]
+        noise = noises.estimate_bands(known_parts, capture["time"].values[frames])
+    used = "band", noise / factor * slopes, schema.NOISE.attrs
+    response = response.sel(band=names).assign(noise=used).assign_attrs({_SOURCE: "capture"})
+    return (warned(response, *doubts) if doubts else response), noise
 
 
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:

@@ -5,7 +5,6 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import _samples as samples
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.schema import Status
@@ -14,14 +13,13 @@ from dbthermal.separation._tiles import RANGE_SIGMAS
 _FRAMES: Final = 200  # about as many frames and pixels tell
 _PIXELS: Final = 10_000
 _OUTSIDE: Final = 0.01  # share of samples outside the calibration that is told
-_UNLIKE: Final = 2.0  # factor between two noises that is told
 _HARDLY: Final = 0.1  # share of the moving pixels
 _REASONS: Final = 3  # flags that are named
 
 
 def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
-    """Doubts about counts of a capture, or their noise, that do not fit its response."""
-    found, ratios = list[str](), dict[str, float]()
+    """Doubts about counts of a capture that do not fit its response."""
+    found = list[str]()
     counts = schema.check(corrected, "corrected")["counts"]
     if counts.dtype.kind != "f":  # raw counts of pixels that differ
         return []
@@ -33,8 +31,7 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     factors = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
     stds = np.hypot(noises * factors, patterns)
-    for name, one, noise, std in zip(names, counts, noises * factors, stds, strict=True):
-        first = one[:_FRAMES, ::step, ::step].values[:, good]
+    for name, one, std in zip(names, counts, stds, strict=True):
         every = one[:: max(1, len(one) // _FRAMES), ::step, ::step].values[:, good]
         curve = responses.curve(response, name)
         low, high = curve.counts([curve.lowest, curve.highest])
@@ -47,16 +44,6 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
                 f"{high:.0f} count that its response was calibrated over. Must lie within: "
                 "calibrate over the temperatures of the scene; or is it another band's response?"
             )
-        level = samples.noise(first)
-        if noise > 0 and np.isfinite(level).any():
-            ratios[name] = float(np.nanmedian(level)) / noise
-    # What never rests raises the noise that is found; in no band does it lower that of another.
-    if ratios and min(ratios.values()) < 1.0 / _UNLIKE and max(ratios.values()) > _UNLIKE:
-        said = ", ".join(f"{ratio:.2g} in band '{name}'" for name, ratio in ratios.items())
-        found.append(
-            f"The noise is {said} times that of the response. Must be alike: are two bands "
-            "exchanged, in the recordings or in the files of the blackbody?"
-        )
     return found
 
 

@@ -168,7 +168,10 @@ class _Job:
     def separate(self, source: Path | xr.Dataset, target: Path) -> None:
         """Separate a capture, or what is left of it, into its target."""
         capture = store.open_dataset(source) if isinstance(source, Path) else source
-        response = _with_noise(capture, self.response, self.method, self.options)
+        checked = _inputs.check(
+            capture, self.response, get_method(self.method), self.method, **self.options
+        )
+        response = checked.response  # with one noise for all blocks
         provenance = self.provenance or store.provenance({})
         digest = _digest([*_thinned(capture), response, self.method, self.options])
         provenance = json.loads(json.dumps({**provenance, "run": digest}))
@@ -246,19 +249,6 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
 
 def _of_rows(value: Any, rows: slice) -> Any:
     return value.isel(y=rows) if isinstance(value, xr.DataArray) and "y" in value.dims else value
-
-
-def _with_noise(
-    capture: xr.Dataset, response: xr.Dataset, method: str, options: Mapping[str, Any]
-) -> xr.Dataset:
-    """Response with the noise of the whole capture, that of every block; all inputs are checked."""
-    inputs = _inputs.check(capture, response, get_method(method), method, pool=None, **options)
-    if "noise" in response:
-        return response
-    slopes = np.array([curve.reference_slope for curve in inputs.curves])
-    order = [str(name) for name in capture["band"].values]
-    noise = xr.DataArray(inputs.noise * slopes, dims="band", coords={"band": order})
-    return response.sel(band=order).assign(noise=noise.assign_attrs(units="count"))
 
 
 def _share(

@@ -12,8 +12,9 @@ from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._completion.prior import stated
+from dbthermal.separation._inputs import check
 from dbthermal.separation._pooling import materials as pooling
-from dbthermal.separation._solve import solve
+from dbthermal.separation._solve import get_method, solve
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -90,9 +91,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
+    stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
+    known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
+    response = known.response  # with one noise for all steps
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
-    stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     alone = None
     narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
     if reflection_shift is None and narrower >= _WIDE:

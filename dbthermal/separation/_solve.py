@@ -48,7 +48,7 @@ _MODULES: Final = {
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
-_ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera", "warnings"}
+_ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -89,8 +89,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
-        where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
-        otherwise the noise is estimated from the capture.
+        where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture,
+        unless the capture proves 1.4 times as much or more: then the capture's, with a warning.
+        Without `noise` it is estimated from the capture. Attribute `noise_source` says which.
     method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent"}
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
         least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
@@ -228,7 +229,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
             _separate_all(inputs, pooled, result, threads, bar)
         else:
             _solve_jointly(inputs, result, threads, bar)
-    held = response.attrs | corrected.attrs
+    sources = inputs.response.attrs, corrected.attrs
+    held = sources[0] | sources[1]
+    doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
@@ -238,7 +241,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         pooled=int(pool is not None),
         response_kind=response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
-        noise_source="response" if "noise" in response else "capture",
+        **({"warnings": [*doubts]} if doubts else {}),
+        noise_source=inputs.response.attrs["noise_source"],
         emissivity_source="capture" if emissivity is None else "given",
         not_estimated=" ".join(inputs.method.not_estimated + ratios),
         reference_band=str(corrected["band"].values[inputs.bands[0]]),

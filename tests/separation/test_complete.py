@@ -267,7 +267,8 @@ def test_one_call_without_a_shift_to_find() -> None:
     rng = np.random.default_rng(13)
     counts = capture["counts"]
     shared = rng.normal(0.0, 5.0, (2, len(TIME), 1, 1)).astype(counts.dtype)  # [count]
-    whole = separation.separate(capture.assign(counts=counts + shared), RESPONSE)
+    response = RESPONSE.assign(noise=np.hypot(RESPONSE["noise"], 5.0).assign_attrs(units="count"))
+    whole = separation.separate(capture.assign(counts=counts + shared), response)
     apart = float(((whole["status"] & int(Status.BANDS_APART)) != 0).mean())
     print(f"bands apart in {apart:.2f}")
     assert whole.attrs["reflection_shift"] == "none"

@@ -31,15 +31,11 @@ def test_right_response_is_not_spoken_against(corrected: xr.Dataset) -> None:
     assert against_response(raw, RIG.response()) == []
 
 
-@pytest.mark.parametrize(("noise", "said"), [(0.35, "lie outside the"), (3.5, "The noise is ")])
-def test_exchanged_recordings_are_told(noise: float, said: str) -> None:
-    """A capture whose bands are exchanged contradicts the response by its level or its noise."""
-    rig = simulation.Rig(noise=(0.03, noise))
-    names = list(rig.bands)
-    exchanged = capture(rig).assign_coords(band=names[::-1]).sel(band=names)
-    found = against_response(exchanged, rig.response())
-    print(rig.response()["noise"].values, found)
-    assert any(said in one for one in found)
+def test_exchanged_recordings_are_told(corrected: xr.Dataset) -> None:
+    """A capture whose bands are exchanged contradicts the response by its level."""
+    names = list(RIG.bands)
+    exchanged = corrected.assign_coords(band=names[::-1]).sel(band=names)
+    assert any("lie outside the" in one for one in against_response(exchanged, RIG.response()))
 
 
 def test_samples_outside_the_calibration_are_counted(corrected: xr.Dataset) -> None:

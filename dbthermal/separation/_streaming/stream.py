@@ -138,7 +138,7 @@ class Stream:
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.
         self._order, template = inputs.bands, template.isel(band=inputs.bands)
-        inputs = _inputs.check(template, **known)
+        inputs = _inputs.check(template, **known | {"response": inputs.response})
         self._template, self._kind = template.isel(time=0, drop=True), response_kind
         self._shape = shape = (template.sizes["y"], template.sizes["x"])
         self._camera = kernels.camera(inputs)

@@ -1,0 +1,118 @@
+"""Noise that is stated too small: the capture's is used where it proves more, and said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from captures import emissivity_of
+
+from dbthermal import _samples as samples
+from dbthermal import separation, simulation, store
+from dbthermal.simulation import Background
+from reproduction.experiments.pictures import Picture, smooth_shift
+
+RIG = simulation.Rig()
+TIME = np.arange(300) / 10.0
+GLASS = emissivity_of(0.86, 0.72)
+SHAPE = (24, 32)
+NOISE = np.array(RIG.noise)
+
+
+def stated(factor: float) -> xr.Dataset:
+    """Response whose noise is so many times too small."""
+    response = RIG.response()
+    noise = (response["noise"] / factor).assign_attrs(response["noise"].attrs)
+    return response.assign(noise=noise)
+
+
+def larger(scene: xr.Dataset, factor: float, seed: int = 1) -> np.ndarray:
+    """What a capture of a scene proves, over its noise, of a stated one so many times too small."""
+    rng = np.random.default_rng(seed)
+    response = RIG.response()
+    counts = simulation.observe(scene, response, rng)["counts"]
+    slopes = (response["noise"] / NOISE).values[:, np.newaxis, np.newaxis]
+    signals = samples.some_pixels(counts, 4096) / slopes
+    return np.asarray(samples.larger_noise(signals, NOISE / factor) / NOISE)
+
+
+@pytest.fixture(scope="module")
+def picture() -> tuple[xr.Dataset, xr.Dataset]:
+    """Scene of walkers before glass, and its capture."""
+    rng = np.random.default_rng(31)
+    scene = Picture(SHAPE).draw(TIME, GLASS, rng)
+    return scene, simulation.observe(scene, RIG.response(), rng)
+
+
+@pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
+def test_too_small_a_noise_is_replaced(
+    picture: tuple[xr.Dataset, xr.Dataset], factor: float
+) -> None:
+    """Both numbers are named, and the intervals hold as with the right noise."""
+    scene, capture = picture
+    with pytest.warns(UserWarning, match=f"The noise of band '9.5' .* {factor:g} times the resp"):
+        result = separation.solve(capture, stated(factor))
+    assert result.attrs["noise_source"] == "capture"
+    assert len(result.attrs["warnings"]) == 2
+    right = RIG.response()["noise"].values
+    np.testing.assert_allclose(result["noise"].values, right, rtol=0.05)
+    moving = scene["background_temperature"].std("time") > 0.3  # K
+    good = moving & (result["status"] == 0)
+    error = abs(result["object_temperature"] - scene["object_temperature"])
+    held = float((error < 1.96 * result["object_temperature_std"]).where(good).mean())
+    print(f"good {float(good.sum() / moving.sum()):.2f}, held {held:.3f}")
+    assert float(good.sum() / moving.sum()) > 0.8
+    assert 0.92 < held < 0.98
+
+
+@pytest.mark.parametrize("factor", [1.0, 1 / 1.5])
+def test_right_or_larger_noise_is_kept(
+    picture: tuple[xr.Dataset, xr.Dataset], factor: float
+) -> None:
+    """The response's noise is used as it is, without a warning."""
+    result = separation.solve(picture[1], stated(factor))
+    np.testing.assert_array_equal(result["noise"].values, stated(factor)["noise"].values)
+    assert result.attrs["noise_source"] == "response"
+    assert "warnings" not in result.attrs
+
+
+def test_one_noise_for_all_blocks(picture: tuple[xr.Dataset, xr.Dataset], tmp_path: Path) -> None:
+    """On disk the noise is that of the whole capture, as if separated at once."""
+    store.save(picture[1], tmp_path / "capture.zarr", store.provenance({}))
+    with pytest.warns(UserWarning, match="The noise of band"):
+        separation.run(tmp_path / "capture.zarr", tmp_path / "result.zarr", stated(2.0))
+    with pytest.warns(UserWarning, match="The noise of band"):
+        whole = separation.solve(picture[1], stated(2.0))
+    result = store.open_dataset(tmp_path / "result.zarr").load()
+    np.testing.assert_allclose(result["noise"].values, whole["noise"].values, rtol=1e-12)
+    assert result.attrs["noise_source"] == "capture"
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_motion_is_no_noise(seed: int) -> None:
+    """Whatever moves proves nothing: few frames, rapid heating, cameras apart, no rest at all."""
+    rng = np.random.default_rng(seed)
+    apart = smooth_shift(SHAPE, 6.0, 2.0)
+    options = {"start": 293.15, "stop": 323.15}
+    scenes = [Picture(SHAPE).draw(TIME[:frames], GLASS, rng, apart) for frames in (60, 100, 300)]
+    scenes += [Picture(SHAPE, walkers=30, rise=(0.5, 2.0)).draw(TIME, GLASS, rng)]
+    scenes += [Picture(SHAPE, walkers=30).draw(TIME[:150] * 5.0, GLASS, rng)]
+    for materials in (GLASS, emissivity_of(0.3, 0.5), emissivity_of(0.95, 0.85)):
+        for correlation_time in (0.01, 0.1, 0.3, 3.0):
+            walk = Background("random walk", correlation_time=correlation_time)
+            args = (TIME, materials, walk, 400, rng)
+            scenes.append(simulation.independent_pixels(*args, **options))
+    for place, scene in enumerate(scenes):
+        found = larger(scene, 1.0, seed)
+        assert np.isnan(found).all(), (place, found)
+
+
+def test_rounded_counts_of_less_noise_than_a_step() -> None:
+    """Rounding to steps of 0.2 to 2 deviations of the noise proves no more than is stated."""
+    rng = np.random.default_rng(5)
+    noise = np.ones(2)
+    level = 100.0 + np.linspace(0.0, 30.0, 300)[:, np.newaxis] * rng.random(400)
+    for step in (0.2, 0.5, 1.0, 2.0):
+        exact = level + rng.standard_normal((2, 300, 400))
+        found = samples.larger_noise(step * np.rint(exact / step), noise)
+        assert np.isnan(found).all(), (step, found)
