@@ -27,11 +27,9 @@ Labels = npt.NDArray[np.intp]
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
-_SOURCE: Final = "noise_source"  # attribute: whether "response" or "capture" tells the noise
 # Pixels from which the noise is estimated, and a clock is judged.
-_NOISE_PIXELS: Final = 4096
+_NOISE_PIXELS, _CLOCK_PIXELS = 4096, 256
 _NOISE_SAMPLES: Final = 2**19  # of a band, at most
-_CLOCK_PIXELS: Final = 256
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
@@ -250,9 +248,9 @@ def _selection(
 def _noise(
     capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]
 ) -> tuple[xr.Dataset, Array]:
-    """Response with the noise that is used for all parts of a capture, and this (band) [K]."""
+    """Noise (band) [K], and the response with it, for all parts; `noise_source` says of which."""
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
-    factor, decided, doubts = _noise_factor(capture), response.attrs.get(_SOURCE), list[str]()
+    factor, decided = _noise_factor(capture), response.attrs.get("noise_source")
     if "noise" in response:
         known = np.asarray(responses.noise(response, names) / slopes)
         if decided == "capture":
@@ -267,22 +265,21 @@ def _noise(
         signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
         larger = samples.larger_noise(signals, stated)
         if decided or np.isnan(larger).all():
-            return response.assign_attrs({_SOURCE: "response"}), stated
+            return response.assign_attrs(noise_source="response"), stated
         noise = np.where(np.isnan(larger), stated, larger)
-        doubts = [
-            f"The noise of band '{name}' is {one:.3g} K in the capture, {one / other:.2g} times "
-            f"the response's {other:.3g} K. The capture's is used: is the response of another "
-            "integration time or correction, or are two bands exchanged?"
-            for name, one, other in zip(names, noise, stated, strict=True)
-            if one > other
-        ]
+        said = " and ".join(
+            f"{ratio * other:.3g} K in band '{name}', {ratio:.2g} times the stated {other:.3g} K"
+            for name, ratio, other in zip(names, larger / stated, stated, strict=True)
+            if ratio > 1.0
+        )
+        doubt = "is the response of another integration time, or are two bands exchanged?"
+        response = warned(response, f"The noise of the capture, which is used, is {said}: {doubt}")
     else:
         parts, frames = quality.sample(capture, _NOISE_PIXELS)
-        known_parts = [one.linearise(part) for one, part in zip(curves, parts, strict=True)]
-        noise = noises.estimate_bands(known_parts, capture["time"].values[frames])
+        linear = [one.linearise(part) for one, part in zip(curves, parts, strict=True)]
+        noise = noises.estimate_bands(linear, capture["time"].values[frames])
     used = "band", noise / factor * slopes, schema.NOISE.attrs
-    response = response.sel(band=names).assign(noise=used).assign_attrs({_SOURCE: "capture"})
-    return (warned(response, *doubts) if doubts else response), noise
+    return response.sel(band=names).assign(noise=used).assign_attrs(noise_source="capture"), noise
 
 
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:

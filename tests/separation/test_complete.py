@@ -262,13 +262,11 @@ def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[floa
 
 
 def test_one_call_without_a_shift_to_find() -> None:
-    """Noise that all pixels of a band share sets bands apart, and no shift mends it: no error."""
+    """A band that is two frames late sets bands apart, and no shift mends it: no error."""
     _, capture, _ = draw(replace(SMALL, shape=(24, 24)), 13, 0.86, 0.72)
-    rng = np.random.default_rng(13)
-    counts = capture["counts"]
-    shared = rng.normal(0.0, 5.0, (2, len(TIME), 1, 1)).astype(counts.dtype)  # [count]
-    response = RESPONSE.assign(noise=np.hypot(RESPONSE["noise"], 5.0).assign_attrs(units="count"))
-    whole = separation.separate(capture.assign(counts=counts + shared), response)
+    counts = capture["counts"].copy()
+    counts[1, 2:] = counts[1, :-2].values
+    whole = separation.separate(capture.assign(counts=counts), RESPONSE)
     apart = float(((whole["status"] & int(Status.BANDS_APART)) != 0).mean())
     print(f"bands apart in {apart:.2f}")
     assert whole.attrs["reflection_shift"] == "none"

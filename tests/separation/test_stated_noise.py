@@ -50,10 +50,10 @@ def test_too_small_a_noise_is_replaced(
 ) -> None:
     """Both numbers are named, and the intervals hold as with the right noise."""
     scene, capture = picture
-    with pytest.warns(UserWarning, match=f"The noise of band '9.5' .* {factor:g} times the resp"):
+    with pytest.warns(UserWarning, match=r"The noise of .*in band '8-14', .* K in band '9.5', "):
         result = separation.solve(capture, stated(factor))
     assert result.attrs["noise_source"] == "capture"
-    assert len(result.attrs["warnings"]) == 2
+    assert len(result.attrs["warnings"]) == 1
     right = RIG.response()["noise"].values
     np.testing.assert_allclose(result["noise"].values, right, rtol=0.05)
     moving = scene["background_temperature"].std("time") > 0.3  # K
@@ -71,7 +71,8 @@ def test_right_or_larger_noise_is_kept(
 ) -> None:
     """The response's noise is used as it is, without a warning."""
     result = separation.solve(picture[1], stated(factor))
-    np.testing.assert_array_equal(result["noise"].values, stated(factor)["noise"].values)
+    known = stated(factor)["noise"].values
+    np.testing.assert_allclose(result["noise"].values, known, rtol=1e-14)
     assert result.attrs["noise_source"] == "response"
     assert "warnings" not in result.attrs
 
@@ -79,9 +80,9 @@ def test_right_or_larger_noise_is_kept(
 def test_one_noise_for_all_blocks(picture: tuple[xr.Dataset, xr.Dataset], tmp_path: Path) -> None:
     """On disk the noise is that of the whole capture, as if separated at once."""
     store.save(picture[1], tmp_path / "capture.zarr", store.provenance({}))
-    with pytest.warns(UserWarning, match="The noise of band"):
+    with pytest.warns(UserWarning, match="The noise of the capture"):
         separation.run(tmp_path / "capture.zarr", tmp_path / "result.zarr", stated(2.0))
-    with pytest.warns(UserWarning, match="The noise of band"):
+    with pytest.warns(UserWarning, match="The noise of the capture"):
         whole = separation.solve(picture[1], stated(2.0))
     result = store.open_dataset(tmp_path / "result.zarr").load()
     np.testing.assert_allclose(result["noise"].values, whole["noise"].values, rtol=1e-12)
