@@ -39,7 +39,7 @@ _MEANS: Final = -2.0 * np.diff(norm.pdf(ndtri(0.5 + 0.5 * _RANKS))) / np.diff(_R
 _UNEQUAL: Final = 1.1
 # Factor from which a noise is another than the stated one; largest between bands of what moves.
 _LARGER: Final = 1.4
-_UNLIKE: Final = 5.0
+_UNLIKE: Final = 20.0
 
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
@@ -89,7 +89,7 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     What jumps at every frame is white, but jumps in all bands. If the excess over the stated noise
     were motion, at most K times weaker in another band n, then
 
-    .. math:: \overline{d_m d_n} \ge (s_m^2 - \sigma_m^2) / K, \quad K = 5
+    .. math:: \overline{d_m d_n} \ge (s_m^2 - \sigma_m^2) / K, \quad K = 20
 
     If the covariance is smaller by three standard deviations, it is noise. One band that proves it
     is enough: a quiet band's jumps may be lost in another's noise, and then do little.
