@@ -48,10 +48,8 @@ def ratio_variance_bound(
 
     Parameters
     ----------
-    emissivity : tuple of float
-        Emissivities of the two bands [1].
-    noise : tuple of float
-        Standard deviations of the noise [K].
+    emissivity, noise : tuple of float
+        Emissivities [1] of the two bands, and standard deviations of their noise [K].
     background : ndarray, shape (time, ...)
         Background temperature [K].
     functions : ndarray, shape (time, order)

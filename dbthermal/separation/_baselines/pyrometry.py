@@ -58,7 +58,6 @@ class RatioSettings:
     order : int or None
         Number of polynomials of time that both radiances are smoothed with, by least squares,
         before their ratio is taken; None for no smoothing.
-
     """
 
     kind: str = "wide"
