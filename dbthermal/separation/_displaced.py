@@ -261,13 +261,13 @@ def _blurred(
         """The weights applied to values (time, pixel), along one axis after the other."""
         values = values.reshape(len(values), -1, width)
         for axis in (1, 2):
-            values = correlate1d(values, taps, axis, mode="constant")
-        return values.reshape(len(values), -1)[:, here] * inverse
+            values = np.asarray(correlate1d(values, taps, axis, mode="constant"))
+        return np.asarray(values.reshape(len(values), -1)[:, here] * inverse)
 
     reach = int(TAIL * displacement.blur)
     taps = _gaussian(slice(reach, reach + 1), slice(2 * reach + 1), displacement.blur)[0]
     known = known & usable
-    share = np.maximum(smoothed(1.0 * known), _NO_WEIGHT)
+    share = np.maximum(smoothed(np.where(known, 1.0, 0.0)), _NO_WEIGHT)
     blurred = np.stack([smoothed(one * known) / share for one in counts])
     # Of independent noise, blurred, or resampled and blurred; and what was measured of shared one.
     paired = displacement.weights(more, displacement.source(rows))
