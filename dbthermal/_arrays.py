@@ -38,3 +38,15 @@ def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:
     """Quotient where the denominator is positive, and another value elsewhere."""
     xp, positive = namespace(denominator), denominator > 0
     return xp.where(positive, numerator / xp.where(positive, denominator, 1.0), otherwise)
+
+
+def select(values: Any, selected: Any, axis: int = -1) -> Any:
+    """Values at the selected places along an axis, told by a mask or by their numbers.
+
+    Along the last one, an index of NumPy would leave the axes in another order in memory, and take
+    several times as long.
+    """
+    if namespace(values) is not np:
+        return values.movedim(axis, -1)[..., selected].movedim(-1, axis)
+    selected = np.flatnonzero(selected) if selected.dtype == bool else selected
+    return values.take(selected, axis=axis)

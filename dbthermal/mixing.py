@@ -24,10 +24,8 @@ def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
 
     Parameters
     ----------
-    emissivity : array or tensor
-        Emissivity e [1].
-    emitted, reflected : array or tensor
-        Blackbody signals at the object's and at the background's temperature, in one unit.
+    emissivity, emitted, reflected : array or tensor
+        Emissivity e [1]; blackbody signals at object's and background's temperature, in one unit.
 
     Examples
     --------
@@ -55,10 +53,8 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
 
     Parameters
     ----------
-    emissivity : array_like
-        Emissivity [1]; ValueError if one lies outside [0, 1] or is NaN.
-    emitted, reflected : array_like
-        Blackbody signal at the object's and at the background's temperature, in one unit.
+    emissivity, emitted, reflected : array_like
+        As for `mixed`; ValueError if an emissivity lies outside [0, 1] or is NaN.
 
     Examples
     --------

@@ -196,38 +196,28 @@ def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:
 
 def _reduced(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Capture of means over squares of pixels and over frames, and the response for it."""
-    height, width, frames = (aligned.sizes[dim] for dim in ("y", "x", "time"))
     side, length = _reduction(aligned)
     if side == length == 1:
         return aligned.load(), response
-    rows, columns, times = height // side, width // side, frames // length
-    good, segment = np.ones((height, width), dtype=bool), np.zeros(frames, dtype=np.int32)
-    if "status" in aligned:
-        good = (aligned["status"].values & _BAD) == 0
-    if "segment" in aligned:
-        segment = aligned["segment"].values
-    parts = segment[: times * length].reshape(times, length)
-    means = np.full((aligned.sizes["band"], times, rows, columns), np.nan, dtype=np.float32)
-    for row in range(rows):
-        block = slice(row * side, (row + 1) * side)
-        counts = aligned["counts"].isel(y=block).values[:, : times * length, :, : columns * side]
-        valid = np.all(schema.measured(counts), axis=0) & good[block, : columns * side]
-        valid = valid.reshape(times, length, side, columns, side)
+    maps = aligned.drop_vars(["y", "x"], errors="ignore")
+    counts, squares = maps["counts"], dict[str, Any](y=side, x=side, boundary="trim")
+    none = {dim: xr.zeros_like(maps[dim], dtype=np.int32) for dim in ("time", "y", "x")}
+    bad = (maps.get("status", none["y"] + none["x"]) & _BAD) != 0
+    segment = maps.get("segment", none["time"])
+    first = segment.values[np.arange(segment.size) // length * length]
+    rows = []
+    for top in range(0, counts.sizes["y"] - side + 1, side):
+        block = counts[:, :, top : top + side].astype(np.float64)
         # Of all bands the same samples, on one side of a shutter event.
-        valid &= (parts == parts[:, :1]).reshape(times, length, 1, 1, 1)
-        number = valid.sum(axis=(1, 2, 4))
-        for band, movie in enumerate(counts):
-            total = movie.reshape(valid.shape).sum(axis=(1, 2, 4), where=valid, dtype=np.float64)
-            np.divide(total, number, out=means[band, :, row], where=number > 0, casting="same_kind")
-    clock = aligned["time"].values[: times * length].reshape(times, length).mean(axis=1)
-    lost = ~good[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        valid = schema.measured(block).all("band") & (segment == first)
+        valid &= ~bad[top : top + side]
+        rows.append(block.where(valid).coarsen(time=length, **squares).mean())
     small = xr.Dataset(
         {
-            "counts": (aligned["counts"].dims, means, aligned["counts"].attrs),
-            "status": (("y", "x"), lost.all(axis=(1, 3)) * np.uint32(Status.DEAD_PIXEL)),
-            "segment": ("time", parts[:, 0], schema.SEGMENT.attrs),
+            "counts": xr.concat(rows, "y").astype(np.float32).assign_attrs(counts.attrs),
+            "status": bad.coarsen(**squares).all() * np.uint32(Status.DEAD_PIXEL),
+            "segment": ("time", first[: rows[0].sizes["time"] * length : length]),
         },
-        coords={"band": aligned["band"], "time": ("time", clock, aligned["time"].attrs)},
         attrs=aligned.attrs,
     )
     # Interpolated samples are not independent: the noise of their means is that of the means.

@@ -68,12 +68,11 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     [110.7, 342.3]
     """
     finite = numbers.copy(data=np.isfinite(numbers.values))
-    count = finite.sum("material")
-    total = numbers.where(finite, 0.0).sum("material")
+    mean = numbers.where(finite).mean("material").fillna(np.inf)
     parts = {
         "median": (numbers.median("material", skipna=False), "condition number, median"),
-        "mean": ((total / count.where(count > 0, 1)).where(count > 0, np.inf), "its finite mean"),
-        "finite": (count, "materials with a finite condition number"),
+        "mean": (mean, "its finite mean"),
+        "finite": (finite.sum("material"), "materials with a finite condition number"),
     }
     return xr.Dataset(
         {

@@ -135,9 +135,7 @@ def embedded_table() -> xr.Dataset:
     >>> embedded_table().emissivity.sel(material="plate window glass", band="9.5").item()
     0.718
     """
-    with resources.as_file(resources.files("dbthermal.emissivity").joinpath(_TABLE)) as path:
-        rows = texts.table_rows(texts.read_text(path), _TABLE, comment="#")
-    (_, titles), *rows = rows
+    titles, rows = _packaged(_TABLE)
     names = ["material", "library", "source"]
     if titles != [*names, *FILTERS, "coverage_8_14"]:
         raise ValueError(f"Invalid columns {titles} of '{_TABLE}'. Must be those of the filters.")
@@ -182,10 +180,8 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
             f"Invalid bands {names} of the library's emissivities. Must be of {list(FILTERS)}, "
             "each once; of other bands give a prior on the emissivities."
         )
-    with resources.as_file(resources.files("dbthermal.emissivity").joinpath(_MIXTURE)) as path:
-        (_, titles), *rows = texts.table_rows(texts.read_text(path), _MIXTURE, comment="#")
-    count = len(FILTERS)
-    values = texts.numbers(rows, len(titles), _MIXTURE)
+    titles, rows = _packaged(_MIXTURE)
+    count, values = len(FILTERS), texts.numbers(rows, len(titles), _MIXTURE)
     covariance = np.zeros((len(values), count, count))
     i, j = np.tril_indices(count)
     covariance[:, i, j] = covariance[:, j, i] = values[:, 1 + count :]
@@ -201,6 +197,13 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
         "covariance": (("component", "band", "other"), np.concatenate([known, wide[np.newaxis]])),
     }
     return xr.Dataset(variables, {"band": names, "other": names})
+
+
+def _packaged(name: str) -> tuple[list[str], list[texts.Row]]:
+    """Titles and rows of a table that comes with the package."""
+    with resources.as_file(resources.files("dbthermal.emissivity").joinpath(name)) as path:
+        (_, titles), *rows = texts.table_rows(texts.read_text(path), name, comment="#")
+    return titles, rows
 
 
 def chosen_bands(bands: Bands) -> list[Band]:
@@ -227,19 +230,13 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
         raise
     emissivity = values.values.astype(np.float64)
     wavelength = values["wavelength"].values.astype(np.float64)
-    bad = ~np.isfinite(emissivity)
-    if bad.any():
-        raise ValueError(
-            f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
-            "Must be finite."
-        )
     lowest, highest = schema.EMISSIVITY_LIMITS
-    bad = (emissivity < lowest) | (emissivity > highest)
-    if bad.any():
-        raise ValueError(
-            f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
-            f"Must lie in [{lowest}, {highest}]; it is a fraction, not per cent."
-        )
+    limits = f"lie in [{lowest}, {highest}]; it is a fraction, not per cent"
+    within = (emissivity >= lowest) & (emissivity <= highest)
+    for bad, rule in ((~np.isfinite(emissivity), "be finite"), (~within, limits)):
+        if bad.any():
+            found = f"{emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m"
+            raise ValueError(f"Invalid emissivity {found}. Must {rule}.")
     return wavelength, emissivity
 
 

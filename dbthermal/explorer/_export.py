@@ -1,19 +1,19 @@
 """Figure and files of explored frames and curves."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 
 from dbthermal import figures, store
-from dbthermal._arrays import Array
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
@@ -22,17 +22,23 @@ SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
 _MOST_COLUMNS: Final = 3
 
 
-def figure(
-    view: View,
-    names: Sequence[str],
-    index: int,
-    regions: Mapping[str, Region],
-    *,
-    celsius: bool,
-    palette: str = "inferno",
-    limits: Mapping[str, tuple[float, float]],
-) -> Figure:
-    """Figure of some panes at a frame, side by side, with the outlines of regions."""
+@dataclass(frozen=True)
+class Shown:
+    """Panes of a view at a frame, as a page shows them."""
+
+    names: Sequence[str]  # of the panes
+    index: int  # of the frame
+    regions: Mapping[str, Region]
+    celsius: bool
+    pixels: Pixels = "unflagged"  # that count in the regions' curves
+    palette: str = "inferno"
+    # Ranges of colour by pane; the view's own if left out.
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def figure(view: View, shown: Shown) -> Figure:
+    """Figure of the panes side by side, with the outlines of regions."""
+    names = shown.names
     columns = 2 if len(names) == 4 else min(len(names), _MOST_COLUMNS)
     rows = -(-len(names) // columns)
     height = 3.6 * view.shape[0] / view.shape[1] + 0.5
@@ -49,19 +55,18 @@ def figure(
             axis.set(xticks=[], yticks=[])
             axis.set_title("Status: green is without a flag", fontsize=9)
         else:
-            units, offset = pane.unit(celsius=celsius)
-            low, high = limits.get(name) or view.limits(name)
-            image = xr.DataArray(view.frame(name, index) - offset, dims=("y", "x"))
+            units, offset = pane.unit(celsius=shown.celsius)
+            low, high = shown.limits.get(name) or view.limits(name)
+            image = xr.DataArray(view.frame(name, shown.index) - offset, dims=("y", "x"))
             label = units if units != "1" else ""
             scale = (low - offset, high - offset)
             title = pane.label[0].upper() + pane.label[1:]
-            drawing.draw_image(result, axis, image, title, label, cmap=palette, limits=scale)
-        for place, region in enumerate(regions.values()):
+            drawing.draw_image(result, axis, image, title, label, cmap=shown.palette, limits=scale)
+        for place, region in enumerate(shown.regions.values()):
             color = drawing.COLORS[place % len(drawing.COLORS)]
-            outline = _outline(region) - 0.5
-            axis.add_patch(Polygon(outline[:, ::-1], fill=False, edgecolor=color, linewidth=1.5))
+            axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))
     note = drawing.provenance_note(view.data)
-    result.suptitle(f"{view.time[index]:.2f} s{note}", fontsize=10)
+    result.suptitle(f"{view.time[shown.index]:.2f} s{note}", fontsize=10)
     return result
 
 
@@ -74,19 +79,15 @@ def status_legend(view: View) -> tuple[npt.NDArray[np.uint8], list[tuple[str, st
     return codes, [(*texts[name], float(np.mean(first == name))) for name in names]
 
 
-def _outline(region: Region) -> Array:
-    """Corners (n, 2) of an outline, rows and columns."""
+def _outline(region: Region, **style: Any) -> Patch:
+    """Outline of a region on a picture, whose first pixel has its centre at 0."""
+    corners = np.array(region.points)[:, ::-1] - 0.5  # (x, y)
     if region.kind == "polygon":
-        return np.array(region.points)
-    (top, left), (bottom, right) = region.points
+        return Polygon(corners, **style)
+    size = corners[1] - corners[0]
     if region.kind == "rectangle":
-        return np.array([(top, left), (top, right), (bottom, right), (bottom, left)])
-    angle = np.linspace(0.0, 2.0 * np.pi, 90)
-    middle, half = (
-        np.array([top + bottom, left + right]) / 2,
-        np.array([bottom - top, right - left]),
-    )
-    return np.asarray(middle + np.column_stack([np.sin(angle), np.cos(angle)]) * half / 2)
+        return Rectangle(corners[0], *size, **style)
+    return Ellipse(corners.mean(axis=0), *size, **style)
 
 
 def curves(
@@ -102,32 +103,21 @@ def curves(
     return result.assign(outline=("region", outlines)).assign_attrs(pane=name, selection=pixels)
 
 
-def save(  # noqa: PLR0913 - what the page shows, by name
-    view: View,
-    path: str | Path,
-    names: Sequence[str],
-    index: int,
-    regions: Mapping[str, Region],
-    *,
-    celsius: bool,
-    pixels: Pixels = "unflagged",
-    palette: str = "inferno",
-    limits: Mapping[str, tuple[float, float]],
-) -> None:
+def save(view: View, path: str | Path, shown: Shown) -> None:
     """Save what is seen, by suffix.
 
     ``.csv``: curves of the regions in the first pane; ``.tiff``: its frame, 32-bit float in its own
     units; ``.png``: all panes; ``.nc``: all panes' frames, and the curves.
     """
-    path, (name, *_) = Path(path), names
+    path, (name, *_), index = Path(path), shown.names, shown.index
     if path.suffix not in SUFFIXES:
         raise ValueError(f"Invalid path '{path}'. Must end in one of {list(SUFFIXES)}.")
     what = {"pane": name, "frame": index, "sources": view.sources}
     if path.suffix == ".csv":
-        path.write_text(_table(view, curves(view, name, regions, pixels), celsius=celsius))
+        found = curves(view, name, shown.regions, shown.pixels)
+        path.write_text(_table(view, found, celsius=shown.celsius))
     elif path.suffix == ".png":
-        shown = figure(view, names, index, regions, celsius=celsius, palette=palette, limits=limits)
-        store.save_figure(shown, path, store.provenance(what))
+        store.save_figure(figure(view, shown), path, store.provenance(what))
     elif path.suffix == ".tiff":
         pane = view.pane(name)
         text = f"{pane.label} [{pane.units}] at {view.time[index]:.3f} s"
@@ -135,13 +125,13 @@ def save(  # noqa: PLR0913 - what the page shows, by name
             path, tiffinfo={270: text.encode("ascii", "ignore")}
         )
     else:
-        units = {one: {"units": view.panes[one].units} for one in names}
-        frames = {
-            one.replace(" ", "_"): (("y", "x"), view.frame(one, index), units[one]) for one in names
-        }
-        result = xr.Dataset(frames, attrs={"time": float(view.time[index])})
-        if regions and view.panes[name].kind != "status":
-            result = result.merge(curves(view, name, regions, pixels), combine_attrs="no_conflicts")
+        result = xr.Dataset(attrs={"time": float(view.time[index])})
+        for one in shown.names:
+            units = {"units": view.panes[one].units}
+            result[one.replace(" ", "_")] = (("y", "x"), view.frame(one, index), units)
+        if shown.regions and view.panes[name].kind != "status":
+            found = curves(view, name, shown.regions, shown.pixels)
+            result = result.merge(found, combine_attrs="no_conflicts")
         result.to_netcdf(path, engine="scipy")
 
 
@@ -154,9 +144,7 @@ def _table(view: View, found: xr.Dataset, *, celsius: bool) -> str:
         one = found.sel(region=region)
         for name, zero in names:
             of = "K" if name == "std" and zero != offset else units
-            columns[f'"{region} {name} [{of}]"'] = np.atleast_1d(one[name].values - zero)
-        columns[f'"{region} pixels"'] = np.atleast_1d(one["pixels"].values)
-    lines = [
-        ",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)
-    ]
-    return "\n".join([",".join(columns), *lines]) + "\n"
+            columns[f"{region} {name} [{of}]"] = np.atleast_1d(one[name].values - zero)
+        columns[f"{region} pixels"] = np.atleast_1d(one["pixels"].values)
+    rows = xr.Dataset({name: ("row", values) for name, values in columns.items()}).to_dataframe()
+    return str(rows.to_csv(index=False, float_format="%.6g", na_rep="nan"))

@@ -93,11 +93,9 @@ class Explorer(anywidget.AnyWidget):
         names = ["object_temperature"] if "object_temperature" in panes else films
         names += [name for name in panes if name == "status" or name.startswith("emissivity ")]
         limits = {name: self._range(name) for name in names if name != "status"}
-        shown = _export.figure(
-            view, names, self._state["index"], {}, celsius=self._celsius, limits=limits
-        )
+        shown = _export.Shown(names, self._state["index"], {}, self._celsius, limits=limits)
         buffer = io.BytesIO()
-        shown.savefig(buffer, dpi=_DPI)
+        _export.figure(view, shown).savefig(buffer, dpi=_DPI)
         return base64.b64encode(buffer.getvalue()).decode()
 
     def _range(self, name: str) -> tuple[float, float]:
@@ -199,17 +197,13 @@ class Explorer(anywidget.AnyWidget):
 
     def _answer_export(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer a file of what is seen."""
+        shown = _export.Shown(
+            names=asked["panes"],
+            regions=self.regions,
+            limits={name: tuple(pair) for name, pair in asked["limits"].items()},
+            **{name: asked[name] for name in ("index", "celsius", "pixels", "palette")},
+        )
         with TemporaryDirectory() as folder:
             path = Path(folder) / f"explored{asked['suffix']}"
-            _export.save(
-                self.view,
-                path,
-                asked["panes"],
-                asked["index"],
-                self.regions,
-                celsius=asked["celsius"],
-                pixels=asked["pixels"],
-                palette=asked["palette"],
-                limits={name: tuple(pair) for name, pair in asked["limits"].items()},
-            )
+            _export.save(self.view, path, shown)
             return {"name": path.name}, [np.frombuffer(path.read_bytes(), dtype=np.uint8)]

@@ -109,17 +109,13 @@ def separated_temperatures(
 
     Parameters
     ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K].
-    emission : DataArray
-        Object temperature (time, y, x) [K].
+    apparent, emission : DataArray
+        Temperature of the inputs (band, time, y, x), and of the object (time, y, x) [K].
     change : DataArray
         Background temperature less its mean over time, or `separation.reflected_change`
         (time, y, x) [K].
-    title : str
-        Name of the scene.
-    label : str
-        Label of the change, with its unit.
+    title, label : str
+        Name of the scene; label of the change, with its unit.
 
     Examples
     --------

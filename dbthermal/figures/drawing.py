@@ -104,10 +104,8 @@ def draw_image(
         Where to draw.
     image : DataArray
         (y, x).
-    title, label : str
-        Title, and label of the colour bar with its unit.
-    cmap : str
-        Colour map.
+    title, label, cmap : str
+        Title, label of the colour bar with its unit, and colour map.
     limits : tuple of float, optional
         Values at the ends of the colour map; the image's own if not given.
     """

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.stats import mode
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
@@ -48,10 +49,8 @@ def ratio_variance_bound(
 
     Parameters
     ----------
-    emissivity : tuple of float
-        Emissivities of the two bands [1].
-    noise : tuple of float
-        Standard deviations of the noise [K].
+    emissivity, noise : tuple of float
+        Emissivities [1] of the two bands, and standard deviations of their noise [K].
     background : ndarray, shape (time, ...)
         Background temperature [K].
     functions : ndarray, shape (time, order)
@@ -210,13 +209,8 @@ def _most_frequent(background: Array) -> Mask:
 
     No frame where no two share a temperature; the lowest of several that are as frequent.
     """
-    ordered = np.sort(background, axis=0)
-    place = np.arange(len(ordered))[:, np.newaxis]
-    new = np.diff(ordered, axis=0, prepend=-np.inf) > 0
-    length = place - np.maximum.accumulate(np.where(new, place, 0), axis=0)
-    longest = np.argmax(length, axis=0)[np.newaxis]
-    level = np.take_along_axis(ordered, longest, axis=0)
-    return np.asarray((background == level) & (length.max(axis=0) > 0))
+    level, frames = mode(background, axis=0)
+    return np.asarray((background == level) & (frames > 1))
 
 
 def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:

@@ -1,14 +1,10 @@
 """Counts in files of NumPy, HDF5, NetCDF and zarr, or in an array that is opened already."""
 
-import lzma
-import struct
 import warnings
 import zipfile
-import zlib
 from contextlib import ExitStack
 from pathlib import Path
-from tokenize import TokenError
-from typing import IO, Any, Final
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,15 +14,6 @@ from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._recording import Clock
-
-_NO_ARCHIVE: Final = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
-    *(ValueError, OSError, EOFError, RuntimeError, LookupError),
-)
-_NO_HEADER: Final = (
-    *(ValueError, LookupError, SyntaxError, TypeError, AttributeError, ArithmeticError),
-    *(RecursionError, MemoryError, TokenError, Warning),
-)
 
 
 def array(
@@ -106,7 +93,7 @@ def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: st
 def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:
     """Array of a .npy or of a .npz, whose checksums must be right."""
     stream: IO[bytes] = stack.enter_context(path.open("rb"))
-    try:
+    with recordings.damage_named(f"Damaged '{path.name}'", "a whole .npz"):
         if stream.read(2) == b"PK":
             archive = stack.enter_context(zipfile.ZipFile(path))
             names = [member.removesuffix(".npy") for member in archive.namelist()]
@@ -115,15 +102,11 @@ def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -
         else:
             stream.seek(0)
         return _numpy_array(stream, path.name, memory)
-    except _NO_ARCHIVE as error:
-        if isinstance(error, ValueError) and "Must " in str(error):
-            raise
-        raise ValueError(f"Damaged '{path.name}': {error}. Must be a whole .npz.") from error
 
 
 def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any]:
     """Array in NumPy's format, which must end where its header says."""
-    try:
+    with recordings.damage_named(f"Invalid '{name}'", ".npy, .npz, HDF5, NetCDF or zarr"):
         version = np.lib.format.read_magic(stream)
         headers = {
             (1, 0): np.lib.format.read_array_header_1_0,
@@ -131,11 +114,6 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any
         }
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
             shape, by_columns, dtype = headers[version](stream)
-    except _NO_HEADER as error:
-        message = " ".join(str(error).split())[:100]
-        raise ValueError(
-            f"Invalid '{name}': {message}. Must be .npy, .npz, HDF5, NetCDF or zarr."
-        ) from error
     _check(shape, dtype, memory, name)
     size = 2 * int(np.prod(shape, dtype=object))
     if len(content := stream.read(size + 1)) != size:

@@ -16,10 +16,6 @@ import zarr
 from dbthermal.readers import _recording as recordings
 
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
-_DAMAGE: Final = (
-    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError),
-    *(OSError, EOFError, RuntimeError, MemoryError, SystemError, RuntimeWarning, UserWarning),
-)
 
 
 def kind_of(path: Path) -> str:
@@ -40,9 +36,9 @@ def read(
     if kind == "NetCDF" and path.stat().st_size > limit:
         rule = f"Must be at most {limit:.3g} bytes, twice memory=, for it is read at once"
         raise ValueError(f"Invalid size of '{path.name}'. {rule}.")
-    try:
-        stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
-        warnings.simplefilter("error", UserWarning)  # as of one dimension twice
+    stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
+    warnings.simplefilter("error", UserWarning)  # as of one dimension twice
+    with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
         found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
         values, dims = found[recordings.array_name(found, name, path)]
         if "time" in dims[1:]:
@@ -53,11 +49,6 @@ def read(
         if isinstance(values, zarr.Array):
             _check_chunks(values, path)
         return values[...]
-    except _DAMAGE as error:
-        if isinstance(error, ValueError) and "Must " in str(error):
-            raise
-        message = " ".join(str(error).split())[:200]
-        raise ValueError(f"Damaged '{path.name}': {message}. Must be a whole {kind}.") from error
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:

@@ -1,9 +1,15 @@
 """Parts that all readers of recordings share: files, byte order, clock, and the Dataset made."""
 
+import lzma
 import re
-from collections.abc import Collection, Mapping, Sequence
+import struct
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Final
 
 import numpy as np
@@ -27,6 +33,12 @@ _REFUSED: Final = {
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
+# What the libraries of the formats raise for files that are damaged.
+DAMAGE: Final = (
+    *(ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError),
+    *(RuntimeError, SyntaxError, SystemError, TypeError, ValueError, Warning, TokenError),
+    *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
+)
 # An image is smoother than with its bytes swapped, by this factor, or the order is not known.
 _SMOOTHER: Final = 2.0
 
@@ -56,6 +68,18 @@ def files(path: Paths) -> list[Path]:
         if texts.regular_file(one, _LARGEST).stat().st_size == 0:
             raise ValueError(f"Empty file '{one.name}'. Must hold at least one frame.")
     return paths
+
+
+@contextmanager
+def damage_named(found: str, rule: str) -> Iterator[None]:
+    """Make one line of all that a library raises for a damaged file; what a reader says stays."""
+    try:
+        yield
+    except DAMAGE as error:
+        if isinstance(error, ValueError) and "Must " in str(error):
+            raise
+        message = " ".join(str(error).split())[:200]
+        raise ValueError(f"{found}: {message}. Must be {rule}.") from error
 
 
 def check_memory(shape: Sequence[int], memory: float, name: str) -> None:

@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import re
-import struct
 from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
@@ -25,11 +24,6 @@ _FORM: Final = (
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
     ("is_tiled", "tiled pages", False, "False: save it in strips"),
-)
-# What tifffile raises for damaged files, its own errors among them.
-_DAMAGE: Final = (
-    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError),
-    *(struct.error, OSError, MemoryError),
 )
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
@@ -204,7 +198,7 @@ def _pages(path: Path) -> list[_Page]:
             if not complaints.empty():  # which tifffile logs, and goes on
                 raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)
-    except _DAMAGE as error:
+    except recordings.DAMAGE as error:
         refused = "Must " in str(error)
         state, rule = ("Invalid", "") if refused else ("Damaged", ". Must be whole, or BigTIFF.")
         raise ValueError(f"{state} TIFF '{path.name}': {error}{rule}") from error

@@ -58,10 +58,8 @@ def save_page(
         Title, and beside it what the data are: "measured", "simulated", "emulated".
     sections : iterable of Section
         In their order.
-    numbers : mapping
-        Numbers of the page, kept in it as JSON in the element ``numbers``.
-    provenance : mapping
-        From `store.provenance`, shown at the end.
+    numbers, provenance : mapping
+        Numbers, kept in the page as JSON in the element ``numbers``; from `store.provenance`.
     """
     environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True)
     text = resources.files("dbthermal.reporting").joinpath("page.html").read_text("utf-8")

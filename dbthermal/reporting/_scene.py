@@ -206,9 +206,7 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
     pane = view.panes["object_temperature"]
     unit, zero = pane.unit(celsius=celsius)
     film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000)
-    with np.errstate(invalid="ignore"):
-        count = film.notnull().sum("time")
-        image = film.sum("time") / count.where(count > 0) - zero
+    image = film.mean("time") - zero
     aspect = view.shape[0] / view.shape[1]
     figure, axes = drawing.canvas(1, 1, (5.6, 4.6 * aspect + 0.5))
     limits = drawing.limits_of(image)

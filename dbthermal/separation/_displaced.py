@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import distance_transform_edt, map_coordinates, uniform_filter
+from scipy.ndimage import correlate1d, distance_transform_edt, map_coordinates, uniform_filter
 from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
@@ -256,8 +256,19 @@ def _blurred(
     total = weights.sum(axis=1)
     inverse = np.divide(1.0, total, out=np.zeros_like(total), where=usable[here])
     weights = csr_array(diags_array(inverse) @ weights)
-    share = np.maximum((weights @ (1.0 * known).T).T, _NO_WEIGHT)
-    blurred = np.stack([(weights @ (one * known).T).T / share for one in counts])
+
+    def smoothed(values: Array) -> Array:
+        """The weights applied to values (time, pixel), along one axis after the other."""
+        values = values.reshape(len(values), -1, width)
+        for axis in (1, 2):
+            values = np.asarray(correlate1d(values, taps, axis, mode="constant"))
+        return np.asarray(values.reshape(len(values), -1)[:, here] * inverse)
+
+    reach = int(TAIL * displacement.blur)
+    taps = _gaussian(slice(reach, reach + 1), slice(2 * reach + 1), displacement.blur)[0]
+    known = known & usable
+    share = np.maximum(smoothed(np.where(known, 1.0, 0.0)), _NO_WEIGHT)
+    blurred = np.stack([smoothed(one * known) / share for one in counts])
     # Of independent noise, blurred, or resampled and blurred; and what was measured of shared one.
     paired = displacement.weights(more, displacement.source(rows))
     own, both, before = (

@@ -120,17 +120,22 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)
     if not np.any(gap):
         return counts, valid
-    place = np.arange(len(valid))[:, np.newaxis]
-    before = np.maximum.accumulate(np.where(valid, place, -1), axis=0)
-    after = np.minimum.accumulate(np.where(valid, place, len(valid))[::-1], axis=0)[::-1]
-    gap &= (before >= 0) & (after < len(valid)) & (after - before <= LONGEST_GAP + 1)
     frame, pixel = np.nonzero(gap)
-    first, last = before[frame, pixel], after[frame, pixel]
+    ends = []
+    for step in (-1, 1):
+        end = frame
+        for _ in range(LONGEST_GAP):  # beyond the capture there is no valid frame
+            end = np.clip(np.where(valid[end, pixel], end, end + step), 0, len(valid) - 1)
+        ends.append(end)
+    short = valid[ends[0], pixel] & valid[ends[1], pixel] & (ends[1] - ends[0] <= LONGEST_GAP + 1)
+    frame, pixel, first, last = (one[short] for one in (frame, pixel, *ends))
     share = (time[frame] - time[first]) / (time[last] - time[first])
     filled = counts.copy()
     line = (1.0 - share) * counts[:, first, pixel] + share * counts[:, last, pixel]
     filled[:, frame, pixel] = line
-    return filled, valid | gap
+    bridged = valid.copy()
+    bridged[frame, pixel] = True
+    return filled, bridged
 
 
 def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:

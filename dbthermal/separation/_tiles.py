@@ -15,7 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing
-from dbthermal._arrays import namespace
+from dbthermal._arrays import namespace, select
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
@@ -55,7 +55,7 @@ class Pixels:
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
-        return self.each(lambda values: values[..., selected])
+        return self.each(lambda values: select(values, selected))
 
     def each(self, function: Callable[[Any], Any]) -> Self:
         """Return the record with a function of each of its arrays."""
@@ -147,17 +147,17 @@ class Tile:
     def select_frames(self, selected: Mask) -> "Tile":
         """Return the tile with the selected frames (time) alone."""
         segment = None if self.segment is None else self.segment[selected]
-        signals, time = self.signals[:, selected], self.time[selected]
-        return replace(self, signals=signals, time=time, segment=segment)
+        signals = select(self.signals, selected, axis=1)
+        return replace(self, signals=signals, time=self.time[selected], segment=segment)
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         known: dict[str, Any] = {
-            name: None if getattr(self, name) is None else getattr(self, name)[..., selected]
+            name: None if getattr(self, name) is None else select(getattr(self, name), selected)
             for name in ("emissivity", "emissivity_covariance")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
-        signals = self.signals[..., selected]
+        signals = select(self.signals, selected)
         shape = (1, signals.shape[2])
         return replace(self, signals=signals, shape=shape, material=material, **known)
 
@@ -308,10 +308,10 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0])
         parts = []
-        for frames, pixels in sets:
-            part = tile if np.all(frames) else tile.select_frames(frames)
+        for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
-            parts.append((frames, pixels, part if whole else part.select_pixels(pixels)))
+            part = tile if whole else tile.select_pixels(pixels)
+            parts.append((frames, pixels, part if np.all(frames) else part.select_frames(frames)))
         if displacement is not None:
             parts = [alike for one in parts for alike in of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)

@@ -17,7 +17,6 @@ SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 
 # Of bad pixels: noise and step [count], and mean time between steps [s].
 _NOISE, _STEP, _DWELL = 15.0, 60.0, 3.0
-_STAMP: Final = {"units": "s", "long_name": "time of exposure"}
 
 
 def expose(
@@ -80,9 +79,8 @@ def expose(
         for place, row in enumerate(steps)
     ]
     together = xr.concat(parts, dim="band", combine_attrs="override")
-    return schema.check(
-        together.assign(exposure_time=(("band", "time"), stamps, _STAMP)), "corrected"
-    )
+    exposed = schema.variables("corrected", {"exposure_time": stamps})
+    return schema.check(together.assign(exposed), "corrected")
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
@@ -131,10 +129,8 @@ def fire_shutter(
         Times in the capture at which the shutter closes [s]; the frame before is repeated.
     rng : Generator
         Source of the offsets.
-    duration : float
-        Time for which it stays closed [s].
-    offset_std : float
-        Standard deviation of a pixel's step [count].
+    duration, offset_std : float
+        Time for which it stays closed [s]; standard deviation of a pixel's step [count].
     bands : tuple of str, optional
         Bands whose cameras close; by default all.
 

@@ -196,10 +196,8 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
 
     Parameters
     ----------
-    corrected : Dataset
-        From `observe`.
-    detector : Dataset
-        From `pattern`, with the same bands and shape.
+    corrected, detector : Dataset
+        From `observe` and `pattern`, with the same bands and shape.
 
     Examples
     --------
@@ -292,12 +290,13 @@ def contact_measurements(
     Dataset
         `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
         (measurement) [K], as read.
-
     """
     names = [str(name) for name in response["band"].values]
     places = schema.band_positions(emissivity, names, "the emissivity")
-    levels = (object_temperature, background_temperature)
-    true = dict(zip(("object_temperature", "background_temperature"), levels, strict=True))
+    true = {
+        "object_temperature": object_temperature,
+        "background_temperature": background_temperature,
+    }
     emitted, reflected = (
         np.stack(_blackbody(response, xr.DataArray(level, dims="measurement", name="temperature")))
         for level in true.values()

@@ -236,17 +236,15 @@ def save_figure(
     from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
 
     text, suffix = as_json(provenance), Path(path).suffix
-    metadata: dict[str, Any] = {"Software": "dbthermal", "Comment": text}
-    if suffix == ".pdf":
-        metadata = {"Creator": "dbthermal", "Subject": text, "CreationDate": None}
-    elif suffix == ".svg":
-        metadata = {"Creator": "dbthermal", "Description": text, "Date": None}
-    kind = suffix if suffix in (".pdf", ".svg") else ".png"
-    with (
-        rc_context({"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}),
-        whole(path, kind) as part,
-    ):
-        figure.savefig(part, dpi=dpi, metadata=metadata)
+    metadata: dict[str, dict[str, Any]] = {
+        ".pdf": {"Creator": "dbthermal", "Subject": text, "CreationDate": None},
+        ".svg": {"Creator": "dbthermal", "Description": text, "Date": None},
+        ".png": {"Software": "dbthermal", "Comment": text},
+    }
+    kind = suffix if suffix in metadata else ".png"
+    fonts: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}
+    with rc_context(fonts), whole(path, kind) as part:
+        figure.savefig(part, dpi=dpi, metadata=metadata[kind])
 
 
 def save_video(

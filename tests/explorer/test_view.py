@@ -3,6 +3,7 @@
 import csv
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -192,8 +193,9 @@ def test_exported_files(tmp_path: Path) -> None:
     """CSV and NetCDF have the curves, TIFF and NetCDF the frame, PNG a picture; by suffix alone."""
     view, names = View(separated()), ["object_temperature", "emissivity 9.5", "status"]
     regions = {"region 1": WHOLE, "door": Region("rectangle", ((0, 0), (2, 2)))}
+    shown = _export.Shown(names, 1, regions, celsius=True)
     for suffix in _export.SUFFIXES:
-        _export.save(view, tmp_path / f"a{suffix}", names, 1, regions, celsius=True, limits={})
+        _export.save(view, tmp_path / f"a{suffix}", shown)
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["time [s]"] for row in rows] == ["0", "0.5", "1"]
@@ -207,9 +209,9 @@ def test_exported_files(tmp_path: Path) -> None:
         assert saved["mean"].sel(region="door").values.tolist() == [310.0, 311.0, 312.0]
         assert saved["object_temperature"].attrs["units"] == "K"
     with pytest.raises(ValueError, match="Must end in one of"):
-        _export.save(view, tmp_path / "a.txt", names, 1, regions, celsius=True, limits={})
+        _export.save(view, tmp_path / "a.txt", shown)
     with pytest.raises(ValueError, match="without a region"):
-        _export.save(view, tmp_path / "a.csv", names, 1, {}, celsius=True, limits={})
+        _export.save(view, tmp_path / "a.csv", replace(shown, regions={}))
 
 
 def test_codes_are_places_in_a_palette() -> None:

@@ -52,7 +52,6 @@ class BcpSettings:
         Reflected apparent temperature [K], if known.
     least_transmission : float
         t0, below which the emissivity is not divided by [1].
-
     """
 
     patch: int = 15

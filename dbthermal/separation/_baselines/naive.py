@@ -53,7 +53,6 @@ class NaiveSettings:
     tolerance : float
         A start is done when its objective, a sample's mean squared residual in units of the noise's
         variance, is below this, or a step lowers it by less than this fraction [1].
-
     """
 
     starts: int = 5

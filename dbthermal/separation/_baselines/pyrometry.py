@@ -14,6 +14,7 @@ of any width are inverted exactly, and the radiances are smoothed before their r
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -58,7 +59,6 @@ class RatioSettings:
     order : int or None
         Number of polynomials of time that both radiances are smoothed with, by least squares,
         before their ratio is taken; None for no smoothing.
-
     """
 
     kind: str = "wide"
@@ -115,11 +115,9 @@ def _radiance(curve: Curve, kind: str, temperature: Array) -> Array:
     band = bands.get(curve.band)
     lowest, highest = bands.TEMPERATURE_RANGE
     valid = (temperature >= lowest) & (temperature <= highest)
+    law = band.radiance if kind == "wide" else partial(planck.spectral_radiance, band.centre)
     result = np.full_like(temperature, np.nan)
-    if kind == "wide":
-        result[valid] = band.radiance(temperature[valid])
-    else:
-        result[valid] = planck.spectral_radiance(band.centre, temperature[valid])
+    result[valid] = law(temperature[valid])
     return result
 
 
