@@ -255,16 +255,16 @@ def _noise(
         known = np.asarray(responses.noise(response, names) / slopes)
         if decided == "capture":
             return response, np.asarray(known * factor)
-        pixels = max(samples.PIXELS, min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"]))
-        counts = samples.some_pixels(capture["counts"], pixels)
+        pixels = 0 if decided else min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"])
+        counts = samples.some_pixels(capture["counts"], max(samples.PIXELS, pixels))
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
         rounding = samples.rounding_std(counts) / slopes
         wide = np.sqrt(12.0) * rounding > known
         stated = np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * factor)
         signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
-        larger = samples.larger_noise(signals, stated)
-        if decided or np.isnan(larger).all():
+        larger = np.nan * stated if decided else samples.larger_noise(signals, stated)
+        if np.isnan(larger).all():
             return response.assign_attrs(noise_source="response"), stated
         noise = np.where(np.isnan(larger), stated, larger)
         said = " and ".join(
