@@ -94,7 +94,6 @@ def test_motion_is_no_noise(seed: int) -> None:
     """Whatever moves proves nothing: few frames, rapid heating, cameras apart, no rest at all."""
     rng = np.random.default_rng(seed)
     apart = smooth_shift(SHAPE, 6.0, 2.0)
-    options = {"start": 293.15, "stop": 323.15}
     scenes = [Picture(SHAPE).draw(TIME[:frames], GLASS, rng, apart) for frames in (60, 100, 300)]
     scenes += [Picture(SHAPE, walkers=30, rise=(0.5, 2.0)).draw(TIME, GLASS, rng)]
     scenes += [Picture(SHAPE, walkers=30).draw(TIME[:150] * 5.0, GLASS, rng)]
@@ -102,7 +101,7 @@ def test_motion_is_no_noise(seed: int) -> None:
         for correlation_time in (0.01, 0.1, 0.3, 3.0):
             walk = Background("random walk", correlation_time=correlation_time)
             args = (TIME, materials, walk, 400, rng)
-            scenes.append(simulation.independent_pixels(*args, **options))
+            scenes.append(simulation.independent_pixels(*args, start=293.15, stop=323.15))
     for place, scene in enumerate(scenes):
         found = larger(scene, 1.0, seed)
         assert np.isnan(found).all(), (place, found)
