@@ -235,7 +235,9 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     """
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
-    values = schema.band_values(response["noise"], bands, "'noise' of the response", "count")
+    schema.check_variable(response["noise"], schema.NOISE, "'noise' of the response")
+    places = schema.band_positions(response, bands, "the response")
+    values = np.asarray(response["noise"].values[places], dtype=np.float64)
     bad = ~((values > 0) & np.isfinite(values))
     if np.any(bad):
         raise ValueError(
