@@ -77,6 +77,7 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
         emissivity=none,
         noise_variance=none,
         drift_variance=none,
+        spread=np.zeros(status.size),
     )
 
 
@@ -100,7 +101,12 @@ def materials(
         more = pool.materials(alike, threads, bar, every=every, surveyed=surveyed)
         if more is not None:  # else all materials are too narrow
             found = more if found is None else _blurred(found, more, inputs)
-    return None if found is None else pool.materials(inputs, threads, bar, known=found)
+    if found is None:
+        return None
+    # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
+    variance, none = found.inverse_energy + found.spread, np.zeros_like(found.spread)
+    found = replace(found, inverse_energy=variance, spread=none)
+    return pool.materials(inputs, threads, bar, known=found)
 
 
 def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
@@ -114,7 +120,8 @@ def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
     error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
     off = (np.where(both, change, usual) * ratio[1:]) ** 2 / error
     inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
-    return replace(less, ratio=ratio, inverse_energy=inverse)
+    spread = np.where(known, more.spread, less.spread)
+    return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)
 
 
 def shared(

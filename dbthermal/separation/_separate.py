@@ -118,7 +118,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         regions = pooling.others(found, alone)
         pooled = pooling.without_borders(regions, alone, response)
         result = one(pool=pooled, reflection_shift=reflection_shift)
-        joined = pooling.joined(regions, result, response)
+        joined = pooling.joined(regions, alone, result, response)
         materials = pooling.without_borders(joined, alone, response)
     if materials is not None and (pooled is None or not materials.equals(pooled)):
         result = one(pool=materials, reflection_shift=reflection_shift)

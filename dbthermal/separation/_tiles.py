@@ -81,13 +81,14 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Material(Pixels):
-    """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
+    """Reflection ratios and emissivity of each pixel by its material; NaN for others."""
 
     ratio: Array  # reflection ratios (band, pixel) [1]
     inverse_energy: Array  # their variance, see `ReflectionRatio` (pixel) [1/K^2]
     emissivity: Array  # of the first band (pixel) [1]
     noise_variance: Array  # its variance from the noise (pixel) [1]
     drift_variance: Array  # its variance from the background's slow part (pixel) [1]
+    spread: Array  # variance of single pixels' ratios about these, as `inverse_energy` (pixel)
 
 
 @dataclass(frozen=True)

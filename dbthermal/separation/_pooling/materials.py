@@ -21,13 +21,14 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import binary_dilation, distance_transform_cdt
 from scipy.stats import chi2
 
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-from dbthermal.separation._pooling import feature_maps, region_merging
+from dbthermal.separation._pooling import feature_maps, gradients, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 
 NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
@@ -198,17 +199,33 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 
 
 def joined(
-    labels: xr.DataArray, pooled: xr.Dataset, response: xr.Dataset, *, resolution: float = 0.1
+    labels: xr.DataArray,
+    alone: xr.Dataset,
+    pooled: xr.Dataset,
+    response: xr.Dataset,
+    *,
+    resolution: float = 0.1,
 ) -> xr.DataArray:
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
-    object; pooled ratios are not.
+    object; pooled ratios are not. Also joined is what has no step at the border: an emissivity that
+    changes over its material.
     """
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     _, features = _features(pooled, _bands(pooled, response)[0])
     found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
-    found.join_alike(region_merging.neighbours(cells), resolution)
+    pairs = region_merging.neighbours(cells)
+    found.join_alike(pairs, resolution)
+    _, own = _features(alone, _bands(alone, response)[0])
+    before = -1
+    while before != (before := np.unique(found.roots()).size):
+        for first, second in pairs:
+            one, other = found.root(first), found.root(second)
+            if one != other:
+                current = found.roots()[cells]
+                if _continuous(current == one, current == other, own, resolution):
+                    found.join(one, other)
     return _labelled(cells, found, pooled)
 
 
@@ -326,6 +343,21 @@ def step(
     if np.any(residual > chi2.isf(_BORDER_RATE, pixels - design.shape[1])):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))
+
+
+def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:
+    """Whether the pixels' own features go on across the border of two regions (y, x)."""
+    reach, whole = _SPACINGS[0], (slice(None),)
+    border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
+    window = tuple(slice(max(0, p.min() - reach), p.max() + reach + 1) for p in np.nonzero(border))
+    one, other, border = one[window], other[window], border[window]
+    values, variances = own.values[whole + window], own.variances[whole + window]
+    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= reach)
+    both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
+    least = np.where(own.common, 0.0, resolution * np.abs(np.mean(values[:, both], axis=1)))
+    return gradients.continuous(
+        np.nonzero(both), values[:, both], variances[:, both], other[both], least
+    )
 
 
 def _labelled(cells: Labels, regions: Regions, result: xr.Dataset) -> xr.DataArray:

@@ -1,7 +1,7 @@
 """Reflection ratios and emissivity of each material, from the surveys of its pixels."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._pooling import gradients
 from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
@@ -50,7 +51,6 @@ def materials(
         return None
     labels = whole if surveyed is None else surveyed
     selected, blocks = select(labels), inputs.blocks
-    ratios = None if known is None else _of_labels(known, whole)
 
     def pooled(before: Material | None) -> tuple[Material | None, float]:
         """Materials, and the share of their pixels that have an emissivity."""
@@ -60,10 +60,10 @@ def materials(
             return None, 0.0
         places = np.concatenate([place for place, _ in surveys])
         together = surveys[0][1].join([part for _, part in surveys[1:]])
-        noise = inputs.noise[inputs.bands]
-        found = estimate(labels[places], int(whole.max()) + 1, together, noise, ratios)
+        image = Image(whole, places, inputs.capture.sizes["x"])
+        found = estimate(image, labels[places], together, inputs.noise[inputs.bands], known)
         told = np.isfinite(together.emissivity).sum() / max((together.frames > 0).sum(), 1)
-        return expand(found, whole), told
+        return found, told
 
     if known is not None:
         return pooled(replace(known, emissivity=np.full_like(known.emissivity, np.nan)))[0]
@@ -109,53 +109,130 @@ def select(labels: Labels) -> Mask:
     return result
 
 
-def expand(materials: Material, labels: Labels) -> Material:
-    """Materials at pixels of given labels (pixel,); NaN at those without a material, -1."""
-    values = (getattr(materials, field.name) for field in fields(Material))
-    return Material(*(np.where(labels >= 0, value[..., labels], np.nan) for value in values))
+@dataclass(frozen=True)
+class Image:
+    """Materials of all pixels of an image, and which of the pixels are surveyed."""
+
+    labels: Labels  # (pixel,)
+    surveyed: Labels  # numbers of pixels in the image (surveyed,)
+    width: int
+
+    def expand(self, values: Array) -> Array:
+        """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
+        return np.where(self.labels >= 0, values[..., self.labels], np.nan)
+
+    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
+        """Gradient at all pixels of a label, of some that are surveyed."""
+        asked = np.flatnonzero(self.labels == label)
+        places = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
+        return gradients.fit(*places, cost)
 
 
-def _of_labels(material: Material, labels: Labels) -> Material:
-    """Materials from those at the pixels of given labels (pixel,): the inverse of `expand`."""
-    pixels = np.unique(labels, return_index=True)
-    return material.select_pixels(pixels[1][pixels[0] >= 0])
+@dataclass(frozen=True)
+class _Common:
+    """Ratios of each pixel by its material."""
+
+    ratio: Array  # (band, pixel) [1]
+    variance: Array  # of them, common to neighbours (pixel) [1/K^2]
+    spread: Array  # of single pixels about them (pixel) [1/K^2]
 
 
 def estimate(
-    labels: Labels, count: int, survey: Survey, noise: Array, known: Material | None = None
+    image: Image, labels: Labels, survey: Survey, noise: Array, known: Material | None = None
 ) -> Material:
-    r"""Ratios and emissivity of so many materials from surveyed pixels and their labels (pixel,).
+    r"""Ratios and emissivity at all pixels, from surveyed ones of given labels (surveyed,).
 
     The scatters of the pixels are added, and their principal axis gives the material's ratios: the
     maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
-    the pixels' own, corrected to the common ratios. A pixel that differs from its material by more
-    than four standard deviations is left out. The noise is that of the bands (band,) [K]; NaN for a
-    material without information. Ratios that are `known` are those.
+    the pixels' own, corrected to these ratios. Both may have `gradients` over the place. A pixel
+    that differs from its material by more than four standard deviations is left out. The noise is
+    that of the bands (band,) [K]; NaN for a material without information. Ratios (band, pixel) that
+    are `known` are those.
     """
+    count = int(image.labels.max()) + 1
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # A pixel that takes a rapid object for the background has an energy beyond all others'.
         told = np.isfinite(survey.emissivity) * 1.0
         sound = np.where(told > 0, labels, -1)
         found = _ratios(sound, count, survey, noise, even=True)
-        outliers = _outliers(labels, found, survey, noise)
+        outliers = _outliers(labels, found, found.ratio[:, labels], survey, noise)
         # Near black the few that have an emissivity alone are selected by their own ratio.
         surveyed = np.where(survey.frames > 0, 1.0, 0.0)
         most = _sum(labels, told, count) > _MAJORITY * _sum(labels, surveyed, count)
-        outliers &= np.append(most, False)[labels]
-        used = np.where(outliers, -1, labels)
+        most = np.append(most, False)[labels]
+        used = np.where(outliers & most, -1, labels)
         for _ in range(_ROUNDS):
             found = _ratios(used, count, survey, noise, even=True)
-            outliers = _outliers(used, found, survey, noise)
+            outliers = _outliers(used, found, found.ratio[:, labels], survey, noise)
             if not np.any(outliers):
                 break
             used = np.where(outliers, -1, used)
         found = _ratios(used, count, survey, noise)
-        ratio, variance = found.ratio, found.variance
         if known is not None:
             stated = np.isfinite(known.ratio[-1])
-            ratio = np.where(stated, known.ratio, ratio)
-            variance = np.where(stated, known.inverse_energy, variance)
-        return Material(ratio, variance, *_emissivities(used, count, survey, ratio))
+            ratio = np.where(stated, known.ratio, image.expand(found.ratio))
+            variance = np.where(stated, known.inverse_energy, image.expand(found.variance))
+            return _material(image, _Common(ratio, variance, known.spread), used, survey)
+        common, graded = _graded(image, used, found, survey, noise)
+        for _ in range(_ROUNDS if np.any(graded) else 0):
+            # Along a gradient those far from its middle are no outliers, and no axis is common.
+            ratio, before = common.ratio[:, image.surveyed], used
+            used = np.where(graded[labels], labels, used)
+            for _ in range(_ROUNDS):
+                used = np.where(most & _outliers(used, found, ratio, survey, noise), -1, used)
+            found = _ratios(used, count, _turned(survey, found.ratio[:, labels] / ratio), noise)
+            common, graded = _graded(image, used, found, survey, noise)
+            if np.array_equal(used, before):
+                break
+        return _material(image, common, used, survey)
+
+
+def _turned(survey: Survey, change: Array) -> Survey:
+    """Survey with the rapid changes of each pixel times a factor (band, pixel), where known."""
+    factor = np.where(np.isfinite(change), change, 1.0)
+    factor = factor[:, np.newaxis] * factor
+    scatter, rapid = survey.scatter * factor, survey.rapid_scatter * factor
+    return replace(survey, scatter=scatter, rapid_scatter=rapid)
+
+
+def _graded(
+    image: Image, labels: Labels, found: "_Ratios", survey: Survey, noise: Array
+) -> tuple[_Common, Mask]:
+    r"""Ratios with their gradients over the place, and the materials that have one.
+
+    In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
+    axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
+    tells it by :math:`a = u^T C u - n^T C n`, :math:`b = n^T C u`, of variance u^T C u + n.
+    """
+    ratio, variance = image.expand(found.ratio), image.expand(found.variance)
+    spread, graded = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
+    scatter = np.where(found.rapid[labels], survey.rapid_scatter[1], survey.scatter)
+    frames = np.where(found.rapid[labels], survey.rapid_frames[1], survey.frames)
+    fits, at = [], []
+    for label in np.flatnonzero(np.isfinite(found.variance)):
+        pixels = np.flatnonzero((labels == label) & (frames > 0))
+        whitened = found.ratio[:, label] / noise
+        length, parts = whitened @ whitened, scatter[..., pixels]
+        axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
+        axes *= np.sign(axes[0, 0])
+        seen = np.einsum("bi,bcp,cj->ijp", axes, parts, axes)
+        asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
+        for number, across in enumerate(axes.T[1:], 1):
+            cost = gradients.Cost(
+                seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
+            )
+            one = image.gradient(label, pixels, cost)
+            if one.degree > 0:
+                graded[label] = True
+                vector = vector + one.value * across[:, np.newaxis]
+                variance[asked] = np.maximum(variance[asked], length * one.variance)
+            fits.append(one)
+            at.append((asked, length))
+        if graded[label]:
+            ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
+    for (asked, length), square in zip(at, gradients.spreads(fits), strict=True):
+        spread[asked] = np.maximum(spread[asked], length * square)
+    return _Common(ratio, variance, spread), graded
 
 
 def _sum(labels: Labels, values: Array, count: int) -> Array:
@@ -249,14 +326,16 @@ def _apart(
     return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
 
 
-def _outliers(labels: Labels, material: _Ratios, survey: Survey, noise: Array) -> Mask:
-    """Pixels whose ratio, at the orders of their material, is not the material's.
+def _outliers(
+    labels: Labels, material: _Ratios, common: Array, survey: Survey, noise: Array
+) -> Mask:
+    """Pixels whose ratio, at the orders of their material, is not the common one (band, pixel).
 
     Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
     that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
     go first: at least half as far as the farthest of the material.
     """
-    rapid, common = material.rapid[labels], material.ratio[:, labels]
+    rapid = material.rapid[labels]
     axis = common / noise[:, np.newaxis]
     axis = axis / np.sqrt((axis**2).sum(axis=0))
     result = np.zeros(labels.shape, dtype=bool)
@@ -276,12 +355,11 @@ def _outliers(labels: Labels, material: _Ratios, survey: Survey, noise: Array) -
     return np.asarray(result & known & (survey.frames > 0) & (labels >= 0))
 
 
-def _emissivities(
-    labels: Labels, count: int, survey: Survey, ratio: Array
-) -> tuple[Array, Array, Array]:
-    """Emissivity (material) of the first band, its variance from noise, and that from drift [1]."""
+def _material(image: Image, common: _Common, labels: Labels, survey: Survey) -> Material:
+    """Emissivity of the first band, its variance from noise, and that from drift [1], to ratios."""
+    count = int(image.labels.max()) + 1
     # e_1 at the common ratios: e_1 - e_1 (1 - e_1) w . kappa
-    product = (survey.null_weights * ratio[:, labels]).sum(axis=0)
+    product = (survey.null_weights * common.ratio[:, image.surveyed]).sum(axis=0)
     value = survey.emissivity * (1.0 - (1.0 - survey.emissivity) * product)
     known = (labels >= 0) & np.isfinite(value)
     where = np.where(known, labels, -1)
@@ -299,4 +377,24 @@ def _emissivities(
     scatter = _sum(where, weight**2 * residual, count) / total**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
     expected = _sum(where, weight**2 * noise, count) / total**2
-    return mean, np.maximum(scatter, expected), _sum(where, weight * drift, count) / total
+    result = Material(
+        ratio=common.ratio,
+        inverse_energy=common.variance,
+        emissivity=image.expand(mean),
+        noise_variance=image.expand(np.maximum(scatter, expected)),
+        drift_variance=image.expand(_sum(where, weight * drift, count) / total),
+        spread=common.spread,
+    )
+    fits = {}
+    for label in np.unique(where[known]):
+        some = np.flatnonzero(where == label)
+        w = weight[some]
+        cost = gradients.Cost(w, w * (value[some] - mean[label]), w**2 * noise[some])
+        fits[label] = image.gradient(label, some, cost)
+    for (label, fit), square in zip(fits.items(), gradients.spreads([*fits.values()]), strict=True):
+        pixels = np.flatnonzero(image.labels == label)
+        # Drift changes from pixel to pixel, too, by no more than its variance.
+        if np.var(fit.value) + square > result.drift_variance[pixels[0]]:
+            result.emissivity[pixels] += fit.value
+            result.noise_variance[pixels] = np.maximum(result.noise_variance[pixels], fit.variance) + square
+    return result

@@ -138,6 +138,12 @@ class Regions:
                 self._merge(first, second)
                 joined = True
 
+    def join(self, one: int, other: int) -> None:
+        """Join the regions of two cells."""
+        first, second = self.root(one), self.root(other)
+        if first != second:
+            self._merge(first, second)
+
     def join_in_order(self, pairs: Labels, order: Array) -> None:
         """Join neighbours (pair, 2) by rising order (pair,), unless their features disagree."""
         for index in np.argsort(order, kind="stable"):

@@ -361,7 +361,7 @@ def _work_space(functions: smooth.Subspace) -> Work:
         "columns": np.empty(columns),
         "spectra": np.empty((2, functions.rising.shape[1])),
         "scatter": np.empty((functions.orders, 3)),
-        "material": np.empty(5),
+        "material": np.empty(6),
     }
     curves = {name: np.empty(frames) for name in Work._fields}
     return Work(**curves | rest)
@@ -374,10 +374,11 @@ def solve(
     work, shared = _work_space(functions), _share(tile, functions, drift)
     material = tile.material
     frames, pixels = tile.signals.shape[1:]
-    materials = np.full((pixels, 5), np.nan)
+    materials = np.full((pixels, 6), np.nan)
     if material is not None:
         numbers = (material.ratio[1], material.inverse_energy, material.emissivity)
-        materials[:] = np.stack([*numbers, material.noise_variance, material.drift_variance], 1)
+        rest = (material.noise_variance, material.drift_variance, material.spread)
+        materials[:] = np.stack([*numbers, *rest], 1)
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)

@@ -63,20 +63,25 @@ def ratios(model: Model, work: Work) -> Ratio:
     order = _order(scatter, share, pooled, frames)
     free = frames - model.steps - (order + 1.0)
     a, b, d = scatter[order]
-    largest, null = _energies(a, b, d, share, pooled)
+    largest, null = _energies(a, b, d, share, False)
     # The axis by the longer of two expressions.
     across, up = (largest - d, b) if a >= d else (b, largest - a)
-    ratio = material[0] if pooled else up / across * (noise[1] / noise[0])
+    ratio = up / across * (noise[1] / noise[0])
     # Eq. 4: sigma^2 of the energy along the axis less the noise's, over |v|^2.
     length = 1.0 / noise[0] ** 2 + (ratio / noise[1]) ** 2
     energy = (largest - free) / length
     inverse = (energy + free / length) / energy**2 if energy > 0 else np.inf
+    if pooled:
+        null = _energies(a, b, d, share, True)[1]
+        own = material[5] / (material[5] + inverse) if material[5] > 0 else 0.0
+        inverse = own * inverse + (1.0 - own) ** 2 * material[1] if own > 0 else material[1]
+        ratio = material[0] + own * (ratio - material[0])
     last = scatter[orders - 1]
     most, least = _energies(last[0], last[1], last[2], share, pooled)
     weights, variance = _null_combination(ratio, noise)
     return Ratio(
         ratio,
-        material[1] if pooled else inverse,
+        inverse,
         weights,
         variance,
         order + 1,

@@ -101,14 +101,19 @@ def estimate(
     rows = xp.arange(len(order), device=order.device)
     chosen, free = scatter[order, rows], freedom[order, 0]
     ratio = principal_ratio(chosen, noise)
-    if material is not None:
-        ratio = xp.where(pooled, material.ratio, ratio)
     # Energy along the axis less the noise's n, over |v|^2: S of the first band, for eq. 4.
     whitened_ratio = ratio / noise[:, np.newaxis]
     length = xp.einsum("bp,bp->p", whitened_ratio, whitened_ratio)
-    inverse = inverse_energy((largest[order, rows] - free) / length, length, free)
+    energy = xp.linalg.eigvalsh(chosen)[..., -1] - free
+    inverse = inverse_energy(energy / length, length, free)
     if material is not None:
-        inverse = xp.where(pooled, material.inverse_energy, inverse)
+        # The mean of the posterior, of the material's ratio for a prior with its spread.
+        own = quotient(material.spread, material.spread + inverse, 0.0)
+        common = material.inverse_energy
+        mean = material.ratio + own * (ratio - material.ratio)
+        ratio = xp.where(pooled, xp.where(own > 0, mean, material.ratio), ratio)
+        among = xp.where(own > 0, own * inverse + (1.0 - own) ** 2 * common, common)
+        inverse = xp.where(pooled, among, inverse)
     weights, variance = null_combination(ratio, noise)
     rapid, unit = rapid_orders(functions.orders) - 1, like(np.eye(len(noise))[..., None], signals)
     return ReflectionRatio(

@@ -67,4 +67,4 @@ class Work(NamedTuple):
     columns: Array  # (column)
     spectra: Array  # (2, degree)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
-    material: Array  # ratio, inverse energy, emissivity, its two variances; NaN for none
+    material: Array  # ratio, inverse energy, emissivity, its two variances, spread; NaN for none
