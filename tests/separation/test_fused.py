@@ -59,6 +59,7 @@ def material() -> Material:
     """Material of half the pixels, close to what they show; its emissivity for a quarter."""
     half = np.arange(48) % 2 == 0
     values = {"inverse_energy": 1e-4, "noise_variance": 1e-5, "drift_variance": 2e-5}
+    values["spread"] = np.where(np.arange(48) % 8 == 0, 3e-5, 0.0)
     parts = {name: np.where(half, value, np.nan) for name, value in values.items()}
     ratio = np.where(half, np.array([[1.0], [2.0]]), np.nan)
     return Material(ratio=ratio, emissivity=np.where(np.arange(48) % 4 == 0, 0.86, np.nan), **parts)

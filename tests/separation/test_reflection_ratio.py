@@ -109,7 +109,7 @@ def test_inverse_energy() -> None:
 def test_material_is_used_unless_contradicted(ratio: float, pooled: bool) -> None:
     """A material's ratio is used unless it is NaN or the pixel's own changes contradict it."""
     one = np.ones(5)
-    known = Material(np.stack([one, ratio * one]), 1e-4 * one, 0.8 * one, 0 * one, 0 * one)
+    known = Material(np.stack([one, ratio * one]), 1e-4 * one, 0.8 * one, 0 * one, 0 * one, 0 * one)
     signals = changes((1.0, 2.0), NOISE, 5)
     with np.errstate(invalid="ignore"):
         found = reflection_ratio.estimate(signals, FUNCTIONS, NOISE, known)

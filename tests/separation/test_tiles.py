@@ -75,7 +75,7 @@ def test_known_emissivities_go_along(capture: xr.Dataset) -> None:
     image = np.linspace(0.5, 0.9, 63).reshape(7, 9)
     known = xr.DataArray(np.stack([image - 0.1, image]), dims=("band", "y", "x"))
     flat = image.ravel()
-    material = _tiles.Material(np.stack([flat, flat]), flat, flat, flat, flat)
+    material = _tiles.Material(np.stack([flat, flat]), flat, flat, flat, flat, flat)
     checked = inputs_of(capture, "calibrated", emissivity=known)
     ((_, _, tile),) = next(_tiles.cut(checked, slice(2, 7), material)).parts
     assert tile.emissivity is not None

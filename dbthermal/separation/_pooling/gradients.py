@@ -1,16 +1,17 @@
-r"""Change of a quantity over the place in a material: a coating, a curved surface, a worn one.
+r"""Change of a quantity over the place in a material: a coating, a curved surface, wear.
 
-A pixel tells a quantity q by the cost :math:`a q^2 - 2 b q`, in which b has the variance v. Over a
-material q is a polynomial of the place, :math:`q = \sum_k c_k f_k(x, y)`, of the degree with the
-lowest Bayesian information criterion [1]_:
+A pixel tells a quantity q by a cost :math:`a q^2 - 2 b q`, in which b has the variance v. Over the
+material q is a polynomial of the place, :math:`q = \sum_k c_k f_k(x, y)`:
 
 .. math:: c = A^{-1} \sum b f, \quad A = \sum a f f^T, \quad C = A^{-1} (\sum v f f^T) A^{-1}
 
-What the pixels scatter about it beyond v is their spread.
+It is a constant unless the Bayesian information criterion [1]_ says otherwise, and then of the
+degree that predicts best [2]_. What pixels scatter about it beyond v is their spread.
 
 References
 ----------
 .. [1] Schwarz (1978), Annals of Statistics 6, 461, doi:10.1214/aos/1176344136
+.. [2] Akaike (1974), IEEE Transactions on Automatic Control 19, 716, doi:10.1109/TAC.1974.1100705
 """
 
 from dataclasses import dataclass
@@ -28,26 +29,28 @@ Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 # Highest degree, and pixels for each coefficient, at least.
 _DEGREE: Final = 4
 _ENOUGH: Final = 4
-# Deviations of the spread's estimate from which there is one.
-_SIGMAS: Final = 3.0
 # Condition number of the normal equations from which a degree is not determined.
 _SINGULAR: Final = 1e8
+# Highest degree beside a step at a border.
+_SMOOTH: Final = 3
+# Deviations from which there is a spread, and at which a step must be visible.
+_SIGMAS: Final = 3.0
 # Chance at which what is left of noise alone is taken for more [1].
 _CHANCE: Final = 0.01
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Coefficients of the cost of each pixel, and the variance of the linear one (pixel,)."""
+    """Cost of a quantity in each pixel (pixel,), and the variance of its linear coefficient."""
 
-    square: Array
-    linear: Array
-    variance: Array
+    square: Array  # a
+    linear: Array  # b
+    variance: Array  # v
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Polynomial of the place, and what is left."""
+    """Polynomial of the place, and what the pixels show beyond it."""
 
     degree: int
     value: Array  # at the places asked for (place,)
@@ -58,37 +61,31 @@ class Gradient:
 
 
 def fit(known: Places, asked: Places, cost: Cost) -> Gradient:
-    """Gradient at some places from pixels at known ones; the constant's value and variance if none.
+    """Gradient at some places from the costs of pixels at known ones.
 
-    The degree is one that the pixels determine, four of them to each coefficient at least.
+    Of a degree for which there are four pixels to a coefficient at least.
     """
     scale = [(one.mean(), max(float(np.ptp(one)) / 2.0, 1.0)) for one in known]
-    here, there = (
-        [(one - middle) / half for one, (middle, half) in zip(places, scale, strict=True)]
-        for places in (known, asked)
-    )
-    highest, chosen = -np.inf, None
+    pixels, highest, chosen = cost.square.size, 0.0, None
     for degree in range(_DEGREE + 1):
-        powers = [(i, k - i) for k in range(degree + 1) for i in range(k + 1)]
-        if degree > 0 and cost.square.size < _ENOUGH * len(powers):
-            break
-        functions, at = (
-            np.stack([y**i * x**j for i, j in powers], axis=1) for y, x in (here, there)
-        )
+        functions, at = (_powers(places, scale, degree) for places in (known, asked))
+        others = functions.shape[1] - 1
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
-        if degree > 0 and not np.linalg.cond(normal) < _SINGULAR:
+        few = others > 0 and pixels < _ENOUGH * (others + 1)
+        if few or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
             break
         inverse = np.linalg.inv(normal)
         coefficients = inverse @ (functions.T @ cost.linear)
         covariance = inverse @ (functions.T @ (cost.variance[:, np.newaxis] * functions)) @ inverse
-        # Chi-square of all coefficients but the constant, less the criterion's price: once it is
-        # no constant, what predicts best [2].
+        # Chi-square of all coefficients but the constant.
         gain = coefficients[1:] @ np.linalg.solve(covariance[1:, 1:], coefficients[1:])
-        price = np.log(cost.square.size) if highest <= 0 else 2.0
-        if gain - (len(powers) - 1) * price > max(highest, 0.0) or degree == 0:
-            gain -= 2.0 * (len(powers) - 1)
-            highest, chosen = gain, (degree, functions, at, coefficients, covariance)
-    assert chosen is not None
+        price = np.log(pixels) if highest == 0.0 else 2.0
+        if degree == 0 or gain - others * price > highest:
+            highest = max(float(gain) - 2.0 * others, 0.0)
+            chosen = degree, functions, at, coefficients, covariance
+    if chosen is None:  # no pixel tells anything
+        nothing = np.full(asked[0].size, np.nan)
+        return Gradient(0, nothing, nothing, 0.0, 1.0, 1.0)
     degree, functions, at, coefficients, covariance = chosen
     residual = cost.linear - cost.square * (functions @ coefficients)
     return Gradient(
@@ -101,54 +98,54 @@ def fit(known: Places, asked: Places, cost: Cost) -> Gradient:
     )
 
 
-def spreads(gradients: list[Gradient]) -> Array:
-    r"""Variance of single pixels about each gradient, 0 where none is seen.
+def spreads(fits: list[Gradient]) -> Array:
+    """Variance of single pixels about each gradient (gradient,), 0 where none is seen.
 
-    Few pixels do not tell it: what all materials tell together, :math:`\tau_0^2`, is taken for the
-    mean and the deviation of a normal distribution, and each material's is the posterior mean.
+    Few pixels do not tell it. What all materials tell together is taken for the mean, and for the
+    deviation, of a normal distribution; that of a material is the mean of its posterior.
     """
     excess, information, uncertainty = (
-        np.array([getattr(one, name) for one in gradients])
+        np.array([getattr(one, name) for one in fits])
         for name in ("excess", "information", "uncertainty")
     )
     own = np.where(excess > _SIGMAS * uncertainty, excess / information, 0.0)
-    if excess.sum() < _SIGMAS * np.sqrt(np.sum(uncertainty**2)):
+    if not excess.sum() > _SIGMAS * np.sqrt(np.sum(uncertainty**2)):
         return own
     usual = excess.sum() / information.sum()
-    weight = (information / uncertainty) ** 2
-    mean = (weight * excess / information + 1.0 / usual) / (weight + 1.0 / usual**2)
+    weight = (usual * information / uncertainty) ** 2
+    mean = (weight * excess / information + usual) / (weight + 1.0)
     return np.where(own > 0, own, np.maximum(mean, 0.0))
 
 
-def continuous(
-    places: Places, values: Array, variances: Array, second: Mask, least: Array
-) -> bool:
-    """Whether values (map, pixel) with variances are a polynomial of the place without a step.
+def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
+    """Say that values (map, pixel) with variances go on from one region into a `second` (pixel,).
 
-    The step lies between pixels and those of a `second` region (pixel,). Of the polynomials, with
-    one and without, the lowest Bayesian information criterion decides, if nothing is left beyond
-    noise, and if the least step (map,) would be seen at three standard deviations.
+    Of polynomials of the place, with a step at the border and without, the lowest Bayesian
+    information criterion decides. It must leave no more than noise, and the least step (map,) must
+    be one that would be seen at three standard deviations.
     """
-    y, x = ((one - one.mean()) / max(float(np.ptp(one)) / 2.0, 1.0) for one in places)
-    roots, found = 1.0 / np.sqrt(variances), (np.inf, True)
-    for degree in range(_DEGREE):
-        smooth = [y**i * x ** (k - i) for k in range(degree + 1) for i in range(k + 1)]
-        design = np.stack([*smooth, second * 1.0], axis=1)
+    scale = [(one.mean(), max(float(np.ptp(one)) / 2.0, 1.0)) for one in places]
+    roots, lowest, result = 1.0 / np.sqrt(variances), np.inf, False
+    for degree in range(_SMOOTH + 1):
+        design = np.append(_powers(places, scale, degree), second[:, np.newaxis], axis=1)
         if second.size < _ENOUGH * design.shape[1]:
             break
-        left = np.zeros(2)  # chi-square without the step, and with it
-        seen = True
+        left, seen = np.zeros(2), True  # chi-square without a step, and with one
         for value, root, step in zip(values, roots, least, strict=True):
             basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
-            white = root * value
-            heights = white @ basis
-            left += white @ white - heights @ heights + np.array([heights[-1] ** 2, 0.0])
+            heights = (root * value) @ basis
+            with_step = np.sum((root * value) ** 2) - np.sum(heights**2)
+            left += with_step + np.array([heights[-1] ** 2, 0.0])
             seen &= step == 0.0 or abs(triangle[-1, -1]) * step > _SIGMAS
-        coefficients = len(values) * (len(smooth) + np.arange(2))
-        criterion = left + coefficients * np.log(second.size)
-        noise = chi2.isf(_CHANCE, values.size - coefficients)
-        for number in range(2):
-            if criterion[number] < found[0]:
-                broken = number == 1 or not seen or left[number] > noise[number]
-                found = float(criterion[number]), broken
-    return not found[1]
+        coefficients = len(values) * (design.shape[1] - 1 + np.arange(2))
+        criteria = left + coefficients * np.log(second.size)
+        if criteria.min() < lowest:
+            lowest, noise = criteria.min(), chi2.isf(_CHANCE, values.size - coefficients[0])
+            result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)
+    return result
+
+
+def _powers(places: Places, scale: list[tuple[float, float]], degree: int) -> Array:
+    """Products of powers (place, function) of rows and columns, shifted and scaled."""
+    y, x = ((one - middle) / half for one, (middle, half) in zip(places, scale, strict=True))
+    return np.stack([y**i * x ** (k - i) for k in range(degree + 1) for i in range(k + 1)], axis=1)

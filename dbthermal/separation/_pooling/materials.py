@@ -354,10 +354,11 @@ def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> boo
     values, variances = own.values[whole + window], own.variances[whole + window]
     both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= reach)
     both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
+    if not np.any(both):
+        return False
     least = np.where(own.common, 0.0, resolution * np.abs(np.mean(values[:, both], axis=1)))
-    return gradients.continuous(
-        np.nonzero(both), values[:, both], variances[:, both], other[both], least
-    )
+    y, x = np.nonzero(both)
+    return gradients.continuous((y, x), values[:, both], variances[:, both], other[both], least)
 
 
 def _labelled(cells: Labels, regions: Regions, result: xr.Dataset) -> xr.DataArray:

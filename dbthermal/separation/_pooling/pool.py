@@ -1,7 +1,7 @@
 """Reflection ratios and emissivity of each material, from the surveys of its pixels."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels
-from dbthermal.separation._pooling import gradients
-from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._pooling import gradients, ratios
+from dbthermal.separation._pooling.ratios import Common, Image, Ratios, total
 from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
 MOST: Final = 2048
@@ -18,16 +18,10 @@ MOST: Final = 2048
 
 # Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
-# Deviations beyond which a pixel is not of the material, and rounds of leaving such ones out.
-_OUTLIER_SIGMAS: Final = 4.0
+# Rounds of leaving out pixels that are not of the material.
 _ROUNDS: Final = 6
-# Deviations beyond which the order of the pixels is too small for their material.
-_ORDER_SIGMAS: Final = 3.0
 # Share of the pixels from which those with an emissivity of their own speak for a material [1].
 _MAJORITY: Final = 0.5
-# Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
-_ENERGY_SIGMAS: Final = 8.0
-_LEAST_ENERGY: Final = 0.01
 
 
 def materials(
@@ -109,34 +103,6 @@ def select(labels: Labels) -> Mask:
     return result
 
 
-@dataclass(frozen=True)
-class Image:
-    """Materials of all pixels of an image, and which of the pixels are surveyed."""
-
-    labels: Labels  # (pixel,)
-    surveyed: Labels  # numbers of pixels in the image (surveyed,)
-    width: int
-
-    def expand(self, values: Array) -> Array:
-        """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
-        return np.where(self.labels >= 0, values[..., self.labels], np.nan)
-
-    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
-        """Gradient at all pixels of a label, of some that are surveyed."""
-        asked = np.flatnonzero(self.labels == label)
-        places = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
-        return gradients.fit(*places, cost)
-
-
-@dataclass(frozen=True)
-class _Common:
-    """Ratios of each pixel by its material."""
-
-    ratio: Array  # (band, pixel) [1]
-    variance: Array  # of them, common to neighbours (pixel) [1/K^2]
-    spread: Array  # of single pixels about them (pixel) [1/K^2]
-
-
 def estimate(
     image: Image, labels: Labels, survey: Survey, noise: Array, known: Material | None = None
 ) -> Material:
@@ -149,213 +115,64 @@ def estimate(
     that of the bands (band,) [K]; NaN for a material without information. Ratios (band, pixel) that
     are `known` are those.
     """
-    count = int(image.labels.max()) + 1
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        # A pixel that takes a rapid object for the background has an energy beyond all others'.
-        told = np.isfinite(survey.emissivity) * 1.0
-        sound = np.where(told > 0, labels, -1)
-        found = _ratios(sound, count, survey, noise, even=True)
-        outliers = _outliers(labels, found, found.ratio[:, labels], survey, noise)
-        # Near black the few that have an emissivity alone are selected by their own ratio.
-        surveyed = np.where(survey.frames > 0, 1.0, 0.0)
-        most = _sum(labels, told, count) > _MAJORITY * _sum(labels, surveyed, count)
-        most = np.append(most, False)[labels]
-        used = np.where(outliers & most, -1, labels)
-        for _ in range(_ROUNDS):
-            found = _ratios(used, count, survey, noise, even=True)
-            outliers = _outliers(used, found, found.ratio[:, labels], survey, noise)
-            if not np.any(outliers):
-                break
-            used = np.where(outliers, -1, used)
-        found = _ratios(used, count, survey, noise)
-        if known is not None:
+        count = int(image.labels.max()) + 1
+        found, used, most = _sound(labels, count, survey, noise)
+        if known is None:
+            common, used = _common(image, labels, (found, used, most), survey, noise)
+        else:
             stated = np.isfinite(known.ratio[-1])
             ratio = np.where(stated, known.ratio, image.expand(found.ratio))
             variance = np.where(stated, known.inverse_energy, image.expand(found.variance))
-            return _material(image, _Common(ratio, variance, known.spread), used, survey)
-        common, graded = _graded(image, used, found, survey, noise)
-        for _ in range(_ROUNDS if np.any(graded) else 0):
-            # Along a gradient those far from its middle are no outliers, and no axis is common.
-            ratio, before = common.ratio[:, image.surveyed], used
-            used = np.where(graded[labels], labels, used)
-            for _ in range(_ROUNDS):
-                used = np.where(most & _outliers(used, found, ratio, survey, noise), -1, used)
-            found = _ratios(used, count, _turned(survey, found.ratio[:, labels] / ratio), noise)
-            common, graded = _graded(image, used, found, survey, noise)
-            if np.array_equal(used, before):
-                break
+            common = Common(ratio, variance, known.spread)
         return _material(image, common, used, survey)
 
 
-def _turned(survey: Survey, change: Array) -> Survey:
-    """Survey with the rapid changes of each pixel times a factor (band, pixel), where known."""
-    factor = np.where(np.isfinite(change), change, 1.0)
-    factor = factor[:, np.newaxis] * factor
-    scatter, rapid = survey.scatter * factor, survey.rapid_scatter * factor
-    return replace(survey, scatter=scatter, rapid_scatter=rapid)
+def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ratios, Labels, Mask]:
+    """Ratios of each material, labels of the pixels that agree, and those that may be left out."""
+    # A pixel that takes a rapid object for the background has an energy beyond all others'.
+    told = np.isfinite(survey.emissivity) * 1.0
+    sound = np.where(told > 0, labels, -1)
+    found = ratios.estimate(sound, count, survey, noise, even=True)
+    outliers = ratios.outliers(labels, found, found.ratio[:, labels], survey, noise)
+    # Near black the few that have an emissivity alone are selected by their own ratio.
+    surveyed = np.where(survey.frames > 0, 1.0, 0.0)
+    most = total(labels, told, count) > _MAJORITY * total(labels, surveyed, count)
+    of_most = np.append(most, False)[labels]
+    used = np.where(outliers & of_most, -1, labels)
+    for _ in range(_ROUNDS):
+        found = ratios.estimate(used, count, survey, noise, even=True)
+        outliers = ratios.outliers(used, found, found.ratio[:, labels], survey, noise)
+        if not np.any(outliers):
+            break
+        used = np.where(outliers, -1, used)
+    return ratios.estimate(used, count, survey, noise), used, of_most
 
 
-def _graded(
-    image: Image, labels: Labels, found: "_Ratios", survey: Survey, noise: Array
-) -> tuple[_Common, Mask]:
-    r"""Ratios with their gradients over the place, and the materials that have one.
+def _common(
+    image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
+) -> tuple[Common, Labels]:
+    """Ratios of all pixels with their gradients, and labels of the pixels that agree with them.
 
-    In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
-    axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
-    tells it by :math:`a = u^T C u - n^T C n`, :math:`b = n^T C u`, of variance u^T C u + n.
+    Along a gradient those far from its middle are no outliers; and the scatters, which are added,
+    have one axis only if it is taken out.
     """
-    ratio, variance = image.expand(found.ratio), image.expand(found.variance)
-    spread, graded = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
-    scatter = np.where(found.rapid[labels], survey.rapid_scatter[1], survey.scatter)
-    frames = np.where(found.rapid[labels], survey.rapid_frames[1], survey.frames)
-    fits, at = [], []
-    for label in np.flatnonzero(np.isfinite(found.variance)):
-        pixels = np.flatnonzero((labels == label) & (frames > 0))
-        whitened = found.ratio[:, label] / noise
-        length, parts = whitened @ whitened, scatter[..., pixels]
-        axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
-        axes *= np.sign(axes[0, 0])
-        seen = np.einsum("bi,bcp,cj->ijp", axes, parts, axes)
-        asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
-        for number, across in enumerate(axes.T[1:], 1):
-            cost = gradients.Cost(
-                seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
-            )
-            one = image.gradient(label, pixels, cost)
-            if one.degree > 0:
-                graded[label] = True
-                vector = vector + one.value * across[:, np.newaxis]
-                variance[asked] = np.maximum(variance[asked], length * one.variance)
-            fits.append(one)
-            at.append((asked, length))
-        if graded[label]:
-            ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
-    for (asked, length), square in zip(at, gradients.spreads(fits), strict=True):
-        spread[asked] = np.maximum(spread[asked], length * square)
-    return _Common(ratio, variance, spread), graded
+    found, used, most = sound
+    common, graded = ratios.graded(image, used, found, survey, noise)
+    for _ in range(_ROUNDS if np.any(graded) else 0):
+        ratio, before = common.ratio[:, image.surveyed], used
+        used = np.where(graded[labels], labels, used)
+        for _ in range(_ROUNDS):
+            used = np.where(most & ratios.outliers(used, found, ratio, survey, noise), -1, used)
+        even = ratios.scaled(survey, found.ratio[:, labels] / ratio)
+        found = ratios.estimate(used, len(graded) - 1, even, noise)
+        common, graded = ratios.graded(image, used, found, survey, noise)
+        if np.array_equal(used, before):
+            break
+    return common, used
 
 
-def _sum(labels: Labels, values: Array, count: int) -> Array:
-    """Sum of values (pixel) over each material."""
-    known = labels >= 0
-    return np.asarray(np.bincount(labels[known], values[known], count), dtype=np.float64)
-
-
-def _inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) -> Array:
-    """Variance [1/K^2] of ratios (band, n) that stand on a whitened scatter (band, band, n)."""
-    # With v = kappa / s, the energy in the first band is S = v^T C v / |v|^4.
-    whitened = ratio / noise[:, np.newaxis]
-    length = (whitened**2).sum(axis=0)
-    energy = np.einsum("bn,bcn,cn->n", whitened, scatter, whitened) / length**2
-    return reflection_ratio.inverse_energy(energy, length, freedom)
-
-
-@dataclass(frozen=True)
-class _Ratios:
-    """Ratios of each material."""
-
-    ratio: Array  # (band, material) [1]
-    variance: Array  # (material) [1/K^2]
-    rapid: Mask  # at the largest order, not at those of the pixels (material)
-
-
-def _ratios(
-    labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
-) -> _Ratios:
-    """Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
-
-    Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
-    weights few pixels of much energy do not turn the axis: they are to be found as outliers.
-    """
-    used, frames = survey.scatter, survey.frames
-    parts = [(used, frames), *zip(survey.rapid_scatter, survey.rapid_frames, strict=True)]
-    if even:
-        parts = [_even(labels, count, *part) for part in parts]
-    own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
-    rapid = _apart(own, most, noise)[0] > _ORDER_SIGMAS
-    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, own, strict=True))
-    return _Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
-
-
-def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
-    """Scatters and their frames, of about the same energy in all pixels of a material.
-
-    Their sum is the spatial sign covariance (Locantore et al. 1999, doi:10.1007/BF02595862).
-    """
-    energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
-    inverse = np.where(frames > 0, 1.0 / energy, 0.0)
-    weight = (
-        inverse
-        * (_sum(labels, np.where(frames > 0, 1.0, 0.0), count) / _sum(labels, inverse, count))[
-            labels
-        ]
-    )
-    return scatter * weight, frames * weight
-
-
-def _at_order(
-    labels: Labels, count: int, scatter: Array, frames: Array, noise: Array
-) -> tuple[Array, Array]:
-    """Ratios (band, material) of scatters summed over each, and their variance [1/K^2]."""
-    bands = range(len(noise))
-    total = np.array([[_sum(labels, scatter[i, j], count) for j in bands] for i in bands])
-    informed = np.einsum("bbm->m", total) > 0
-    total = np.where(informed, total, np.eye(len(noise))[..., np.newaxis])
-    ratio = reflection_ratio.principal_ratio(np.moveaxis(total, -1, 0), noise)
-    freedom = _sum(labels, frames, count)
-    # Energy along the axis, over that of the noise: a whole picture sees what is not there.
-    whitened = ratio / noise[:, np.newaxis]
-    unit = whitened / np.sqrt((whitened**2).sum(axis=0))
-    along = np.einsum("bm,bcm,cm->m", unit, total, unit)
-    informed &= along > np.maximum(_ENERGY_SIGMAS * np.sqrt(2.0 * freedom), _LEAST_ENERGY * freedom)
-    variance = _inverse_energy(total, ratio, noise, freedom)
-    return np.where(informed, ratio, np.nan), np.where(informed, variance, np.nan)
-
-
-def _apart(
-    one: tuple[Array, Array], other: tuple[Array, Array], noise: Array
-) -> tuple[Array, Array]:
-    """Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
-
-    The estimate at the smaller order is the more certain one, and their difference has the
-    difference of their variances (Hausman 1978, doi:10.2307/1913827).
-    """
-    scale = noise[1:, np.newaxis] ** 2 + (other[0][1:] * noise[0]) ** 2
-    square = np.max((one[0] - other[0])[1:] ** 2 / scale, axis=0)
-    expected = np.abs(other[1] - one[1])
-    return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
-
-
-def _outliers(
-    labels: Labels, material: _Ratios, common: Array, survey: Survey, noise: Array
-) -> Mask:
-    """Pixels whose ratio, at the orders of their material, is not the common one (band, pixel).
-
-    Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
-    that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
-    go first: at least half as far as the farthest of the material.
-    """
-    rapid = material.rapid[labels]
-    axis = common / noise[:, np.newaxis]
-    axis = axis / np.sqrt((axis**2).sum(axis=0))
-    result = np.zeros(labels.shape, dtype=bool)
-    for large, large_frames in zip(survey.rapid_scatter, survey.rapid_frames, strict=True):
-        scatter = np.where(rapid, large, survey.scatter)
-        frames = np.where(rapid, large_frames, survey.frames)
-        whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
-        own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
-        inverse = _inverse_energy(scatter, own, noise, frames)
-        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
-        score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
-        farthest = np.zeros(len(material.rapid))
-        np.maximum.at(farthest, labels, score)
-        apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
-        result |= apart & ~reflection_ratio.agrees(whole, axis)
-    known = np.isfinite(material.variance[labels])
-    return np.asarray(result & known & (survey.frames > 0) & (labels >= 0))
-
-
-def _material(image: Image, common: _Common, labels: Labels, survey: Survey) -> Material:
+def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> Material:
     """Emissivity of the first band, its variance from noise, and that from drift [1], to ratios."""
     count = int(image.labels.max()) + 1
     # e_1 at the common ratios: e_1 - e_1 (1 - e_1) w . kappa
@@ -369,32 +186,40 @@ def _material(image: Image, common: _Common, labels: Labels, survey: Survey) -> 
     # Weights 1 / (var + median var): no pixel outweighs all others by a small variance.
     typical = np.median(noise[known]) if np.any(known) else np.nan
     weight = np.where(known, 1.0 / (noise + typical), 0.0)
-    total = _sum(where, weight, count)
-    mean = _sum(where, weight * value, count) / total
+    whole = total(where, weight, count)
+    mean = total(where, weight * value, count) / whole
     # var(mean) = sum w^2 (e - mean)^2 / (sum w)^2 n / (n - 1), at least sum w^2 var / (sum w)^2
     residual = np.where(known, (value - mean[where]) ** 2, 0.0)
-    pixels = _sum(where, np.ones_like(value), count)
-    scatter = _sum(where, weight**2 * residual, count) / total**2
+    pixels = total(where, np.ones_like(value), count)
+    scatter = total(where, weight**2 * residual, count) / whole**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
-    expected = _sum(where, weight**2 * noise, count) / total**2
+    expected = total(where, weight**2 * noise, count) / whole**2
     result = Material(
         ratio=common.ratio,
         inverse_energy=common.variance,
         emissivity=image.expand(mean),
         noise_variance=image.expand(np.maximum(scatter, expected)),
-        drift_variance=image.expand(_sum(where, weight * drift, count) / total),
+        drift_variance=image.expand(total(where, weight * drift, count) / whole),
         spread=common.spread,
     )
-    fits = {}
-    for label in np.unique(where[known]):
-        some = np.flatnonzero(where == label)
-        w = weight[some]
-        cost = gradients.Cost(w, w * (value[some] - mean[label]), w**2 * noise[some])
-        fits[label] = image.gradient(label, some, cost)
-    for (label, fit), square in zip(fits.items(), gradients.spreads([*fits.values()]), strict=True):
-        pixels = np.flatnonzero(image.labels == label)
-        # Drift changes from pixel to pixel, too, by no more than its variance.
-        if np.var(fit.value) + square > result.drift_variance[pixels[0]]:
-            result.emissivity[pixels] += fit.value
-            result.noise_variance[pixels] = np.maximum(result.noise_variance[pixels], fit.variance) + square
-    return result
+    return _graded(image, result, where, (value - mean[where], noise, weight))
+
+
+def _graded(
+    image: Image, material: Material, labels: Labels, sample: tuple[Array, Array, Array]
+) -> Material:
+    """Emissivity with its gradients, from differences of single pixels, variances, and weights."""
+    emissivity, variance = material.emissivity.copy(), material.noise_variance.copy()
+    every, fits = np.unique(labels[labels >= 0]), []
+    for label in every:
+        pixels = np.flatnonzero(labels == label)
+        apart, noise, weight = (part[pixels] for part in sample)
+        cost = gradients.Cost(weight, weight * apart, weight**2 * noise)
+        fits.append(image.gradient(label, pixels, cost))
+    for label, fit, spread in zip(every, fits, gradients.spreads(fits), strict=True):
+        pixels = image.labels == label
+        # What differs by no more than the error from drift may be that.
+        if np.var(fit.value) + spread > material.drift_variance[pixels][0]:
+            emissivity[pixels] += fit.value
+            variance[pixels] = np.maximum(variance[pixels], fit.variance) + spread
+    return replace(material, emissivity=emissivity, noise_variance=variance)

@@ -1,0 +1,213 @@
+"""Reflection ratios of each material, from the scatters of its pixels."""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from dbthermal._arrays import Array, Mask
+from dbthermal.separation._inputs import Labels
+from dbthermal.separation._pooling import gradients
+from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._tiles import Survey
+
+# Deviations beyond which a pixel is not of the material.
+_OUTLIER_SIGMAS: Final = 4.0
+# Deviations beyond which the order of the pixels is too small for their material.
+_ORDER_SIGMAS: Final = 3.0
+# Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
+_ENERGY_SIGMAS: Final = 8.0
+_LEAST_ENERGY: Final = 0.01
+
+
+@dataclass(frozen=True)
+class Image:
+    """Materials of all pixels of an image, and which of the pixels are surveyed."""
+
+    labels: Labels  # (pixel,)
+    surveyed: Labels  # numbers of pixels in the image (surveyed,)
+    width: int
+
+    def expand(self, values: Array) -> Array:
+        """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
+        return np.where(self.labels >= 0, values[..., self.labels], np.nan)
+
+    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
+        """Gradient at all pixels of a label, of some that are surveyed."""
+        asked = np.flatnonzero(self.labels == label)
+        here, there = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
+        return gradients.fit(here, there, cost)
+
+
+@dataclass(frozen=True)
+class Common:
+    """Ratios of each pixel by its material."""
+
+    ratio: Array  # (band, pixel) [1]
+    variance: Array  # of them, common to neighbours (pixel) [1/K^2]
+    spread: Array  # of single pixels about them (pixel) [1/K^2]
+
+
+def total(labels: Labels, values: Array, count: int) -> Array:
+    """Sum of values (pixel) over each material."""
+    known = labels >= 0
+    return np.asarray(np.bincount(labels[known], values[known], count), dtype=np.float64)
+
+
+def _inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) -> Array:
+    """Variance [1/K^2] of ratios (band, n) that stand on a whitened scatter (band, band, n)."""
+    # With v = kappa / s, the energy in the first band is S = v^T C v / |v|^4.
+    whitened = ratio / noise[:, np.newaxis]
+    length = (whitened**2).sum(axis=0)
+    energy = np.einsum("bn,bcn,cn->n", whitened, scatter, whitened) / length**2
+    return reflection_ratio.inverse_energy(energy, length, freedom)
+
+
+@dataclass(frozen=True)
+class Ratios:
+    """Ratios of each material."""
+
+    ratio: Array  # (band, material) [1]
+    variance: Array  # (material) [1/K^2]
+    rapid: Mask  # at the largest order, not at those of the pixels (material)
+
+
+def estimate(
+    labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
+) -> Ratios:
+    """Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
+
+    Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
+    weights few pixels of much energy do not turn the axis: they are to be found as outliers.
+    """
+    used, frames = survey.scatter, survey.frames
+    parts = [(used, frames), *zip(survey.rapid_scatter, survey.rapid_frames, strict=True)]
+    if even:
+        parts = [_even(labels, count, *part) for part in parts]
+    own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
+    rapid = _apart(own, most, noise)[0] > _ORDER_SIGMAS
+    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, own, strict=True))
+    return Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
+
+
+def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
+    """Scatters and their frames, of about the same energy in all pixels of a material.
+
+    Their sum is the spatial sign covariance (Locantore et al. 1999, doi:10.1007/BF02595862).
+    """
+    energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
+    inverse = np.where(frames > 0, 1.0 / energy, 0.0)
+    weight = (
+        inverse
+        * (total(labels, np.where(frames > 0, 1.0, 0.0), count) / total(labels, inverse, count))[
+            labels
+        ]
+    )
+    return scatter * weight, frames * weight
+
+
+def _at_order(
+    labels: Labels, count: int, scatter: Array, frames: Array, noise: Array
+) -> tuple[Array, Array]:
+    """Ratios (band, material) of scatters summed over each, and their variance [1/K^2]."""
+    bands = range(len(noise))
+    summed = np.array([[total(labels, scatter[i, j], count) for j in bands] for i in bands])
+    informed = np.einsum("bbm->m", summed) > 0
+    summed = np.where(informed, summed, np.eye(len(noise))[..., np.newaxis])
+    ratio = reflection_ratio.principal_ratio(np.moveaxis(summed, -1, 0), noise)
+    freedom = total(labels, frames, count)
+    # Energy along the axis, over that of the noise: a whole picture sees what is not there.
+    whitened = ratio / noise[:, np.newaxis]
+    unit = whitened / np.sqrt((whitened**2).sum(axis=0))
+    along = np.einsum("bm,bcm,cm->m", unit, summed, unit)
+    informed &= along > np.maximum(_ENERGY_SIGMAS * np.sqrt(2.0 * freedom), _LEAST_ENERGY * freedom)
+    variance = _inverse_energy(summed, ratio, noise, freedom)
+    return np.where(informed, ratio, np.nan), np.where(informed, variance, np.nan)
+
+
+def _apart(
+    one: tuple[Array, Array], other: tuple[Array, Array], noise: Array
+) -> tuple[Array, Array]:
+    """Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
+
+    The estimate at the smaller order is the more certain one, and their difference has the
+    difference of their variances (Hausman 1978, doi:10.2307/1913827).
+    """
+    scale = noise[1:, np.newaxis] ** 2 + (other[0][1:] * noise[0]) ** 2
+    square = np.max((one[0] - other[0])[1:] ** 2 / scale, axis=0)
+    expected = np.abs(other[1] - one[1])
+    return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
+
+
+def outliers(labels: Labels, material: Ratios, common: Array, survey: Survey, noise: Array) -> Mask:
+    """Pixels whose ratio, at the orders of their material, is not the common one (band, pixel).
+
+    Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
+    that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
+    go first: at least half as far as the farthest of the material.
+    """
+    rapid = material.rapid[labels]
+    axis = common / noise[:, np.newaxis]
+    axis = axis / np.sqrt((axis**2).sum(axis=0))
+    result = np.zeros(labels.shape, dtype=bool)
+    for large, large_frames in zip(survey.rapid_scatter, survey.rapid_frames, strict=True):
+        scatter = np.where(rapid, large, survey.scatter)
+        frames = np.where(rapid, large_frames, survey.frames)
+        whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
+        own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
+        inverse = _inverse_energy(scatter, own, noise, frames)
+        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
+        score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
+        farthest = np.zeros(len(material.rapid))
+        np.maximum.at(farthest, labels, score)
+        apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+        result |= apart & ~reflection_ratio.agrees(whole, axis)
+    known = np.isfinite(material.variance[labels])
+    return np.asarray(result & known & (survey.frames > 0) & (labels >= 0))
+
+
+def scaled(survey: Survey, change: Array) -> Survey:
+    """Survey with the rapid changes of each pixel times a factor (band, pixel), where known."""
+    factor = np.where(np.isfinite(change), change, 1.0)
+    factor = factor[:, np.newaxis] * factor
+    scatter, rapid = survey.scatter * factor, survey.rapid_scatter * factor
+    return replace(survey, scatter=scatter, rapid_scatter=rapid)
+
+
+def graded(
+    image: Image, labels: Labels, found: Ratios, survey: Survey, noise: Array
+) -> tuple[Common, Mask]:
+    r"""Ratios with their gradients over the place, and the materials that have one.
+
+    In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
+    axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
+    tells it by :math:`a = u^T C u - n^T C n`, :math:`b = n^T C u`, of variance u^T C u + n.
+    """
+    ratio, variance = image.expand(found.ratio), image.expand(found.variance)
+    spread, graded = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
+    scatter, frames = survey.rapid_scatter[1], survey.rapid_frames[1]
+    fits, at = [], []
+    for label in map(int, np.flatnonzero(np.isfinite(found.variance))):
+        pixels = np.flatnonzero((labels == label) & (frames > 0))
+        whitened = found.ratio[:, label] / noise
+        length, parts = whitened @ whitened, scatter[..., pixels]
+        axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
+        axes *= np.sign(axes[0, 0])
+        seen = np.einsum("bi,bcp,cj->ijp", axes, parts, axes)
+        asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
+        for number, across in enumerate(axes.T[1:], 1):
+            cost = gradients.Cost(
+                seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
+            )
+            one = image.gradient(label, pixels, cost)
+            if one.degree > 0:
+                graded[label] = True
+                vector = vector + one.value * across[:, np.newaxis]
+                variance[asked] = np.maximum(variance[asked], length * one.variance)
+            fits.append(one)
+            at.append((asked, length))
+        if graded[label]:
+            ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
+    for (asked, length), square in zip(at, gradients.spreads(fits), strict=True):
+        spread[asked] = np.maximum(spread[asked], length * square)
+    return Common(ratio, variance, spread), graded
