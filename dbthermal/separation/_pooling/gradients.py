@@ -26,8 +26,10 @@ from dbthermal._arrays import Array, Mask
 Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 """Rows and columns of pixels."""
 
-# Highest degree, and pixels for each coefficient, at least.
-_DEGREE: Final = 4
+DEGREE: Final = 4
+"""Highest degree."""
+
+# Pixels for each coefficient, at least.
 _ENOUGH: Final = 4
 # Condition number of the normal equations from which a degree is not determined.
 _SINGULAR: Final = 1e8
@@ -37,6 +39,7 @@ _SMOOTH: Final = 3
 _SIGMAS: Final = 3.0
 # Chance at which what is left of noise alone is taken for more [1].
 _CHANCE: Final = 0.01
+_TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -54,67 +57,74 @@ class Gradient:
 
     degree: int
     value: Array  # at the places asked for (place,)
-    variance: Array  # of it (place,)
-    excess: float  # sum over the pixels of the squared residuals of b, less v
-    information: float  # sum of a^2, by which a variance of q adds to the excess
-    uncertainty: float  # standard deviation of the excess
+    variance: Array  # of it, without a spread (place,)
+    residual: Array  # of b (pixel,)
+    cost: Cost
+
+    def excess(self, spread: float = 0.0) -> tuple[float, float]:
+        """Variance of q that residuals show beyond v, and its deviation at some spread."""
+        square, variance = self.cost.square**2, self.cost.variance
+        deviation = np.sqrt(2.0 * np.sum((variance + spread * square) ** 2))
+        total = float(np.sum(square))
+        return float(np.sum(self.residual**2 - variance)) / total, float(deviation) / total
 
 
-def fit(known: Places, asked: Places, cost: Cost) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones.
+def fit(known: Places, asked: Places, cost: Cost, most: int = DEGREE) -> Gradient:
+    """Gradient at some places from the costs of pixels at known ones, of a degree at most.
 
-    Of a degree for which there are four pixels to a coefficient at least.
+    And of one for which there are four pixels to a coefficient at least.
     """
     scale = [(one.mean(), max(float(np.ptp(one)) / 2.0, 1.0)) for one in known]
-    pixels, highest, chosen = cost.square.size, 0.0, None
-    for degree in range(_DEGREE + 1):
+    fits, pixels = [], cost.square.size
+    for degree in range(most + 2):
         functions, at = (_powers(places, scale, degree) for places in (known, asked))
-        others = functions.shape[1] - 1
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
-        few = others > 0 and pixels < _ENOUGH * (others + 1)
+        few = degree > 0 and pixels < _ENOUGH * functions.shape[1]
         if few or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
             break
-        inverse = np.linalg.inv(normal)
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         coefficients = inverse @ (functions.T @ cost.linear)
-        covariance = inverse @ (functions.T @ (cost.variance[:, np.newaxis] * functions)) @ inverse
-        # Chi-square of all coefficients but the constant.
-        gain = coefficients[1:] @ np.linalg.solve(covariance[1:, 1:], coefficients[1:])
-        price = np.log(pixels) if highest == 0.0 else 2.0
-        if degree == 0 or gain - others * price > highest:
-            highest = max(float(gain) - 2.0 * others, 0.0)
-            chosen = degree, functions, at, coefficients, covariance
-    if chosen is None:  # no pixel tells anything
+        residual = cost.linear - cost.square * (functions @ coefficients)
+        fits.append((functions, at, inverse, coefficients, residual))
+    if not fits:  # no pixel tells anything
         nothing = np.full(asked[0].size, np.nan)
-        return Gradient(0, nothing, nothing, 0.0, 1.0, 1.0)
-    degree, functions, at, coefficients, covariance = chosen
-    residual = cost.linear - cost.square * (functions @ coefficients)
-    return Gradient(
-        degree=degree,
-        value=at @ coefficients,
-        variance=np.einsum("pi,ij,pj->p", at, covariance, at),
-        excess=float(np.sum(residual**2 - cost.variance)),
-        information=float(np.sum(cost.square**2)),
-        uncertainty=float(np.sqrt(2.0 * np.sum(cost.variance**2))),
-    )
+        return Gradient(0, nothing, nothing, np.zeros(pixels), cost)
+    # What pixels scatter beyond the highest degree is no gradient of theirs.
+    beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
+    variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
+    chosen, highest = 0, 0.0
+    for degree, (functions, _, inverse, coefficients, _) in enumerate(fits[1 : most + 1], 1):
+        # Chi-square of all coefficients but the constant, less the criterion's price.
+        covariance = _covariance(functions, inverse, variance)[1:, 1:]
+        others = coefficients[1:].size
+        gain = float(coefficients[1:] @ np.linalg.solve(covariance, coefficients[1:]))
+        if gain - others * (np.log(pixels) if chosen == 0 else 2.0) > highest:
+            chosen, highest = degree, gain - 2.0 * others
+    _, at, _, coefficients, residual = fits[chosen]
+    value = at @ coefficients
+    # A degree more may be there, unseen: beyond the pixels that tell something it matters.
+    functions, at, inverse, _, _ = fits[min(chosen + 1, len(fits) - 1) if chosen else 0]
+    covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
+    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), residual, cost)
 
 
-def spreads(fits: list[Gradient]) -> Array:
-    """Variance of single pixels about each gradient (gradient,), 0 where none is seen.
+def spreads(fits: list[Gradient]) -> list[float]:
+    """Variance of single pixels about each gradient, 0 where none is seen.
 
-    Few pixels do not tell it. What all materials tell together is taken for the mean, and for the
-    deviation, of a normal distribution; that of a material is the mean of its posterior.
+    Few pixels do not tell it. What all materials tell together, if it is seen, is taken for the
+    mean and the deviation of a normal distribution; that of a material is the posterior's mean.
     """
-    excess, information, uncertainty = (
-        np.array([getattr(one, name) for one in fits])
-        for name in ("excess", "information", "uncertainty")
-    )
-    own = np.where(excess > _SIGMAS * uncertainty, excess / information, 0.0)
-    if not excess.sum() > _SIGMAS * np.sqrt(np.sum(uncertainty**2)):
-        return own
-    usual = excess.sum() / information.sum()
-    weight = (usual * information / uncertainty) ** 2
-    mean = (weight * excess / information + usual) / (weight + 1.0)
-    return np.where(own > 0, own, np.maximum(mean, 0.0))
+    alone = [fit.excess() for fit in fits]
+    weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in alone])
+    usual = float(weights @ [value for value, _ in alone]) / max(weights.sum(), _TINY)
+    if not usual * np.sqrt(weights.sum()) > _SIGMAS:
+        return [value if value > _SIGMAS * deviation else 0.0 for value, deviation in alone]
+    result = []
+    for fit in fits:
+        value, deviation = fit.excess(usual)
+        share = usual**2 / (usual**2 + deviation**2)
+        result.append(max(usual + share * (value - usual), 0.0))
+    return result
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
@@ -143,6 +153,11 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
             lowest, noise = criteria.min(), chi2.isf(_CHANCE, values.size - coefficients[0])
             result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)
     return result
+
+
+def _covariance(functions: Array, inverse: Array, variance: Array) -> Array:
+    """C of coefficients, from A^-1."""
+    return inverse @ (functions.T @ (variance[:, np.newaxis] * functions)) @ inverse
 
 
 def _powers(places: Places, scale: list[tuple[float, float]], degree: int) -> Array:

@@ -134,7 +134,7 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     told = np.isfinite(survey.emissivity) * 1.0
     sound = np.where(told > 0, labels, -1)
     found = ratios.estimate(sound, count, survey, noise, even=True)
-    outliers = ratios.outliers(labels, found, found.ratio[:, labels], survey, noise)
+    outliers = ratios.outliers(labels, found, found.common(labels), survey, noise)
     # Near black the few that have an emissivity alone are selected by their own ratio.
     surveyed = np.where(survey.frames > 0, 1.0, 0.0)
     most = total(labels, told, count) > _MAJORITY * total(labels, surveyed, count)
@@ -142,7 +142,7 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     used = np.where(outliers & of_most, -1, labels)
     for _ in range(_ROUNDS):
         found = ratios.estimate(used, count, survey, noise, even=True)
-        outliers = ratios.outliers(used, found, found.ratio[:, labels], survey, noise)
+        outliers = ratios.outliers(used, found, found.common(labels), survey, noise)
         if not np.any(outliers):
             break
         used = np.where(outliers, -1, used)
@@ -154,21 +154,23 @@ def _common(
 ) -> tuple[Common, Labels]:
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them.
 
-    Along a gradient those far from its middle are no outliers; and the scatters, which are added,
-    have one axis only if it is taken out.
+    Along a gradient those far from its middle are no outliers, and the scatters, which are added,
+    have one axis only if it is taken out. A degree more in each round, for what goes through the
+    middle alone leads astray beyond it.
     """
     found, used, most = sound
-    common, graded = ratios.graded(image, used, found, survey, noise)
-    for _ in range(_ROUNDS if np.any(graded) else 0):
-        ratio, before = common.ratio[:, image.surveyed], used
-        used = np.where(graded[labels], labels, used)
-        for _ in range(_ROUNDS):
-            used = np.where(most & ratios.outliers(used, found, ratio, survey, noise), -1, used)
-        even = ratios.scaled(survey, found.ratio[:, labels] / ratio)
-        found = ratios.estimate(used, len(graded) - 1, even, noise)
-        common, graded = ratios.graded(image, used, found, survey, noise)
-        if np.array_equal(used, before):
-            break
+    common, uneven = ratios.graded(image, used, found, survey, noise)
+    if np.any(uneven):
+        common, _ = ratios.graded(image, used, found, survey, noise, most=1)
+        for degree in range(2, _ROUNDS + 2):
+            here = common.at(image.surveyed)
+            used = np.where(uneven[labels], labels, used)
+            for _ in range(_ROUNDS):
+                used = np.where(most & ratios.outliers(used, found, here, survey, noise), -1, used)
+            even = ratios.scaled(survey, found.ratio[:, labels] / here.ratio)
+            found = ratios.estimate(used, uneven.size - 1, even, noise)
+            highest = min(degree, gradients.DEGREE)
+            common, _ = ratios.graded(image, used, found, survey, noise, highest)
     return common, used
 
 

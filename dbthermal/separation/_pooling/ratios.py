@@ -32,11 +32,13 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
-        """Gradient at all pixels of a label, of some that are surveyed."""
+    def gradient(
+        self, label: int, known: Labels, cost: gradients.Cost, most: int = gradients.DEGREE
+    ) -> gradients.Gradient:
+        """Gradient at all pixels of a label, of some that are surveyed and a degree at most."""
         asked = np.flatnonzero(self.labels == label)
         here, there = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
-        return gradients.fit(here, there, cost)
+        return gradients.fit(here, there, cost, most)
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,10 @@ class Common:
     ratio: Array  # (band, pixel) [1]
     variance: Array  # of them, common to neighbours (pixel) [1/K^2]
     spread: Array  # of single pixels about them (pixel) [1/K^2]
+
+    def at(self, pixels: Labels) -> "Common":
+        """Ratios of some pixels."""
+        return Common(self.ratio[:, pixels], self.variance[pixels], self.spread[pixels])
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -70,6 +76,10 @@ class Ratios:
     ratio: Array  # (band, material) [1]
     variance: Array  # (material) [1/K^2]
     rapid: Mask  # at the largest order, not at those of the pixels (material)
+
+    def common(self, labels: Labels) -> Common:
+        """Ratios of pixels of given labels (pixel,), as far as they have one."""
+        return Common(self.ratio[:, labels], self.variance[labels], np.zeros(labels.size))
 
 
 def estimate(
@@ -139,15 +149,17 @@ def _apart(
     return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
 
 
-def outliers(labels: Labels, material: Ratios, common: Array, survey: Survey, noise: Array) -> Mask:
-    """Pixels whose ratio, at the orders of their material, is not the common one (band, pixel).
+def outliers(
+    labels: Labels, material: Ratios, common: Common, survey: Survey, noise: Array
+) -> Mask:
+    """Pixels whose ratio, at the orders of their material, is not the common one.
 
     Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
     that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
     go first: at least half as far as the farthest of the material.
     """
     rapid = material.rapid[labels]
-    axis = common / noise[:, np.newaxis]
+    axis = common.ratio / noise[:, np.newaxis]
     axis = axis / np.sqrt((axis**2).sum(axis=0))
     result = np.zeros(labels.shape, dtype=bool)
     for large, large_frames in zip(survey.rapid_scatter, survey.rapid_frames, strict=True):
@@ -156,8 +168,9 @@ def outliers(labels: Labels, material: Ratios, common: Array, survey: Survey, no
         whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
         own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
         inverse = _inverse_energy(scatter, own, noise, frames)
-        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
-        score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
+        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse + common.spread, noise))[1:]
+        score = np.max(np.abs(own - common.ratio)[1:] / std, axis=0)
+        score = np.where(labels >= 0, np.nan_to_num(score), 0.0)
         farthest = np.zeros(len(material.rapid))
         np.maximum.at(farthest, labels, score)
         apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
@@ -175,16 +188,21 @@ def scaled(survey: Survey, change: Array) -> Survey:
 
 
 def graded(
-    image: Image, labels: Labels, found: Ratios, survey: Survey, noise: Array
+    image: Image,
+    labels: Labels,
+    found: Ratios,
+    survey: Survey,
+    noise: Array,
+    most: int = gradients.DEGREE,
 ) -> tuple[Common, Mask]:
-    r"""Ratios with their gradients over the place, and the materials that have one.
+    r"""Ratios with their gradients, of a degree at most, and spreads; materials with either.
 
     In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
     axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
     tells it by :math:`a = u^T C u - n^T C n`, :math:`b = n^T C u`, of variance u^T C u + n.
     """
     ratio, variance = image.expand(found.ratio), image.expand(found.variance)
-    spread, graded = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
+    spread, uneven = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
     scatter, frames = survey.rapid_scatter[1], survey.rapid_frames[1]
     fits, at = [], []
     for label in map(int, np.flatnonzero(np.isfinite(found.variance))):
@@ -199,15 +217,15 @@ def graded(
             cost = gradients.Cost(
                 seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
             )
-            one = image.gradient(label, pixels, cost)
+            one = image.gradient(label, pixels, cost, most)
             if one.degree > 0:
-                graded[label] = True
                 vector = vector + one.value * across[:, np.newaxis]
                 variance[asked] = np.maximum(variance[asked], length * one.variance)
             fits.append(one)
-            at.append((asked, length))
-        if graded[label]:
+            at.append((label, asked, length))
+        if any(one.degree > 0 for one in fits[1 - len(noise) :]):
             ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
-    for (asked, length), square in zip(at, gradients.spreads(fits), strict=True):
+    for (label, asked, length), one, square in zip(at, fits, gradients.spreads(fits), strict=True):
         spread[asked] = np.maximum(spread[asked], length * square)
-    return Common(ratio, variance, spread), graded
+        uneven[label] |= one.degree > 0 or square > 0
+    return Common(ratio, variance, spread), uneven

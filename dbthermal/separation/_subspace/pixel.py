@@ -74,8 +74,8 @@ def ratios(model: Model, work: Work) -> Ratio:
     if pooled:
         null = _energies(a, b, d, share, True)[1]
         own = material[5] / (material[5] + inverse) if material[5] > 0 else 0.0
-        inverse = own * inverse + (1.0 - own) ** 2 * material[1] if own > 0 else material[1]
-        ratio = material[0] + own * (ratio - material[0])
+        ratio = material[0] + own * (ratio - material[0]) if own > 0 else material[0]
+        inverse = (1.0 - own) * (material[5] + (1.0 - own) * material[1])
     last = scatter[orders - 1]
     most, least = _energies(last[0], last[1], last[2], share, pooled)
     weights, variance = _null_combination(ratio, noise)

@@ -109,11 +109,10 @@ def estimate(
     if material is not None:
         # The mean of the posterior, of the material's ratio for a prior with its spread.
         own = quotient(material.spread, material.spread + inverse, 0.0)
-        common = material.inverse_energy
         mean = material.ratio + own * (ratio - material.ratio)
         ratio = xp.where(pooled, xp.where(own > 0, mean, material.ratio), ratio)
-        among = xp.where(own > 0, own * inverse + (1.0 - own) ** 2 * common, common)
-        inverse = xp.where(pooled, among, inverse)
+        common = (1.0 - own) * (material.spread + (1.0 - own) * material.inverse_energy)
+        inverse = xp.where(pooled, common, inverse)
     weights, variance = null_combination(ratio, noise)
     rapid, unit = rapid_orders(functions.orders) - 1, like(np.eye(len(noise))[..., None], signals)
     return ReflectionRatio(
