@@ -109,8 +109,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
         Materials (y, x), integer, as from `materials`: the pixels of one label share their
-        emissivities, which makes all of them more certain; a negative one shares nothing. For
-        "subspace" only.
+        emissivities, or a polynomial of the place and a spread about it where they differ, which
+        makes all of them more certain; a negative one shares nothing. For "subspace" only.
     reflection_shift : Dataset, optional
         From `alignment.reflection_shift`, for two cameras side by side: the reflection that all
         other bands, of the second camera, show at a pixel p is the one that the quietest band shows

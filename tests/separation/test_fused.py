@@ -3,6 +3,7 @@
 import sys
 from dataclasses import fields, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,8 +59,9 @@ def tile_of(emissivity: tuple[float, float] = (0.86, 0.72), highest: float = 353
 def material() -> Material:
     """Material of half the pixels, close to what they show; its emissivity for a quarter."""
     half = np.arange(48) % 2 == 0
-    values = {"inverse_energy": 1e-4, "noise_variance": 1e-5, "drift_variance": 2e-5}
-    values["spread"] = np.where(np.arange(48) % 8 == 0, 3e-5, 0.0)
+    spread = np.where(np.arange(48) % 8 == 0, 3e-5, 0.0)
+    values: dict[str, Any] = {"inverse_energy": 1e-4, "noise_variance": 1e-5}
+    values |= {"drift_variance": 2e-5, "spread": spread}
     parts = {name: np.where(half, value, np.nan) for name, value in values.items()}
     ratio = np.where(half, np.array([[1.0], [2.0]]), np.nan)
     return Material(ratio=ratio, emissivity=np.where(np.arange(48) % 4 == 0, 0.86, np.nan), **parts)

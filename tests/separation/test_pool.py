@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import schema, separation
 from dbthermal.separation._pooling import pool
+from dbthermal.separation._pooling.ratios import Image
 from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Survey
 from dbthermal.simulation import Rig
@@ -62,7 +63,7 @@ def test_some_pixels_of_a_large_material_are_surveyed() -> None:
 
 def test_materials_are_spread_over_their_pixels() -> None:
     """Each pixel has the values of its label's material, and NaN without a label."""
-    image = pool.Image(np.array([1, -1, 0]), np.arange(3), 3)
+    image = Image(np.array([1, -1, 0]), np.arange(3), 3)
     expanded = image.expand(np.array([[1.0, 1.0], [2.0, 1.4]]))
     np.testing.assert_array_equal(expanded, [[1.0, np.nan, 1.0], [1.4, np.nan, 2.0]])
 
@@ -173,7 +174,7 @@ def test_few_pixels_of_much_energy_are_outliers() -> None:
         scatter, frames, twice, np.stack([frames] * 2), own, 0 * ratio, half, zero, zero
     )
     labels = np.zeros(66, dtype=np.intp)
-    material = pool.estimate(pool.Image(labels, np.arange(66), 66), labels, survey, noise)
+    material = pool.estimate(Image(labels, np.arange(66), 66), labels, survey, noise)
     variance = reflection_ratio.ratio_variance(material.ratio, material.inverse_energy, noise)
     assert abs(material.ratio[1, 0] - 2.0) < 4.0 * np.sqrt(variance[1, 0])
 
