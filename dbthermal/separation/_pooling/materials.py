@@ -10,8 +10,8 @@ few percent only. So the maps propose and the statistics decide:
    (`region_merging`), as long as a difference that matters would be seen.
 4. A cell whose own ratio is too uncertain, as where nothing moved, joins a neighbour towards which
    the maps have no step.
-5. After a first pooling (`joined`), so do regions between which the pixels' own ratios show no step:
-   an emissivity may change over a body.
+5. After a first pooling (`joined`), so do regions between which the pixels' own ratios show no
+   step: an emissivity may change over a body.
 
 A material is connected: two bodies that do not touch are never pooled, however alike. Wrong
 pooling is a bias that no deviation covers, while a body in two parts costs a little noise.
