@@ -1,5 +1,6 @@
 """The default way through a capture: all steps of the separation, in one call."""
 
+from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
@@ -8,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment
+from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._completion.complete import complete
@@ -24,6 +26,11 @@ _LOOKED_AT: Final = 2000
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought,
 # if it is that by more than so many of its standard deviations.
 _APART, _SIGMAS = 0.02, 3.0
+_UNEXPLAINED: Final = (
+    "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
+    "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
+    "clocks differ, the intervals of the other pixels are too small."
+)
 # Rows and columns, at least, in which a shift can be found.
 _WIDE: Final = 24
 
@@ -70,7 +77,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     -------
     Dataset
         As from `complete`, and `material` (y, x). Attribute `reflection_shift` says whether one was
-        "given", "found" or "none".
+        "given", "found" or "none"; `warnings`, and a UserWarning, that bands are apart and no shift
+        explains it.
 
     Raises
     ------
@@ -95,23 +103,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
-    source = "none" if reflection_shift is None else "given"
-    alone = None
-    narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
-    if reflection_shift is None and narrower >= _WIDE:
-        apart = cameras_apart(corrected, response, workers)
-        if apart > 0.0:
-            try:
-                shift = alignment.reflection_shift(corrected, response)
-            except ValueError:  # no shift explains it: the pixels keep the flag
-                shift = None
-            if shift is not None and seen_apart(shift):
-                alone = one(reflection_shift=shift)
-                left, moving = _pixels_apart(alone)
-                if left / moving < apart:
-                    reflection_shift, source = shift, "found"
-    if alone is None or source != "found":
-        alone = one(reflection_shift=reflection_shift)
+    if reflection_shift is None:
+        alone, reflection_shift, doubts = _apart(one, corrected, response, workers)
+        source = "none" if reflection_shift is None else "found"
+    else:
+        alone, source, doubts = one(reflection_shift=reflection_shift), "given", []
     result, pooled = alone, None
     if materials is None and find_spec("skimage") is not None:
         found = pooling.materials(alone, corrected, response, borders=True)
@@ -135,7 +131,27 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     )
     if materials is not None:
         result["material"] = materials
-    return result.assign_attrs(reflection_shift=source)
+    return warned(result.assign_attrs(reflection_shift=source), *doubts)
+
+
+def _apart(
+    one: Callable[..., xr.Dataset], corrected: xr.Dataset, response: xr.Dataset, workers: int
+) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
+    """First separation, the shift of the reflections if it needs one, and what is not explained."""
+    apart = 0.0
+    if min(corrected.sizes.get(name, 0) for name in ("y", "x")) >= _WIDE:  # solve refuses others
+        apart = cameras_apart(corrected, response, workers)
+    if apart > 0.0:
+        try:
+            shift = alignment.reflection_shift(corrected, response)
+        except ValueError:  # no shift explains it: the pixels keep the flag
+            shift = None
+        if shift is not None and seen_apart(shift):
+            alone = one(reflection_shift=shift)
+            left, moving = _pixels_apart(alone)
+            if left / moving < apart:
+                return alone, shift, []
+    return one(), None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
 
 
 def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2) -> float:

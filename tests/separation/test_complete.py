@@ -262,11 +262,13 @@ def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[floa
 
 
 def test_one_call_without_a_shift_to_find() -> None:
-    """A band that is two frames late sets bands apart, and no shift mends it: no error."""
+    """A band that is two frames late sets bands apart, and no shift mends it: that is said."""
     _, capture, _ = draw(replace(SMALL, shape=(24, 24)), 13, 0.86, 0.72)
     counts = capture["counts"].copy()
     counts[1, 2:] = counts[1, :-2].values
-    whole = separation.separate(capture.assign(counts=counts), RESPONSE)
+    with pytest.warns(UserWarning, match=r"^The bands of \d+% .* no shift") as said:
+        whole = separation.separate(capture.assign(counts=counts), RESPONSE)
+    assert whole.attrs["warnings"] == [str(said[0].message)]
     apart = float(((whole["status"] & int(Status.BANDS_APART)) != 0).mean())
     print(f"bands apart in {apart:.2f}")
     assert whole.attrs["reflection_shift"] == "none"
