@@ -155,22 +155,24 @@ def _common(
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them.
 
     Along a gradient those far from its middle are no outliers, and the scatters, which are added,
-    have one axis only if it is taken out. A degree more in each round, for what goes through the
+    have one axis only if it is taken out. Where few pixels have an emissivity alone, a selection by
+    their ratios, no gradient is told. A degree more in each round, for what goes through the
     middle alone leads astray beyond it.
     """
     found, used, most = sound
-    common, uneven = ratios.graded(image, used, found, survey, noise)
+    common, uneven = ratios.graded(image, np.where(most, used, -1), found, survey, noise)
     if np.any(uneven):
-        common, _ = ratios.graded(image, used, found, survey, noise, most=1)
-        for degree in range(2, _ROUNDS + 2):
+        seen, degree = np.where(most, used, -1), 1
+        common, _ = ratios.graded(image, seen, found, survey, noise, degree)
+        for _ in range(_ROUNDS):
             here = common.at(image.surveyed)
             used = np.where(uneven[labels], labels, used)
             for _ in range(_ROUNDS):
                 used = np.where(most & ratios.outliers(used, found, here, survey, noise), -1, used)
             even = ratios.scaled(survey, found.ratio[:, labels] / here.ratio)
             found = ratios.estimate(used, uneven.size - 1, even, noise)
-            highest = min(degree, gradients.DEGREE)
-            common, _ = ratios.graded(image, used, found, survey, noise, highest)
+            seen, degree = np.where(most, used, -1), min(degree + 1, gradients.DEGREE)
+            common, _ = ratios.graded(image, seen, found, survey, noise, degree)
     return common, used
 
 

@@ -207,6 +207,8 @@ def graded(
     fits, at = [], []
     for label in map(int, np.flatnonzero(np.isfinite(found.variance))):
         pixels = np.flatnonzero((labels == label) & (frames > 0))
+        if pixels.size == 0:
+            continue
         whitened = found.ratio[:, label] / noise
         length, parts = whitened @ whitened, scatter[..., pixels]
         axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
