@@ -348,7 +348,7 @@ def step(
 
 
 def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:
-    """Whether the pixels' own features go on across the border of two regions (y, x)."""
+    """Say that the pixels' own features go on across the border of two regions (y, x)."""
     reach, whole = _SPACINGS[0], (slice(None),)
     border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
     window = tuple(slice(max(0, p.min() - reach), p.max() + reach + 1) for p in np.nonzero(border))
