@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import binary_dilation, distance_transform_cdt
+from scipy.ndimage import binary_dilation, distance_transform_cdt, find_objects
 from scipy.stats import chi2
 
 from dbthermal import response as responses
@@ -220,14 +220,22 @@ def joined(
     pairs = region_merging.neighbours(cells)
     found.join_alike(pairs, resolution)
     _, own = _features(alone, _bands(alone, response)[0])
-    before = -1
+    boxes, before = find_objects(cells), -1
     while before != (before := np.unique(found.roots()).size):
-        for first, second in pairs:
-            one, other = found.root(first), found.root(second)
-            if one != other:
-                current = found.roots()[cells]
-                if _continuous(current == one, current == other, own, resolution):
-                    found.join(one, other)
+        for pair in pairs:
+            one, other = (found.root(cell) for cell in pair)
+            if one == other:
+                continue
+            # Around where the two cells touch.
+            window = tuple(
+                slice(
+                    max(0, max(a.start, b.start) - _SPACINGS[0]), min(a.stop, b.stop) + _SPACINGS[0]
+                )
+                for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
+            )
+            here = found.roots()[cells[window]]
+            if _continuous(here == one, here == other, own.window(window), resolution):
+                found.join(one, other)
     return _labelled(cells, found, pooled)
 
 
@@ -349,12 +357,9 @@ def step(
 
 def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:
     """Say that the pixels' own features go on across the border of two regions (y, x)."""
-    reach, whole = _SPACINGS[0], (slice(None),)
     border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
-    window = tuple(slice(max(0, p.min() - reach), p.max() + reach + 1) for p in np.nonzero(border))
-    one, other, border = one[window], other[window], border[window]
-    values, variances = own.values[whole + window], own.variances[whole + window]
-    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= reach)
+    values, variances = own.values, own.variances
+    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= _SPACINGS[0])
     both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
     if not np.any(both):
         return False

@@ -5,7 +5,7 @@ the order in which they are joined.
 """
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,11 @@ class Features:
     variances: Array  # (feature, y, x), in the square of the unit
     common: Mask  # errors that neighbours share: a mean is no surer than one pixel (feature,)
     tolerance: Array  # relative standard deviation that pooling does not reduce (feature,) [1]
+
+    def window(self, window: tuple[slice, ...]) -> "Features":
+        """Features of some rows and columns."""
+        places = (slice(None), *window)
+        return replace(self, values=self.values[places], variances=self.variances[places])
 
     def sums(self, cells: Labels) -> Array:
         """Sums (4, feature, cell + 1) over cells of weight w, w f, w f^2, and the pixels' number.
