@@ -12,7 +12,8 @@ from scipy.sparse import csr_array, diags_array
 from dbthermal.response import Curve
 from dbthermal.separation._displaced import without
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._subspace.reflection_ratio import null_combination
+from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
+from dbthermal.separation._tiles import Material
 
 Array = npt.NDArray[np.floating[Any]]
 Mask = npt.NDArray[np.bool_]
@@ -117,6 +118,16 @@ def weights(inputs: Inputs, emissivity: Array) -> Array:
     """Weights w of eq. 5 (band, pixel) [1], of the bands without background."""
     noise = inputs.noise[inputs.bands]
     return null_combination(ratio_of(emissivity).astype(np.float64), noise)[0]
+
+
+def of_ratio(inputs: Inputs, material: Material) -> Array:
+    """Variance (pixel) [1] of the first weight by that of a material's ratios, 0 without one."""
+    noise = inputs.noise[inputs.bands]
+    std = np.sqrt(ratio_variance(material.ratio, material.inverse_energy, noise))
+    change = [
+        null_combination(ratio, noise)[0][0] for ratio in (material.ratio, material.ratio + std)
+    ]
+    return np.asarray(np.nan_to_num((change[1] - change[0]) ** 2))
 
 
 def coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> Array:

@@ -165,8 +165,10 @@ def solve(
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
         emissivity, of_slope = system.inside(raw), np.zeros(solved.size)
+        of_ratio = np.zeros(solved.size)
         if material is not None:
             of_slope = np.nan_to_num(material.noise_variance)
+            of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
             equations, emissivity, of_slope = _emissivities(
                 inputs, result, raw, solved, equations, looked_at, (first, steps)
@@ -183,9 +185,10 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * system.CONVERGED
-        # An error of e_1 is one of all c: dq = de_1 w_1 [u(x(r)) - u(x(p))].
+        # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
-        off = weight**2 * of_slope * np.mean((beside - here) ** 2, 1)
+        off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
+        off *= np.mean((beside - here) ** 2, 1)
         size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
         factor = _factor(inputs, equations, size, variance, blur)
     return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
@@ -346,7 +349,10 @@ def _factor(
     drawn = gaussian_filter(image, blur, axes=(0, 1)).reshape(drawn.shape)
     gain = np.sqrt((drawn**2).mean(axis=1, keepdims=True))
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
-    target = alone + off * rng.standard_normal(drawn.shape, dtype=np.float32)
+    # Those of a material are common to its pixels.
+    labels = np.arange(len(size)) if inputs.labels is None else inputs.labels
+    common = rng.standard_normal((len(size), _DRAWS), dtype=np.float32)[labels]
+    target = alone + off * common
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
     signal, _, _ = linear.solve(target, alone, change)
