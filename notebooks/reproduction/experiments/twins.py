@@ -10,6 +10,7 @@ from scipy.constants import zero_Celsius
 from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
 from dbthermal import correction as corrections
 from dbthermal import response as responses
+from dbthermal.schema import COMPLETED
 from reproduction import twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import MOVING, arguments
@@ -57,8 +58,11 @@ def judge_twin(
     -------
     Dataset
         Over `cameras`, "side by side" (with a baseline) and "one place": variables of
-        `at_thermocouple` and `over_the_image`; `emissivity_difference` (band) [1], mean magnitude
-        of the default method's emissivity less the calibrated one over the pixels without a flag.
+        `at_thermocouple`; over the `way`, "alone" by `solve`, "pooled" and "completed" by
+        `separate` (side by side only), those of `over_the_image`; `resting` [1], the share of the
+        pixels whose object changes by less than `RESTING`, where two bands leave the emissivity
+        open; `emissivity_difference` (band) [1], mean magnitude of the default method's emissivity
+        less the calibrated one over the pixels without a flag.
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture_of(material, shape, clock, baseline), rng)
@@ -80,10 +84,16 @@ def judge_twin(
         away = abs(separated["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
         seen = (scene, corrected, response, separated)
         read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
-        both = {**over_the_image(scene, separated).data_vars, "emissivity_difference": away}
-        parts.append(read.assign(both))
+        ways = {"alone": over_the_image(scene, separated)}
+        if cameras != "one place":
+            whole = separation.separate(corrected, response, reflection_shift=shift)
+            ways["pooled"] = over_the_image(scene, whole)
+            ways["completed"] = over_the_image(scene, whole, completed=True)
+        image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))
+        both = {**image.data_vars, "resting": _resting(scene), "emissivity_difference": away}
+        parts.append(read.assign_coords(way=image["way"]).assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
-    return xr.concat(parts, label, combine_attrs="override")
+    return xr.concat(parts, label, join="outer", combine_attrs="override")
 
 
 def capture_of(
@@ -128,25 +138,34 @@ def separate_twin(
     return result.assign(films).assign_attrs(corrected.attrs)
 
 
-def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
+def _moving(scene: xr.Dataset) -> xr.DataArray:
+    """Pixels (y, x) of the object in which the background moves."""
+    return (scene["background_temperature"].std("time") > MOVING) & scene["on_object"]
+
+
+def _resting(scene: xr.Dataset) -> xr.DataArray:
+    """Share of the pixels with a moving background whose object rests [1]."""
+    moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
+    return ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
+
+
+def over_the_image(
+    scene: xr.Dataset, separated: xr.Dataset, *, completed: bool = False
+) -> xr.Dataset:
     """Errors of a separation over the object's pixels in which the background moves.
 
-    `good` [1], the share without a flag; of these `object_temperature_rmse` [K], root mean square
-    over time, median; `covered` [1], the share of samples whose 95 % interval holds the truth; and
-    `resting` [1], the share whose object changes by less than `RESTING`, where two bands leave
-    the emissivity open.
+    `good` [1], the share without a flag, or of those that are completed; of these
+    `object_temperature_rmse` [K], root mean square over time, median; and `covered` [1], the share
+    of samples whose 95 % interval holds the truth.
     """
-    background, status = scene["background_temperature"], separated["status"]
-    moving = (background.std("time") > MOVING) & scene["on_object"]
-    good = moving & (status == 0)
+    moving, status = _moving(scene), separated["status"]
+    good = moving & ((status & int(COMPLETED)) != 0 if completed else status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
     inside = abs(error) < INTERVAL * separated["object_temperature_std"]
-    resting = moving & (scene["object_temperature"].std("time") < RESTING)
     values = {
         "good": (good.sum() / moving.sum(), "1"),
         "object_temperature_rmse": (((error**2).mean("time") ** 0.5).median(), "K"),
         "covered": (inside.where(good).mean(), "1"),
-        "resting": (resting.sum() / moving.sum(), "1"),
     }
     return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
 
