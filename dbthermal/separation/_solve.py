@@ -49,6 +49,8 @@ _MODULES: Final = {
 }
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
+# Turns of the pooled emissivities and the object of each camera's own place.
+_TURNS: Final = 2
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -290,7 +292,8 @@ def _solve_jointly(
     Separate twice, the second time with the object of each camera's own place.
 
     With the ratios of bands that are blurred alike, found beforehand, if no materials are known.
-    Where emissivities are pooled, they are those of the second time, and it is done once more.
+    Where emissivities are pooled, they are told and the object of each place anew, in turns: an
+    error of e_1 is one of the difference between the places, which the next emissivity follows.
     """
     material, blur = None, 0.0
     if inputs.labels is None and inputs.method.survey is not None:
@@ -300,14 +303,14 @@ def _solve_jointly(
             material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
     _separate_all(inputs, material, result, threads, bar)
     both = joint.solve(inputs, result, threads, blur=blur)
-    if inputs.labels is not None:
+    for turn in range(0 if inputs.labels is None else _TURNS):
         apart = inputs
         if both is not None:
             # Without the difference the backgrounds, which bend the bands apart, are far off.
             films = result[["object_temperature", "background_temperature"]].copy(deep=True)
             both = replace(both, result=films)
             apart = replace(inputs, difference=both.difference)
-        material = neighbours.materials(apart, threads, bar, every=True)
+        material = neighbours.materials(apart, threads, bar, every=turn == 0)
         _separate_all(apart, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, material=material, before=both)
     if both is not None:
