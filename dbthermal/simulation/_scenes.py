@@ -268,10 +268,11 @@ def walkers(
     for start in starts:
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
-        distance = columns - centre[:, np.newaxis, np.newaxis]
+        seen = np.flatnonzero(np.abs(centre) < 1.0 + 0.30)  # frames with the body in view
+        distance = columns - centre[seen, np.newaxis, np.newaxis]
         body = (distance / 0.30) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
         head = (distance / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
-        cold[body | head] = skin
+        cold[seen] = np.where(body | head, skin, cold[seen])
     return scene(time, warm, cold, emissivity)
 
 
