@@ -268,9 +268,10 @@ def walkers(
     for start in starts:
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
-        seen = np.flatnonzero(np.abs(centre) < 1.0 + 0.30)  # frames with the body in view
+        half = 0.30  # of the body's width
+        seen = np.flatnonzero(np.abs(centre) < 1.0 + half)  # frames with the body in view
         distance = columns - centre[seen, np.newaxis, np.newaxis]
-        body = (distance / 0.30) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
+        body = (distance / half) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
         head = (distance / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
         cold[seen] = np.where(body | head, skin, cold[seen])
     return scene(time, warm, cold, emissivity)
