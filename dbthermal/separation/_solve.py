@@ -292,8 +292,7 @@ def _solve_jointly(
     Separate twice, the second time with the object of each camera's own place.
 
     With the ratios of bands that are blurred alike, found beforehand, if no materials are known.
-    Where emissivities are pooled, they are told and the object of each place anew, in turns: an
-    error of e_1 is one of the difference between the places, which the next emissivity follows.
+    Pooled emissivities and the object of each place are told in turns, each from the other's last.
     """
     material, blur = None, 0.0
     if inputs.labels is None and inputs.method.survey is not None:
@@ -313,12 +312,13 @@ def _solve_jointly(
         material = neighbours.materials(apart, threads, bar, every=turn == 0)
         _separate_all(apart, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, material=material, before=both)
-    if both is not None:
-        apart = replace(inputs, difference=both.difference)
-        if inputs.labels is not None:
-            material = neighbours.materials(apart, threads, bar)
-        _separate_all(apart, material, result, threads, bar)
-        both.finish()
+    if both is None:
+        return
+    apart = replace(inputs, difference=both.difference)
+    if inputs.labels is not None:
+        material = neighbours.materials(apart, threads, bar)
+    _separate_all(apart, material, result, threads, bar)
+    both.finish()
 
 
 def _separate_all(
@@ -329,8 +329,7 @@ def _separate_all(
     bar: "tqdm[Any]",
 ) -> None:
     """Separate all blocks of rows into the result."""
-    separate = partial(_separate, inputs, material, result, bar)
-    list(threads.map(separate, inputs.blocks))
+    list(threads.map(partial(_separate, inputs, material, result, bar), inputs.blocks))
 
 
 def _separate(
@@ -354,9 +353,8 @@ def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -
     kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
     arrays = {}
     for name, variable in variables.items():
-        shape = tuple(sizes[dim] for dim in variable.dims)
         attrs = schema.status_attrs() if name == "status" else variable.attrs
-        empty = np.empty(shape, dtype=variable.dtype)
+        empty = np.empty([sizes[dim] for dim in variable.dims], dtype=variable.dtype)
         arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
     names = ("band", "time", "y", "x")
     coordinates = {name: corrected[name] for name in names if name in corrected.coords}
@@ -375,7 +373,6 @@ def _write(
 
     The tile's bands have these places in the capture. What has no estimate becomes NaN.
     """
-    every = bool(np.all(cut.valid))
     order = np.argsort(bands)
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
     for name in map(str, result.data_vars):
@@ -399,5 +396,5 @@ def _write(
             else:
                 rows, columns = np.nonzero(where)
                 target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values
-        if "time" in dims and not every:
+        if "time" in dims and not np.all(cut.valid):
             target[~cut.valid.reshape(-1, *shape)] = np.nan

@@ -69,15 +69,14 @@ class Gradient:
         return float(np.sum(self.residual**2 - variance)) / total, float(deviation) / total
 
 
-def fit(known: Places, asked: Places, cost: Cost, most: int = DEGREE) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones, of a degree at most.
+def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
+    """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit.
 
     And of one for which there are four pixels to a coefficient at least.
     """
-    scale = [(one.mean(), max(float(np.ptp(one)) / 2.0, 1.0)) for one in known]
     fits, pixels = [], cost.square.size
-    for degree in range(most + 2):
-        functions, at = (_powers(places, scale, degree) for places in (known, asked))
+    for degree in range(limit + 2):
+        functions = _powers(known, known, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         few = degree > 0 and pixels < _ENOUGH * functions.shape[1]
         if few or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
@@ -85,7 +84,7 @@ def fit(known: Places, asked: Places, cost: Cost, most: int = DEGREE) -> Gradien
         inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         coefficients = inverse @ (functions.T @ cost.linear)
         residual = cost.linear - cost.square * (functions @ coefficients)
-        fits.append((functions, at, inverse, coefficients, residual))
+        fits.append((functions, inverse, coefficients, residual))
     if not fits:  # no pixel tells anything
         nothing = np.full(asked[0].size, np.nan)
         return Gradient(0, nothing, nothing, np.zeros(pixels), cost)
@@ -93,18 +92,20 @@ def fit(known: Places, asked: Places, cost: Cost, most: int = DEGREE) -> Gradien
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
     chosen, highest = 0, 0.0
-    for degree, (functions, _, inverse, coefficients, _) in enumerate(fits[1 : most + 1], 1):
+    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : limit + 1], 1):
         # Chi-square of all coefficients but the constant, less the criterion's price.
         covariance = _covariance(functions, inverse, variance)[1:, 1:]
         others = coefficients[1:].size
         gain = float(coefficients[1:] @ np.linalg.solve(covariance, coefficients[1:]))
         if gain - others * (np.log(pixels) if chosen == 0 else 2.0) > highest:
             chosen, highest = degree, gain - 2.0 * others
-    _, at, _, coefficients, residual = fits[chosen]
-    value = at @ coefficients
+    _, _, coefficients, residual = fits[chosen]
+    value = _powers(asked, known, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
-    functions, at, inverse, _, _ = fits[min(chosen + 1, len(fits) - 1) if chosen else 0]
+    more = min(chosen + 1, len(fits) - 1) if chosen else 0
+    functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
+    at = _powers(asked, known, more)
     return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), residual, cost)
 
 
@@ -134,10 +135,9 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
     information criterion decides. It must leave no more than noise, and the least step (map,) must
     be one that would be seen at three standard deviations.
     """
-    scale = [(one.mean(), max(float(np.ptp(one)) / 2.0, 1.0)) for one in places]
     roots, lowest, result = 1.0 / np.sqrt(variances), np.inf, False
     for degree in range(_SMOOTH + 1):
-        design = np.append(_powers(places, scale, degree), second[:, np.newaxis], axis=1)
+        design = np.append(_powers(places, places, degree), second[:, np.newaxis], axis=1)
         if second.size < _ENOUGH * design.shape[1]:
             break
         left, seen = np.zeros(2), True  # chi-square without a step, and with one
@@ -160,7 +160,11 @@ def _covariance(functions: Array, inverse: Array, variance: Array) -> Array:
     return inverse @ (functions.T @ (variance[:, np.newaxis] * functions)) @ inverse
 
 
-def _powers(places: Places, scale: list[tuple[float, float]], degree: int) -> Array:
-    """Products of powers (place, function) of rows and columns, shifted and scaled."""
-    y, x = ((one - middle) / half for one, (middle, half) in zip(places, scale, strict=True))
+def _powers(places: Places, known: Places, degree: int) -> Array:
+    """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
+    # Far from the origin, in pixels, high powers would be alike but for rounding.
+    y, x = (
+        (one - those.mean()) / max(float(np.ptp(those)) / 2.0, 1.0)
+        for one, those in zip(places, known, strict=True)
+    )
     return np.stack([y**i * x ** (k - i) for k in range(degree + 1) for i in range(k + 1)], axis=1)

@@ -220,8 +220,9 @@ def joined(
     pairs = region_merging.neighbours(cells)
     found.join_alike(pairs, resolution)
     _, own = _features(alone, _bands(alone, response)[0])
-    boxes, before = find_objects(cells), -1
-    while before != (before := np.unique(found.roots()).size):
+    boxes, grown = find_objects(cells), True
+    while grown:
+        grown = False
         for pair in pairs:
             one, other = (found.root(cell) for cell in pair)
             if one == other:
@@ -236,6 +237,7 @@ def joined(
             here = found.roots()[cells[window]]
             if _continuous(here == one, here == other, own.window(window), resolution):
                 found.join(one, other)
+                grown = True
     return _labelled(cells, found, pooled)
 
 

@@ -160,19 +160,23 @@ def _common(
     middle alone leads astray beyond it.
     """
     found, used, most = sound
-    common, uneven = ratios.graded(image, np.where(most, used, -1), found, survey, noise)
-    if np.any(uneven):
-        seen, degree = np.where(most, used, -1), 1
-        common, _ = ratios.graded(image, seen, found, survey, noise, degree)
+    seen = np.where(most, used, -1)
+    common, uneven = ratios.graded(image, seen, found, survey, noise)
+    if not np.any(uneven):
+        return common, used
+    common, _ = ratios.graded(image, seen, found, survey, noise, limit=1)
+    for degree in range(2, _ROUNDS + 2):
+        here = common.at(image.surveyed)
+        used = np.where(uneven[labels], labels, used)
         for _ in range(_ROUNDS):
-            here = common.at(image.surveyed)
-            used = np.where(uneven[labels], labels, used)
-            for _ in range(_ROUNDS):
-                used = np.where(most & ratios.outliers(used, found, here, survey, noise), -1, used)
-            even = ratios.scaled(survey, found.ratio[:, labels] / here.ratio)
-            found = ratios.estimate(used, uneven.size - 1, even, noise)
-            seen, degree = np.where(most, used, -1), min(degree + 1, gradients.DEGREE)
-            common, _ = ratios.graded(image, seen, found, survey, noise, degree)
+            outliers = most & ratios.outliers(used, found, here, survey, noise)
+            if not np.any(outliers):
+                break
+            used = np.where(outliers, -1, used)
+        even = ratios.scaled(survey, found.ratio[:, labels] / here.ratio)
+        found = ratios.estimate(used, uneven.size - 1, even, noise)
+        seen, limit = np.where(most, used, -1), min(degree, gradients.DEGREE)
+        common, _ = ratios.graded(image, seen, found, survey, noise, limit)
     return common, used
 
 

@@ -33,12 +33,12 @@ class Image:
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
     def gradient(
-        self, label: int, known: Labels, cost: gradients.Cost, most: int = gradients.DEGREE
+        self, label: int, known: Labels, cost: gradients.Cost, limit: int = gradients.DEGREE
     ) -> gradients.Gradient:
-        """Gradient at all pixels of a label, of some that are surveyed and a degree at most."""
+        """Gradient at all pixels of a label, from some that are surveyed, see `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
         here, there = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
-        return gradients.fit(here, there, cost, most)
+        return gradients.fit(here, there, cost, limit)
 
 
 @dataclass(frozen=True)
@@ -193,9 +193,9 @@ def graded(
     found: Ratios,
     survey: Survey,
     noise: Array,
-    most: int = gradients.DEGREE,
+    limit: int = gradients.DEGREE,
 ) -> tuple[Common, Mask]:
-    r"""Ratios with their gradients, of a degree at most, and spreads; materials with either.
+    r"""Ratios with their gradients, up to a degree, and spreads; materials with either.
 
     In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
     axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
@@ -219,7 +219,7 @@ def graded(
             cost = gradients.Cost(
                 seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
             )
-            one = image.gradient(label, pixels, cost, most)
+            one = image.gradient(label, pixels, cost, limit)
             if one.degree > 0:
                 vector = vector + one.value * across[:, np.newaxis]
                 variance[asked] = np.maximum(variance[asked], length * one.variance)

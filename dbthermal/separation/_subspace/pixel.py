@@ -73,6 +73,7 @@ def ratios(model: Model, work: Work) -> Ratio:
     inverse = (energy + free / length) / energy**2 if energy > 0 else np.inf
     if pooled:
         null = _energies(a, b, d, share, True)[1]
+        # The mean of the posterior, of the material's ratio for a prior with its spread.
         own = material[5] / (material[5] + inverse) if material[5] > 0 else 0.0
         ratio = material[0] + own * (ratio - material[0]) if own > 0 else material[0]
         inverse = (1.0 - own) * (material[5] + (1.0 - own) * material[1])
