@@ -79,7 +79,10 @@ _CONTRAST_SIGMAS: Final = 8.0
 _CHI2_SIGMAS: Final = 8.0
 _CORRELATION_SIGMAS: Final = 3.5
 _DELAY_SIGMAS: Final = 4.0
+# Deviation by noise of an emissivity outside (0, 1) from which it says nothing [1].
+_UNKNOWN: Final = 0.1
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
+_HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_EMISSIVITY)
 # Last orders of the smooth curve at which its polynomials may be too few.
 _LAST: Final = 6
 # Flags of pixels in which rapid changes of the object are looked for.
@@ -188,7 +191,9 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     """Values, standard deviations and flags; NaN, in the films in place, where undefined."""
     flags = _flags(tile, solution)
     still = flags[Status.NO_BACKGROUND_MOTION]
-    ambiguous = solution.constant & flags[Status.ROLES_MAY_BE_SWAPPED]
+    ambiguous = flags[Status.ROLES_MAY_BE_SWAPPED] & (
+        solution.constant | flags[Status.NONPHYSICAL_EMISSIVITY]
+    )
     undefined = still | flags[Status.GRAY] | ambiguous
     unidentified = undefined | solution.constant
     no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
@@ -221,7 +226,10 @@ def _survey(tile: Tile, orders: int, solution: Solution) -> Survey:
     A selection by the estimate itself would bias the sum over a material.
     """
     status = _report(tile, solution).status
-    sound = (status & _BROKEN) == 0
+    # The ratio of an object that is taken for the background is that of emissivities.
+    exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
+    exchanged &= (status & _HARDLY_CHANGES) != 0
+    sound = ((status & _BROKEN) == 0) & ~exchanged
     fewer = reflection_ratio.rapid_orders(orders)[:, np.newaxis] - solution.order
     return Survey(
         scatter=np.where(sound, solution.scatter, 0.0),
@@ -250,8 +258,9 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     nonphysical = defined & np.any((emissivity <= 0) | (emissivity >= 1), axis=0)
     swapped = defined & ~nonphysical & (emissivity.mean(axis=0) < 0.5)
     constant = ~still & ~gray & solution.constant
-    # Before a constant object all that changes would be the background, which comes and goes.
-    swapped[constant] = ~residuals.returning(tile.signals[0][:, constant])
+    # Before an object that hardly changes, what changes would be the background: comes and goes.
+    resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
+    swapped[resting] = ~residuals.returning(tile.signals[0][:, resting])
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
     excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom)
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
