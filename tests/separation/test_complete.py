@@ -261,6 +261,27 @@ def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[floa
         assert bool((completed | (whole["material"] >= 0)).all())
 
 
+@pytest.mark.parametrize("rise", [(6.0, 20.0), (2.0, 6.0)])
+def test_an_object_that_heats_before_a_still_room_is_no_reflection(
+    rise: tuple[float, float],
+) -> None:
+    """Where nobody walks, what moves is the object: it gets no temperature of what it mirrors."""
+    picture = Picture(shape=(30, 40), rise=rise, still=0.5)
+    scene, capture, _ = draw(picture, 17, 0.86, 0.72)
+    whole = separation.separate(capture, RESPONSE)
+    error = abs(whole["object_temperature"] - scene["object_temperature"])
+    within = (error < 1.96 * whole["object_temperature_std"]).mean("time")
+    still = scene["background_temperature"].std("time") < 0.01
+    share, worst = float(still.mean()), float(error.where(still).max())
+    measured = float((whole["status"] == 0).where(still).mean())
+    held = float(within.where(still).mean())
+    print(f"{share:.2f} still, {measured:.2f} measured, {held:.3f} hold, worst {worst:.1f} K")
+    assert share > 0.3
+    assert bool(error.notnull().all())
+    assert held > 0.9
+    assert worst < 5.0
+
+
 def test_one_call_without_a_shift_to_find() -> None:
     """A band that is two frames late sets bands apart, and no shift mends it: that is said."""
     _, capture, _ = draw(replace(SMALL, shape=(24, 24)), 13, 0.86, 0.72)
