@@ -116,6 +116,12 @@ class Field:
         parts = self.nodes.reshape(2, *self.spline.nodes)
         return np.stack([rows @ part @ columns.T for part in parts])
 
+    def disagreement(self, data: Information, centres: list[Array], other: "Field") -> float:
+        """Chi-square of another field by the data of this one, over what chance makes of it."""
+        matrix = _normal(data.tensor, *self.spline.values(centres))
+        off = other.nodes - self.nodes
+        return float(off @ matrix @ off / np.trace(cho_solve(self.factor, matrix)))
+
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(part) for part in self.spline.values(centres))

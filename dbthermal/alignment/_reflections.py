@@ -31,10 +31,15 @@ _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations, and
-# differs by no more than so many of those of the shorter one's.
+# a chi-square by the shorter one's data of no more than so many times what chance makes of it.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _MORE: Final = 1.25
-_AGREE: Final = 1.5
+_AGREE: Final = 2.25
+# The same for a period up to twice as long, where the shorter one's field is known no better than
+# so [pixel]: among changes of little more than noise it may itself go astray, while an object that
+# heats rapidly was seen to give 30 to 8000.
+_VAGUE: Final = 0.2
+_ASTRAY: Final = 25.0
 _CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
@@ -198,7 +203,7 @@ def _coarse(
     signals, valid = capture.binned(factor)
     reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, result = capture.frames.size, None
-    best, kept = np.inf, np.array(np.inf)
+    best, last, before = np.inf, np.inf, None  # of the field that was taken
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -211,11 +216,11 @@ def _coarse(
         field, data = matching.refine(level, begin)
         places, variance = level.centres(), _variances(field, data, level)
         size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
-        # A field of slower changes must lie within the deviation of the more robust one.
-        apart = (begin.on(places) - field.on(places)) ** 2 / kept
-        told = _told(data, factor).any()
-        if told and size < best / _MORE and apart.mean() < _AGREE**2:
-            kept, best = variance, size
+        # A field of slower changes must fit the data of the more robust one.
+        apart = 0.0 if before is None else begin.disagreement(before, places, field)
+        limit = _ASTRAY if best > _VAGUE and period <= 2.0 * last else _AGREE
+        if _told(data, factor).any() and size < best / _MORE and apart < limit:
+            best, last, before = size, period, data
             energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             # Those of the largest energy, no more than memory allows.
             most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
