@@ -1,5 +1,6 @@
 """Shift of the reflections between two cameras side by side, against simulated truth."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,9 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, schema, simulation, store
+from dbthermal.alignment._field import Information, Spline
+from reproduction import twins
+from reproduction.experiments import capture_of
 from reproduction.experiments.pictures import Picture, smooth_shift
 
 RIG = simulation.Rig()
@@ -139,6 +143,45 @@ def test_rapid_object_does_not_pull_the_field(
     print(f"{rise} s, {shift}: median {np.median(np.abs(error), axis=1)} pixel")
     assert error.shape[1] > 0.7 * true[0].size
     assert np.median(np.abs(error[1])) < 0.03
+
+
+def test_fields_of_the_posterior_disagree_as_chance_makes_them() -> None:
+    """The chi-square of fields drawn from the posterior is that of chance, far ones' is more."""
+    rng = np.random.default_rng(3)
+    spline, centres = Spline((40, 50), 15.0), [np.arange(40.0), np.arange(50.0)]
+    tensor = np.stack([np.full((40, 50), one) for one in (0.3, 0.1, 0.8)])
+    data = Information(tensor, rng.normal(0.0, 0.5, (2, 40, 50)))
+    field = spline.fitted(data, centres)
+    factor = np.triu(field.factor[0])
+    draws = field.nodes + np.linalg.solve(factor, rng.normal(size=(field.nodes.size, 500))).T
+    chance = [field.disagreement(data, centres, replace(field, nodes=one)) for one in draws]
+    far = field.disagreement(data, centres, replace(field, nodes=field.nodes + 1.0))
+    print(f"drawn {np.mean(chance):.3f}, a pixel off {far:.0f}")
+    assert np.mean(chance) == pytest.approx(1.0, abs=0.05)
+    assert far > 25.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 17])
+def test_reflections_that_mostly_change_slowly(seed: int) -> None:
+    """In a simulated twin of the wineglass the fastest changes tell little, and lead nobody astray.
+
+    The registration on the object may leave a shift of all pixels, which is no error of the field.
+    """
+    rng = np.random.default_rng(seed)
+    drawing = replace(capture_of("plate window glass", (84, 112), (300, 10.0), 0.04), rays=2)
+    scene = twins.twin("wineglass", drawing, rng)
+    capture = twins.registered(scene, twins.observe(scene, RESPONSE, rng))
+    field = alignment.reflection_shift(capture, RESPONSE)
+    moving = scene["background_temperature"].std("time").values > 0.1
+    moving &= scene["on_object"].values & np.isfinite(scene["shift"].values).all(axis=0)
+    known = float(field["known"].values[moving].mean())
+    error = (field["shift"].values - scene["shift"].values)[1][moving & field["known"].values]
+    apart = np.median(np.abs(error - np.median(error)))
+    print(f"known {known:.2f}, error along the baseline {apart:.3f} pixel")
+    assert known > 0.9
+    assert apart < 0.1
+    assert abs(np.median(error)) < 0.2
 
 
 @pytest.mark.slow
