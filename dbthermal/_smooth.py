@@ -30,6 +30,7 @@ class Subspace:
     steps: int  # columns of every order, beside the constant
     rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
     pieces: npt.NDArray[np.intp] | None = None  # frames with a column, if not all (column, 2)
+    of_pieces: Array | None = None  # leverage (time, 1) of pieces of one order
 
     @property
     def orders(self) -> int:
@@ -44,6 +45,8 @@ class Subspace:
 
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
+        if self.of_pieces is not None:
+            return self.of_pieces
         result = namespace(self.functions).zeros_like(self.object_part.T[self.steps :])
         for column, (start, stop) in enumerate(self.spans):
             result[max(column - self.steps, 0) :, start:stop] += (
@@ -97,17 +100,17 @@ def piecewise(
     for start, stop in pairwise(edges):
         events = len(camera_steps(None if segment is None else segment[start:stop]))
         order = min(number, stop - start - events)
-        parts.append((start, stop, _known_basis(time[start:stop].tobytes(), order)))
-    spans = np.repeat(
-        [(start, stop) for start, stop, _ in parts], [one.shape[1] for *_, one in parts], axis=0
-    )
+        parts.append((start, stop, *_known_basis(time[start:stop].tobytes(), order)))
+    ends, counts = [part[:2] for part in parts], [part[2].shape[1] for part in parts]
+    spans = np.repeat(ends, counts, axis=0)
     # A column after another, of which a piece fills a part: what is zero takes no memory.
     together, column = np.zeros((len(spans), time.size)), 0
-    for start, stop, basis in parts:
+    for start, stop, basis, _ in parts:
         together[column : column + basis.shape[1], start:stop] = basis.T
         column += basis.shape[1]
     if not camera_steps(segment):  # of two pieces, orthonormal as they are
-        return Subspace(together.T, together.T, len(together) - 1, rising, spans)
+        leverage = np.concatenate([part[3] for part in parts])
+        return Subspace(together.T, together.T, len(together) - 1, rising, spans, leverage)
     functions, object_part = _without_steps(
         together.T, camera_steps(segment), np.empty((time.size, 0))
     )
@@ -115,9 +118,10 @@ def piecewise(
 
 
 @lru_cache(maxsize=4096)
-def _known_basis(time: bytes, order: int) -> Array:
-    """Basis over some times: many pixels have pieces of the same."""
-    return polynomial_basis(np.frombuffer(time), order)
+def _known_basis(time: bytes, order: int) -> tuple[Array, Array]:
+    """Basis over some times, and its leverage (time, 1): many pixels have pieces of the same."""
+    basis = polynomial_basis(np.frombuffer(time), order)
+    return basis, (basis.T**2).sum(axis=0)[:, np.newaxis]
 
 
 def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:

@@ -3,7 +3,7 @@ r"""Steps 1 to 4 of `method` for two bands, one pixel after another, compiled.
 The equations of `steps`, whose results are repeated within rounding.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from math import sqrt
@@ -24,7 +24,7 @@ from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
-from dbthermal.separation._tiles import Tile
+from dbthermal.separation._tiles import Tile, Whole
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
@@ -256,47 +256,53 @@ def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
 
 
 @inlined
-def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
+def _turn(samples: Any, places: Whole, turned: Any) -> None:
     """Samples (kind, time, pixel) of a few pixels as (pixel, kind, time), in place."""
     for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
-            row = samples[kind, t, start : start + size]
-            for p in range(size):
-                turned[p, kind, t] = row[p]
+            row = samples[kind, t]
+            for p in range(places.size):
+                turned[p, kind, t] = row[np.uintp(places[p])]
 
 
 @inlined
-def _return(turned: Any, start: int, size: int, samples: Any) -> None:
+def _return(turned: Any, places: Whole, samples: Any) -> None:
     """The reverse of `_turn`, in place."""
     for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
-            row = samples[kind, t, start : start + size]
-            for p in range(size):
-                row[p] = turned[p, kind, t]
+            row = samples[kind, t]
+            for p in range(places.size):
+                row[np.uintp(places[p])] = turned[p, kind, t]
 
 
 def _compiled(digest: str) -> Callable[..., None]:
-    """Steps of all pixels of a tile, compiled once for sources of one digest."""
+    """Steps of some pixels of a tile, compiled once for sources of one digest."""
 
     @njit(nogil=True, error_model="numpy")
     def separate(
-        model: Model, signals: Array, materials: Array, least: float, work: Work, solved: Solved
+        model: Model,
+        signals: Array,
+        places: Whole,
+        materials: Array,
+        least: float,
+        work: Work,
+        solved: Solved,
     ) -> None:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
-        frames, pixels = signals.shape[1:]
-        block = max(_BLOCK, _TURNED // frames)
+        frames, pixels = signals.shape[1], places.size
+        block = min(max(_BLOCK, _TURNED // frames), pixels)
         inside, outside = np.empty((block, 2, frames)), np.empty((block, 4, frames), np.float32)
         for start in range(0, pixels, block):
-            size = min(block, pixels - start)
-            _turn(signals, start, size, inside)
-            for p in range(size):
-                here = start + p
+            together = places[start : start + block]
+            _turn(signals, together, inside)
+            for p in range(together.size):
+                here = np.uintp(together[p])
                 kernels.copy(inside[p, 0], work.first)
                 kernels.copy(inside[p, 1], work.second)
                 kernels.copy(materials[here], work.material)
                 _pixel(model, least, work, outside[p], solved.record[here], solved.sums[here])
-            _return(outside, start, size, solved.films)
+            _return(outside, together, solved.films)
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
         separate.enable_caching()
@@ -310,24 +316,16 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     """All that the pixels of a tile of two bands share."""
     first, second = tile.curves
     rate, gray = _ratios(first, second)
-    columns = np.ascontiguousarray(functions.functions.T)
-    of_object = columns  # the same array, if it holds the same, stays in the cache
-    if functions.object_part is not functions.functions:
-        of_object = np.ascontiguousarray(functions.object_part.T)
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
     return Model(
         first=kernels.table(first, second),
         second=kernels.table(second, first),
-        functions=columns,
-        object_part=of_object,
-        spans=functions.spans,
+        **_columns(functions),
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        leverage=np.ascontiguousarray(functions.leverage().T),
-        steps=int(functions.steps),
         noise=(float(tile.noise[0]), float(tile.noise[1])),
         pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
@@ -342,6 +340,21 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     )
 
 
+def _columns(functions: smooth.Subspace) -> dict[str, Any]:
+    """Fields of a `Model` that hold functions of time, columns along it."""
+    columns = np.ascontiguousarray(functions.functions.T)
+    of_object = columns  # the same array, if it holds the same, stays in the cache
+    if functions.object_part is not functions.functions:
+        of_object = np.ascontiguousarray(functions.object_part.T)
+    return {
+        "functions": columns,
+        "object_part": of_object,
+        "spans": functions.spans,
+        "leverage": np.ascontiguousarray(functions.leverage().T),
+        "steps": int(functions.steps),
+    }
+
+
 @lru_cache
 def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
     """Relative rate of the ratio of the slopes at the reference [1/K], and some of the ratios."""
@@ -351,28 +364,33 @@ def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
     return float(rates[0]), second.slope(temperatures) / first.slope(temperatures)
 
 
-def _work_space(functions: smooth.Subspace) -> Work:
+def _work_space(frames: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
-    frames, columns = functions.functions.shape
-    rest: dict[str, Any] = {
+    curves = {name: np.empty(frames) for name in Work._fields}
+    return curves | {
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
         "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
-        "coefficients": np.empty((2, columns)),
-        "columns": np.empty(columns),
-        "spectra": np.empty((2, functions.rising.shape[1])),
-        "scatter": np.empty((functions.orders, 3)),
+        "spectra": np.empty((2, degrees)),
         "material": np.empty(6),
     }
-    curves = {name: np.empty(frames) for name in Work._fields}
-    return Work(**curves | rest)
 
 
 def solve(
     tile: Tile, functions: smooth.Subspace, drift: float, least: float = emissions.BEND
 ) -> Solution:
     """As `steps.solve`, of two bands."""
-    work, shared = _work_space(functions), _share(tile, functions, drift)
-    material = tile.material
+    every = np.arange(tile.signals.shape[2])
+    return solve_parts(tile, [(every, functions)], drift, least)
+
+
+def solve_parts(
+    tile: Tile,
+    parts: Sequence[tuple[Whole, smooth.Subspace]],
+    drift: float,
+    least: float = emissions.BEND,
+) -> Solution:
+    """As `solve`, of pixels in parts, each with functions of its own of the same rising ones."""
+    shared, material = _share(tile, parts[0][1], drift), tile.material
     frames, pixels = tile.signals.shape[1:]
     materials = np.full((pixels, 6), np.nan)
     if material is not None:
@@ -382,9 +400,15 @@ def solve(
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
-    _separate(shared, signals, materials, float(least), work, Solved(films, record, sums))
+    solved, freedom = Solved(films, record, sums), np.empty(pixels, np.intp)
+    space = _work_space(frames, len(shared.rising))
+    for places, functions in parts:
+        model, count = shared._replace(**_columns(functions)), functions.functions.shape[1]
+        space["coefficients"], space["columns"] = np.empty((2, count)), np.empty(count)
+        space["scatter"] = np.empty((functions.orders, 3))
+        _separate(model, signals, places, materials, float(least), Work(**space), solved)
+        freedom[places] = frames - functions.steps - record["order"][places]
     named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
-    freedom = frames - functions.steps - record["order"]
     named |= {
         "freedom": freedom,
         "beyond": named["beyond"] > 0,

@@ -181,10 +181,15 @@ def _solve(
     least: float = emissions.BEND,
 ) -> Solution:
     """Steps 1 to 4, compiled for two bands, or on a device."""
-    solve = fused.solve if len(tile.noise) == 2 else steps.solve
+    solve = fused.solve if _compiled(tile, settings) else steps.solve
     if settings.device is not None:
         solve = partial(steps.solve_on, settings.device)
     return solve(tile, functions, settings.background_drift, least)
+
+
+def _compiled(tile: Tile, settings: SubspaceSettings) -> bool:
+    """Steps 1 to 4 of a tile are those that are compiled."""
+    return len(tile.noise) == 2 and settings.device is None
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -337,12 +342,18 @@ def _divided(
     number: int = smooth.PIECE_ORDER,
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
-    groups, parts, time, segment = pieces.alike(first), [], tile.time, tile.segment
-    for places in groups:
-        begins, rising = first[:, places[0]], functions.rising
-        divided = smooth.piecewise(time, begins, rising, segment=segment, number=number)
-        parts.append(_solve(tile.select_pixels(places), divided, settings, least))
-    return parts[0].join(parts[1:]).select_pixels(np.argsort(np.concatenate(groups)))
+    parts = []
+    for places in pieces.alike(first):
+        begins = first[:, places[0]]
+        divided = smooth.piecewise(
+            tile.time, begins, functions.rising, segment=tile.segment, number=number
+        )
+        parts.append((places, divided))
+    if _compiled(tile, settings):
+        return fused.solve_parts(tile, parts, settings.background_drift, least)
+    alone = [_solve(tile.select_pixels(places), it, settings, least) for places, it in parts]
+    order = np.argsort(np.concatenate([places for places, _ in parts]))
+    return alone[0].join(alone[1:]).select_pixels(order)
 
 
 METHOD: Final = Method(

@@ -99,8 +99,9 @@ def solve_on(
     tensor = partial(importlib.import_module("torch").tensor, device=device)
     material = None if tile.material is None else tile.material.each(tensor)
     there = replace(tile, signals=tensor(tile.signals), material=material)
-    names = ("functions", "object_part", "rising")
-    columns: dict[str, Any] = {name: tensor(getattr(functions, name)) for name in names}
+    names = ("functions", "object_part", "rising", "of_pieces")
+    parts = {name: getattr(functions, name) for name in names}
+    columns: dict[str, Any] = {name: tensor(v) for name, v in parts.items() if v is not None}
     return solve(there, replace(functions, **columns), drift, least).each(host)
 
 
