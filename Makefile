@@ -90,7 +90,7 @@ interop: ## compare emulators and codecs with independent software, in an enviro
 	"$$PYTHON" -m venv --clear .venv/interop
 	PIP_CONSTRAINT=requirements.lock .venv/interop/bin/python -m pip install --quiet pip
 	.venv/interop/bin/python -m pip install --quiet --group interop --editable '.[instruments,test]'
-	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
+	.venv/interop/bin/python -c "import flirpy, thorlabs_apt_protocol"
 	.venv/interop/bin/python -m pytest tests/instruments/test_interop.py
 
 test: .venv/installed ## check lint, types, the quick tests, and every notebook with small values

@@ -131,14 +131,13 @@ class Band:
         return temperature
 
 
-def _filter(name: str, centre_um: float, fwhm_um: float) -> Band:
-    return Band(name, (centre_um - 0.5 * fwhm_um) * 1e-6, (centre_um + 0.5 * fwhm_um) * 1e-6)
-
-
 _FWHM: Final = {"8.5": 0.5, "9.5": 0.5, "10.6": 1.5, "12.1": 0.5}  # by centre [um]
 FILTERS: Final[Mapping[str, Band]] = MappingProxyType(
     {"8-14": Band("8-14", 8e-6, 14e-6)}
-    | {name: _filter(name, float(name), fwhm) for name, fwhm in _FWHM.items()}
+    | {
+        name: Band(name, (float(name) - 0.5 * fwhm) * 1e-6, (float(name) + 0.5 * fwhm) * 1e-6)
+        for name, fwhm in _FWHM.items()
+    }
 )
 """The camera's own band and the four filters of the paper (section 5, experimental setup;
 doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top hats."""

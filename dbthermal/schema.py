@@ -1,10 +1,9 @@
 """Glossary: dimensions, type, unit and meaning of every variable at each stage of the data stream.
 
 A name is agreed here first, then used. `check` holds a dataset against its stage and raises with
-the value that offends. ``python -m dbthermal.schema`` prints the glossary as docs/nomenclature.md.
+the value that offends.
 """
 
-import sys
 from collections.abc import Mapping
 from enum import IntFlag
 from typing import Any, Final, Self
@@ -55,7 +54,6 @@ __all__ = [
     "check_variable",
     "has_flag",
     "measured",
-    "nomenclature",
     "status_attrs",
     "variables",
 ]
@@ -366,35 +364,3 @@ def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
             f"Unordered '{dim}' of {label}: {values[place]} {units} is followed by "
             f"{values[place + 1]} {units}. Must increase strictly."
         )
-
-
-def nomenclature() -> str:
-    """Glossary as Markdown, the text of docs/nomenclature.md."""
-    parts = [_PREFACE, "## Coordinates", _table(COORDINATES)]
-    for stage, variables in STAGES.items():
-        parts += [f"## Stage `{stage}`", _table({**variables, **OPTIONAL.get(stage, {})}, stage)]
-    bits = [f"| {bit.value} | `{bit.label}` | {bit.meaning} |" for bit in Status]
-    head = ["| value | name | meaning |", "| --: | --- | --- |"]
-    return "\n\n".join([*parts, "## Bits of `status`", "\n".join([*head, *bits])]) + "\n"
-
-
-_PREFACE: Final = """# Nomenclature
-
-Variables at each stage of the data stream, made from `dbthermal/schema.py` by
-`python -m dbthermal.schema > docs/nomenclature.md`. Temperatures are in kelvin, other units are SI;
-`count` is the unit of the detector's signal. A variable in italics is optional."""
-
-
-def _table(variables: Mapping[str, Variable], stage: str = "") -> str:
-    """Markdown table of variables; the optional ones of a stage in italics."""
-    rows = ["| variable | dimensions | type | unit | meaning |", "| --- | --- | --- | --- | --- |"]
-    optional = OPTIONAL.get(stage, {})
-    for name, one in variables.items():
-        label = f"*{name}*" if name in optional else f"`{name}`"
-        dims = ", ".join(one.dims) or "-"
-        rows.append(f"| {label} | {dims} | {one.dtype} | {one.units} | {one.long_name} |")
-    return "\n".join(rows)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(nomenclature())

@@ -431,9 +431,9 @@ def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
 def test_compiling_is_noticed_once(tmp_path: Path) -> None:
     """What is compiled anew, however much, is one line on the standard error."""
     code = """if True:
-    from dbthermal._cli import compiling
+    from dbthermal._cli.steps import tell_of_compiling
     from numba import njit
-    compiling.tell()
+    tell_of_compiling()
     for power in (1, 2):
         assert njit(lambda x: x**power)(3) == 3**power
     """

@@ -126,7 +126,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         options.register = options.register or "homography"
     _refuse_unused(options)
     source, response, *fitted = staged(options, **stages)
-    _tell_of_compiling()
+    tell_of_compiling()
     response.load()
     known, shown = _known(options), sys.stderr.isatty()
     if options.correction:
@@ -178,11 +178,25 @@ def _refuse_unused(options: argparse.Namespace) -> None:
             raise ValueError(f"Unused option --{name}. Must be left out {why}.")
 
 
-def _tell_of_compiling() -> None:
-    """Notice from now on that the separation is compiled."""
-    from dbthermal._cli import compiling  # noqa: PLC0415 - takes long
+def tell_of_compiling() -> None:
+    """Say from now on, once, that the separation is compiled, if no earlier run left it so."""
+    from numba.core import event  # noqa: PLC0415 - takes long
 
-    compiling.tell()
+    class Told(event.Listener):
+        """Listener to the compiler."""
+
+        said = False
+
+        def on_start(self, _: event.Event) -> None:
+            if not self.said:
+                text = "Compiling the separation, once after an installation: about a minute.\n"
+                sys.stderr.write(text)
+            self.said = True
+
+        def on_end(self, _: event.Event) -> None:
+            pass
+
+    event.register("numba:compile", Told())  # type: ignore[no-untyped-call]
 
 
 def _known(options: argparse.Namespace) -> dict[str, Any]:
@@ -194,7 +208,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (one.load() for one in staged(options, **stages))
-    _tell_of_compiling()
+    tell_of_compiling()
     completed = separation.complete(
         result, source, response, result.get("material"), **_known(options)
     )

@@ -23,7 +23,7 @@ _MINIMUM_PIXELS: Final = 16
 # Copies from which a run is taken for the shutter's; a shorter one is of lost frames. A shutter
 # event that is missed biases the separation, lost frames that are counted as one cost it one degree
 # of freedom a band.
-_FEWEST_COPIES: Final = 3
+FEWEST_COPIES: Final = 3
 _SAMPLE = 4096  # about as many pixels, on an even grid, are compared first
 # Most samples of a block of rows that is read at once.
 _BLOCK = 4_000_000
@@ -82,7 +82,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
         marked = known[index] | _copies(counts.isel(band=index))
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
-            renewed = bool(known[index, first:after].any()) or after - first >= _FEWEST_COPIES
+            renewed = bool(known[index, first:after].any()) or after - first >= FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     return _events(runs, counts["time"].values.astype(np.float64))
 

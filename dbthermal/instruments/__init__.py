@@ -3,11 +3,11 @@
 Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
 them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
 opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over
-`fslp`, `filterwheel` over `_controller` and `apt`, and `tc08`; `camera` is the interface of any
-camera, and `thermocouple` converts type T. Imported by name are ``v4l2`` (frames), ``telemetry``,
-``transport`` (addresses, serial lines), ``signals`` and ``emulated``: devices behind ``sim://``
-addresses, below the same drivers. The drivers were written from public descriptions and tested
-against public byte vectors and emulators, never against hardware. They need the packages of
+`_fslp`, `filterwheel` over `_controller` and `_apt`, and `tc08`; `camera` is the interface of any
+camera. Imported by name are ``v4l2`` (frames), ``telemetry``, ``transport`` (addresses, serial
+lines), ``signals`` and ``emulated``: devices behind ``sim://`` addresses, below the same drivers.
+All drivers were written from public descriptions and tested against public byte vectors, stand-ins
+for the system's calls and emulators, **never against hardware**. They need the packages of
 ``dbthermal[instruments]``.
 """
 
@@ -15,19 +15,16 @@ import importlib
 from types import ModuleType
 
 __all__ = [
-    "apt",
     "boson",
     "camera",
     "devices",
     "filterwheel",
-    "fslp",
     "inventory",
     "live",
     "protocols",
     "recording",
     "session",
     "tc08",
-    "thermocouple",
 ]
 __dir__ = __all__.copy
 

@@ -24,8 +24,8 @@ from typing import Annotated, Final, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from dbthermal.instruments import apt
-from dbthermal.instruments.apt import Id
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments._apt import Id
 from dbthermal.instruments.transport import Transport
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1

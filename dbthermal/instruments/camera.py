@@ -19,11 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _text as texts
+from dbthermal.correction._shutter import FEWEST_COPIES
 from dbthermal.schema import Flags
 
 __all__ = [
     "DAMAGED",
-    "FEWEST_COPIES",
     "FFC_READING",
     "FPA_READING",
     "FRAME_TIMEOUT",
@@ -55,10 +55,6 @@ Identity = Mapping[str, str | bool]
 
 FRAME_TIMEOUT: Final = 1.0
 """Longest wait for a frame by default [s]; a Boson gives 30 or 60 a second."""
-
-FEWEST_COPIES: Final = 3
-"""Copies in a row from which a camera without telemetry counts as closed, as in
-`dbthermal.correction.find_shutter`: fewer are lost frames."""
 
 FPA_READING: Final = "fpa "
 """Prefix of the name of a reading of the focal-plane array's temperature; the band follows."""
@@ -269,8 +265,8 @@ def next_shutter(
     - it repeats the image (no pixel differs), and the frame before counted as closed, or by the
       serial line a correction is imminent or in progress (a reading is older than its frame, so
       that it does not count against an image that changes); or
-    - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
-      serial line alone may miss an event: it is read once a second, and stalls meanwhile.
+    - it is the third copy in a row or a later one, of a camera without telemetry: fewer are lost
+      frames. A serial line alone may miss an event: it is read once a second, and stalls meanwhile.
 
     The flag marks an event, not always from its first copy: `dbthermal.correction.find_shutter`
     makes one event with renewed offsets of every run of copies that holds or touches a flagged

@@ -2,7 +2,7 @@
 
 Opening sends nothing that changes a camera, and moves nothing. In an emulated session all emulators
 share one world, so that the wheel's position decides what the camera behind it sees; they are
-imported only then. Nothing here was ever run on hardware.
+imported only then.
 """
 
 import importlib
@@ -257,11 +257,11 @@ def _frames(
 ) -> AbstractContextManager[FrameSource]:
     """Open the frames of a band's camera."""
     camera = session.cameras[band]
-    stream = Stream(session.shape, session.frame_rate, session.telemetry_rows)
+    form = session.shape, session.frame_rate, session.telemetry_rows
     if world is None:
-        return camera_kind(camera.kind).open_frames(camera.video, stream)
+        return camera_kind(camera.kind).open_frames(camera.video, Stream(*form))
     unfiltered = None if band == session.filtered else band
-    source: AbstractContextManager[FrameSource] = _emulated("camera").open_frames(
-        camera.kind, band, world, pictures, unfiltered, stream
+    source: AbstractContextManager[FrameSource] = _emulated("camera").EmulatedCamera(
+        world, band, pictures, unfiltered, *form, kind=camera.kind
     )
     return source

@@ -7,8 +7,7 @@ never starts, is an error here; steps lost under way are not detected until `Fil
 
 A motion is over when two things agree: the controller reports its end or the moving bits are clear,
 and the wheel is where it should be. Neither is enough alone. Bits were seen to stick, the report of
-an earlier move may come late, and before a move starts the bits are clear too. Tested against
-public byte vectors and an emulator, not against hardware.
+an earlier move may come late, and before a move starts the bits are clear too.
 """
 
 import time as system_time
@@ -16,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from dbthermal.instruments import apt
+from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._controller import (
     Controller,
     NoReplyError,
@@ -61,7 +60,8 @@ CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is ov
 class FilterWheel(Closing):
     """A filter wheel whose line is open, for one thread at a time; see `from_url`.
 
-    `filters` has the band in each slot, 1 to 6.
+    `filters` has the band in each slot, 1 to 6. All methods raise `WheelError` or a kind of it if
+    the controller reports an error, falls silent or is not connected, TransportError if it is gone.
     """
 
     def __init__(
@@ -99,11 +99,7 @@ class FilterWheel(Closing):
         return wheel
 
     def connect(self) -> apt.Info:
-        """Find the controller, check its identity, set the speeds and enable the motor.
-
-        `WheelError` or a kind of it if nothing replies, the device is another one, or does not take
-        the speeds or enable the motor; TransportError if it is gone.
-        """
+        """Find the controller, check its identity, set the speeds and enable the motor."""
         info = self._controller.find()
         self._controller.prepare()
         return info
@@ -114,10 +110,7 @@ class FilterWheel(Closing):
         return self._transport.is_simulated
 
     def identity(self) -> Identity:
-        """Model (not always that on the label), numbers and addresses of the controller.
-
-        `WheelError` if the wheel is not connected.
-        """
+        """Model (not always that on the label), numbers and addresses of the controller."""
         controller, info = self._controller, self._controller.info
         return {
             "model": info.model,
@@ -128,7 +121,7 @@ class FilterWheel(Closing):
         }
 
     def status(self) -> apt.Status:
-        """Position [count] and state; NoReplyError or TransportError if the motor is silent."""
+        """Position [count] and state of the motor."""
         return self._controller.status()
 
     def home(self) -> None:
@@ -136,8 +129,7 @@ class FilterWheel(Closing):
 
         The speeds are set before: where they are near 0, as in some controllers that were just
         switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
-        the wheel does not start, stops before the switch, or takes too long, and was stopped; else
-        the errors of `connect`, and WheelError if it is still moving.
+        the wheel does not start, stops before the switch, or takes too long, and was stopped.
         """
         self._controller.prepare()
         self._require_rest()
@@ -154,8 +146,7 @@ class FilterWheel(Closing):
         ValueError if the slot is another; NotHomedError if the controller was not homed since it
         was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
         stops elsewhere, or the controller reports a fault: it must be homed before the next move;
-        WheelTimeoutError if it takes too long, and was stopped; WheelError if it is still moving,
-        or the controller reports an error or falls silent; TransportError if the device is gone.
+        WheelTimeoutError if it takes too long, and was stopped.
         """
         scale = self._controller.scale
         target = scale.target(position, self.settings.home_offset)
@@ -182,11 +173,7 @@ class FilterWheel(Closing):
         self.move_to(slots[band])
 
     def position(self) -> int:
-        """Slot in the beam, 1 to 6.
-
-        WheelError or TransportError if the wheel is between two slots, moving, or not homed, or the
-        device is gone.
-        """
+        """Slot in the beam, 1 to 6; WheelError between two slots, in a move, or if not homed."""
         status = self._require_rest()
         self._require_home(status)
         scale = self._controller.scale
@@ -207,7 +194,7 @@ class FilterWheel(Closing):
         return self.filters[position]
 
     def stop(self) -> None:
-        """Stop the wheel by a ramp; TransportError if the device is gone."""
+        """Stop the wheel by a ramp."""
         self._controller.stop()
 
     def close(self) -> None:

@@ -3,8 +3,7 @@
 The bus is only listed, through pyusb, and Linux's sysfs is read: nothing is opened, set or reset,
 for the devices may be recording. A device's nodes are those below its USB device in sysfs, so that
 two equal cameras are told apart by their ports. A Boson's USB serial number may not always be the
-camera's own: ask the camera itself. Tested against an emulated backend and a written sysfs tree,
-not against hardware.
+camera's own: ask the camera itself.
 """
 
 import os

@@ -19,14 +19,8 @@ from dbthermal import store
 from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
-from dbthermal.instruments.recording._reader import (
-    BLACKBODY,
-    is_complete,
-    mean_reading,
-    require_filter,
-    step_path,
-)
-from dbthermal.instruments.session import Session
+from dbthermal.instruments.recording import _reader as reader
+from dbthermal.instruments.session import BLACKBODY, Session
 
 __all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
@@ -157,7 +151,7 @@ def record_sweep(
     Path(folder).mkdir(parents=True, exist_ok=True)
     held = store.HeldFolder(Path(folder))
     plan = [
-        (number, temperature, band, step_path(folder, session.name, number, band))
+        (number, temperature, band, reader.step_path(folder, session.name, number, band))
         for number, temperature in enumerate(session.blackbody.temperatures)
         for band in session.swept or (None,)
     ]
@@ -172,7 +166,7 @@ def record_sweep(
             resting = number
         path = held.place() / planned.name
         summaries.append(was or _record_step(devices, band, path, limits, preview))
-        mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
+        reader.mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
     return summaries
 
 
@@ -229,14 +223,14 @@ def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summ
     """Summary of a recording of the sweep that exists already; None if it does not."""
     if not path.exists():
         return None
-    if not is_complete(path):
+    if not reader.is_complete(path):
         rule = "Must be complete: move it away, and this step is recorded again"
         raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
     was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
     if was[number : number + 1] != [temperature]:
         raise ValueError(f"Recording '{path}' of temperatures {was} K. Must be of {temperature} K.")
-    require_filter(path, band)
+    reader.require_filter(path, band)
     return Summary(path, attrs["ended"], attrs["totals"])
 
 
@@ -254,5 +248,5 @@ def _record_step(
     summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
-    require_filter(summary.path, band)
+    reader.require_filter(summary.path, band)
     return summary

@@ -54,7 +54,7 @@ __dir__ = __all__.copy
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
 _SCHEMES: Final = {"filter_wheel": "serial", "thermocouples": "tc08"}  # of their addresses
-BLACKBODY: Final = "blackbody"  # name of its thermocouple
+BLACKBODY: Final = "blackbody"  # name of its thermocouple, and of its readings [K]
 
 
 def _by(check: Callable[[Any], object]) -> AfterValidator:

@@ -6,8 +6,7 @@ types and error numbers are those of the header ``usbtc08.h`` that the vendor pu
 
 A reading without a temperature is NaN, and `Flag` says why. Not every open thermocouple can be
 detected: one may also read a noisy room temperature (picotech.com, topic 29871). Move the
-blackbody, and see whether the reading follows. Tested against an emulated library object and a stub
-compiled from the public signatures, not against hardware.
+blackbody, and see whether the reading follows.
 """
 
 import ctypes

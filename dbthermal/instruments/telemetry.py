@@ -6,8 +6,7 @@ certain**: it is where public decoders that do not depend on one another agree (
 ``flir_ros_sync.cpp``), and none of them is the vendor's. So are the orders: each 16-bit word is
 little-endian, and of a longer number the high word comes first. Therefore a recording keeps the
 rows as they came. The meaning of the status bits is not public: the shutter follows from
-`last_ffc_frame` and the serial line, see `camera.next_shutter`. Tested against computed vectors and
-emulators, not against a camera.
+`last_ffc_frame` and the serial line, see `camera.next_shutter`.
 """
 
 from collections.abc import Mapping

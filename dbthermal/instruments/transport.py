@@ -2,15 +2,14 @@
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``sim://boson/wide`` an
 emulator that answers in memory; sessions and all drivers share the rules of `parse`. An address
-never names a program or a library: that of the TC-08 is told by an environment variable. Tested on
-pseudo-terminals, not on hardware.
+never names a program or a library: that of the TC-08 is told by an environment variable.
 """
 
 import importlib
 import re
 import time as system_time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
@@ -134,41 +133,37 @@ class SerialTransport(Closing):
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
-        try:
+        with self._named("write to"):
             self._port.write(data)
-        except OSError as error:  # pyserial's errors are of this kind
-            raise self._lost("write to", error) from error
 
     def read(self, size: int, timeout: float) -> bytes:
         """Wait until bytes came, or `timeout` [s] went by; see `Transport.read`."""
-        try:
+        with self._named("read from"):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
             more = min(size - 1, self._port.in_waiting) if first else 0
             return first + (self._port.read(more) if more else b"")
-        except OSError as error:
-            raise self._lost("read from", error) from error
 
     def pulse_rts(self) -> None:
         """Take the line RTS down and up again; `TransportError` if the device is gone."""
-        try:
+        with self._named("set RTS of"):
             self._port.rts = False
             system_time.sleep(SETTLING)
             self._port.rts = True
-        except OSError as error:
-            raise self._lost("set RTS of", error) from error
 
     def close(self) -> None:
         """Release the port."""
-        try:
+        with self._named("close"):
             self._port.close()
-        except OSError as error:
-            raise self._lost("close", error) from error
 
-    def _lost(self, action: str, error: OSError) -> TransportError:
-        return TransportError(
-            f"Could not {action} '{self.url}': {error}. The device must stay connected."
-        )
+    @contextmanager
+    def _named(self, action: str) -> Iterator[None]:
+        """Name port and action in the errors of pyserial, which are OSError."""
+        try:
+            yield
+        except OSError as error:
+            rule = "The device must stay connected"
+            raise TransportError(f"Could not {action} '{self.url}': {error}. {rule}.") from error
 
 
 def open_serial(

@@ -3,8 +3,7 @@
 A thin use of Video4Linux2, in ten calls; numbers, sizes and layouts are those of 64-bit Linux
 (``linux/videodev2.h``, https://docs.kernel.org/userspace-api/media/v4l). The kernel's stamp of a
 frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure; likely,
-unless that module is told to use the camera's clock, it is of the frame's first packet. Tested with
-a stand-in for the kernel's calls, not against a camera.
+unless that module is told to use the camera's clock, it is of the frame's first packet.
 """
 
 import errno

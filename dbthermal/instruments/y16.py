@@ -2,7 +2,7 @@
 
 Nothing of the camera is known but its frames: no temperature, and no state of its shutter, which
 then follows from frozen images alone, see `camera.next_shutter`. Its offsets are corrected when the
-camera does so. Tested with a stand-in for the kernel's calls and an emulator, not against hardware.
+camera does so.
 """
 
 from contextlib import AbstractContextManager

@@ -199,18 +199,11 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
             f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene. "
             "Must lie in (0, 1)."
         )
-    rest = _most_frequent(background) if resting else np.zeros(background.shape, dtype=bool)
+    # A pixel rests at its most frequent temperature, the lowest of several, if frames share one.
+    level, frames = mode(background, axis=0)
+    rest = (background == level) & (frames > 1) & resting
     time = scene["time"].values.astype(np.float64)
     return Truth(time, temperature, background, emissivity, rest)
-
-
-def _most_frequent(background: Array) -> Mask:
-    """Frames (time, pixel) in which a pixel's background has its most frequent temperature.
-
-    No frame where no two share a temperature; the lowest of several that are as frequent.
-    """
-    level, frames = mode(background, axis=0)
-    return np.asarray((background == level) & (frames > 1))
 
 
 def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:

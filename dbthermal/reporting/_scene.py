@@ -111,6 +111,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
     result = view.data
+    shot = result if view.capture is None else view.capture
     for name, one in regions.items():
         if not isinstance(one, Region):
             raise TypeError(
@@ -150,17 +151,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         path,
         title,
         [section for section in sections if section.body],
-        origin=_origin(view),
+        origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
         numbers=numbers,
         provenance=result.attrs.get("provenance", {}) if provenance is None else provenance,
-    )
-
-
-def _origin(view: View) -> str:
-    """Origin of the data: measured, simulated, emulated, or not stated."""
-    holders = [one for one in (view.data, view.capture) if one is not None]
-    return next(
-        (str(one.attrs["origin"]) for one in holders if "origin" in one.attrs), "origin not stated"
     )
 
 

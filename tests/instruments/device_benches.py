@@ -8,7 +8,8 @@ from faulty_apt import FaultyApt
 from faulty_boson import Fault, FaultyBoson
 from faulty_tc08 import FaultyTC08
 
-from dbthermal.instruments import apt, fslp
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World

@@ -5,8 +5,8 @@ import struct
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from dbthermal.instruments import apt
-from dbthermal.instruments.apt import Id, StatusBits
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
 
 _NONE = StatusBits(0)

@@ -5,7 +5,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from dbthermal.instruments import fslp
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.world import World
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
+from dbthermal.instruments.emulated.world import ROOM
 
 FULL_SCALE = 673.15
 """What the library makes of an overflow [K]; a choice, the header does not say."""
@@ -77,5 +78,5 @@ class FaultyTC08(EmulatedTC08):
         if channel in self.faults.overflow:
             return FULL_SCALE, True
         if channel in self.faults.open:
-            return (self.junction_temperature if self.faults.reads_ambient else float("nan")), False
+            return (ROOM if self.faults.reads_ambient else float("nan")), False
         return super().convert(channel)

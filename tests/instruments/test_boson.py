@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_fslp import ESCAPED_REPLY, SERIAL_REPLY, SERIAL_REQUEST
 
-from dbthermal.instruments import fslp
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import (
     MAXIMUM_RECEIVED,
     Boson,

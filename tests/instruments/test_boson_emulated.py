@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from test_boson import SERIAL, SET_GAIN
 from test_fslp import SERIAL_REQUEST
 
-from dbthermal.instruments import fslp
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import (
     Boson,
     BosonError,

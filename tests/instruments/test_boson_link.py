@@ -11,7 +11,7 @@ from dialogue import Dialogue, Pair
 from faulty_boson import Fault
 from test_boson import reply
 
-from dbthermal.instruments import fslp
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import (
     REPLY_TIMEOUT,
     Boson,

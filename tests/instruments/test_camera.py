@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dbthermal.correction._shutter import FEWEST_COPIES
 from dbthermal.instruments.camera import (
-    FEWEST_COPIES,
     FfcStatus,
     Shutter,
     camera_kind,

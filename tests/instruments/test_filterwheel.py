@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from device_benches import FILTERS, WheelBench
 
-from dbthermal.instruments import apt
+from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._controller import BSC10X, BSC20X
 from dbthermal.instruments.emulated.apt import EmulatedApt
 from dbthermal.instruments.emulated.line import Line

@@ -6,8 +6,8 @@ from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal.instruments import apt
-from dbthermal.instruments.apt import Id, command
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments._apt import Id, command
 from dbthermal.instruments.filterwheel import FilterWheel, WheelError, WrongDeviceError
 
 

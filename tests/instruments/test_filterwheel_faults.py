@@ -7,7 +7,7 @@ from device_benches import FILTERS, Clock, WheelBench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal.instruments import apt
+from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._controller import MAXIMUM_UNSOLICITED
 from dbthermal.instruments.filterwheel import (
     FilterWheel,

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal.instruments.fslp import (
+from dbthermal.instruments._fslp import (
     MAXIMUM_DATA,
     MAXIMUM_FRAME,
     Decoder,

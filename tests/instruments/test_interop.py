@@ -1,7 +1,7 @@
-"""Checks by other hands: independent programs against the codecs, the emulator and the tables.
+"""Checks by other hands: independent programs against the codecs and the emulator.
 
-Each test runs where its package can be imported: flirpy 0.6.2 (MIT), thorlabs-apt-protocol 29.0.0
-(MIT) and thermocouple-its90 1.0.2 (MIT). None of them is needed by the package.
+Each test runs where its package can be imported: flirpy 0.6.2 (MIT) and thorlabs-apt-protocol
+29.0.0 (MIT). Neither of them is needed by the package.
 """
 
 import os
@@ -12,13 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
-import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import apt, thermocouple
-from dbthermal.instruments.apt import Id, command
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments._apt import Id, command
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.world import World
 
@@ -142,16 +139,3 @@ def test_flirpy_understands_the_emulated_boson() -> None:
         state.fpa_temperature = 260.85
         assert camera.get_fpa_temperature() == 6541.3
         camera.close()
-
-
-def test_type_t_agrees() -> None:
-    """thermocouple-its90 has the same voltages and temperatures, with a cold junction too."""
-    other = pytest.importorskip("thermocouple_its90").TypeT
-    celsius = np.arange(-270.0, 400.5, 0.5)
-    voltage = [other.emf(float(value)) for value in celsius]
-    inside = np.clip(celsius + zero_Celsius, 3.15, 673.15)  # the sum's rounding
-    assert_allclose(thermocouple.emf(inside), voltage, rtol=0, atol=1e-9)  # [mV]
-    emf = np.arange(-5.0, 19.5, 0.1)
-    tips = [other.temperature(float(value), reference=25.0) for value in emf]
-    found = thermocouple.temperature(emf, 298.15) - zero_Celsius
-    assert_allclose(found, tips, rtol=0, atol=1e-6)  # [K]

@@ -3,8 +3,7 @@
 A camera that is busy answers late, after its driver gave up; read naively, every later command then
 gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
 sequence number of its own, and frames that do not carry it are discarded. Connecting
-sends and resets nothing, and nothing is ever written to the camera's flash memory. Written from
-public descriptions, tested against public byte vectors and an emulator, not against hardware.
+sends and resets nothing, and nothing is ever written to the camera's flash memory.
 """
 
 import threading
@@ -14,15 +13,10 @@ from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, Final, TypeVar
 
-from dbthermal.instruments import fslp, telemetry
+from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments import telemetry
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import (
-    Ir16Mode,
-    Reading,
-    Setting,
-    Switch,
-    TelemetryLocation,
-)
+from dbthermal.instruments.boson.commands import Reading, Setting
 from dbthermal.instruments.camera import (
     CameraKind,
     FfcMode,
@@ -163,12 +157,13 @@ class Boson(Closing):
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
         settings: list[tuple[Setting[Any], IntEnum]] = [
-            (commands.IR16_MODE, Ir16Mode.COUNTS_16),
+            (commands.IR16_MODE, commands.Ir16Mode.COUNTS_16),
             (commands.FFC_MODE, FfcMode.MANUAL),
-            (commands.TELEMETRY, Switch.ON if telemetry_rows else Switch.OFF),
+            (commands.TELEMETRY, commands.Switch(bool(telemetry_rows))),
         ]
         if telemetry_rows:
-            settings.append((commands.TELEMETRY_LOCATION, TelemetryLocation.BOTTOM))
+            below = commands.TelemetryLocation.BOTTOM
+            settings.append((commands.TELEMETRY_LOCATION, below))
         for setting, value in settings:
             self.set(setting, value)
             state = self.get(setting)

@@ -5,7 +5,7 @@ speeds near 0 and a motor without current after power-up, silence if it is addre
 reports of moves at any time, another model than on the label. Its counter of commanded steps agrees
 with the wheel only once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
 AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in
-`dbthermal.instruments.apt`.
+`dbthermal.instruments._apt`.
 """
 
 import math
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from dbthermal.instruments import apt
-from dbthermal.instruments.apt import Id, StatusBits
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import fslp
+from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import commands
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated.line import Line

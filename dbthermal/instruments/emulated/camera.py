@@ -26,7 +26,6 @@ from dbthermal.instruments.camera import (
     Frame,
     NoFrameError,
     SourceLostError,
-    Stream,
 )
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
@@ -64,6 +63,9 @@ class EmulatedCamera(Closing):
     is_simulated: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
+        if self.kind not in MODELS:
+            rule = f"Must be one of {sorted(MODELS)}"
+            raise ValueError(f"Unknown emulated camera '{self.kind}'. {rule}.")
         self._state = self.world.camera(self.name)
         self._state.has_frames = True
         self.identity: Mapping[str, str] = {
@@ -144,21 +146,6 @@ class EmulatedCamera(Closing):
             "uptime": time,
         }
         return telemetry.encode(values, self.shape[1], self.telemetry_rows)
-
-
-def open_frames(
-    kind: str,
-    name: str,
-    world: World,
-    pictures: Mapping[str, Picture],
-    band: str | None,
-    stream: Stream,
-) -> EmulatedCamera:
-    """Frames of a camera of the world, of a kind of `MODELS`; `band` None is behind the wheel."""
-    if kind not in MODELS:
-        raise ValueError(f"Unknown emulated camera '{kind}'. Must be one of {sorted(MODELS)}.")
-    form = stream.shape, stream.frame_rate, stream.telemetry_rows
-    return EmulatedCamera(world, name, pictures, band, *form, kind=kind)
 
 
 def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:

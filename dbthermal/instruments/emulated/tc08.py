@@ -9,12 +9,12 @@ import math
 from collections.abc import Callable, MutableSequence
 from typing import Any, Final
 
-from dbthermal.instruments import thermocouple
 from dbthermal.instruments.emulated.world import ROOM
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 CONVERSION: Final = 0.1  # conversion time of one channel [s]
+RANGE: Final = (3.15, 673.15)  # of type T [K]
 
 _HANDLE = 1
 
@@ -33,9 +33,7 @@ class EmulatedTC08:
         temperature: Callable[[int], float],
         *,
         sleep: Callable[[float], None] = lambda _: None,
-        junction_temperature: float = ROOM,
     ) -> None:
-        self.junction_temperature = junction_temperature
         self._temperature, self._sleep = temperature, sleep
         self._is_open, self._error = False, 0
         self._kinds: dict[int, str] = {}
@@ -102,9 +100,9 @@ class EmulatedTC08:
         if channel not in self._kinds:
             return math.nan, False
         if channel == 0:
-            return self.junction_temperature, False
-        tip, (lowest, highest) = self._temperature(channel), thermocouple.TEMPERATURE
-        return (tip if lowest <= tip <= highest else math.nan), False
+            return ROOM, False
+        tip = self._temperature(channel)
+        return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
 
     def _accepts(self, handle: int) -> bool:
         """True if the unit is open, and the handle is its own."""

@@ -163,7 +163,6 @@ class _Band:
     device_time: float = -math.inf
     shutter: Shutter = field(default_factory=Shutter)
     ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
-    last_correction: int | None = None
     counts: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
     )
@@ -246,8 +245,12 @@ class CaptureFile:
             "host_time": frame.host_time - self._origin,
             "sequence": frame.sequence,
             "frame_flags": int(flags),
-            **self._decoded(band, frame),
         }
+        if frame.telemetry is not None:
+            decoded = frame.metadata or Metadata()
+            values["telemetry"] = frame.telemetry
+            values["fpa_temperature"] = decoded.fpa_temperature
+            values["frame_counter"] = decoded.frame_counter
         for name, value in values.items():
             state.block[name][state.filled] = value
         state.filled += 1
@@ -316,32 +319,20 @@ class CaptureFile:
         """Flag of a closed shutter, from telemetry, serial line and image."""
         state = self._bands[band]
         read_at, status = state.ffc_status
-        was_closed = state.shutter.closed
+        before = state.shutter
         state.shutter = next_shutter(
-            state.shutter,
+            before,
             repeated=FrameFlag.IMAGE_REPEATED in flags,
             last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
             ffc_status=status if frame.host_time - read_at <= _STALE else None,
         )
-        if state.shutter.closed != was_closed:
+        if state.shutter.closed != before.closed:
             kind = Note.SHUTTER_CLOSED if state.shutter.closed else Note.SHUTTER_OPEN
             self.note(kind, band, frame.host_time, frame.sequence)
+        renewed = state.shutter.last_ffc_frame
+        if renewed is not None and before.last_ffc_frame not in {None, renewed}:
+            self.note(Note.CORRECTION, band, frame.host_time, renewed)
         return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else GOOD
-
-    def _decoded(self, band: str, frame: Frame) -> dict[str, Any]:
-        """Telemetry as it came, and its values that are stored for each frame."""
-        if frame.telemetry is None:
-            return {}
-        state, fields = self._bands[band], frame.metadata or Metadata()
-        if fields.last_ffc_frame is not None:
-            if state.last_correction not in {None, fields.last_ffc_frame}:
-                self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
-            state.last_correction = fields.last_ffc_frame
-        return {
-            "telemetry": frame.telemetry,
-            "fpa_temperature": fields.fpa_temperature,
-            "frame_counter": fields.frame_counter,
-        }
 
     def _write(self, band: str) -> None:
         state = self._bands[band]

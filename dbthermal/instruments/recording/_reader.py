@@ -16,8 +16,7 @@ from dbthermal import schema, store
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
-
-BLACKBODY = "blackbody"  # name of the reading of the blackbody's temperature [K]
+from dbthermal.instruments.session import BLACKBODY
 
 Region = tuple[slice, slice]
 

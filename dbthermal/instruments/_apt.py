@@ -7,9 +7,7 @@ checksum or start byte. A receiver therefore drops bytes until identifier, lengt
 are possible. Data are records: `parse` reads a message, `pack` gives its data again; positions are
 in counts, speeds in the device's units, channels count from 1.
 
-This is what a filter wheel needs, and what a controller may send by itself. Tested against public
-byte vectors, against the release 29.0.0 of thorlabs-apt-protocol and against an emulator, not
-against hardware.
+This is what a filter wheel needs, and what a controller may send by itself.
 
 References
 ----------
@@ -23,29 +21,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import astuple, dataclass
 from enum import IntEnum, IntFlag
 from typing import Any, ClassVar, Final, Self
-
-__all__ = [
-    "BAY_1",
-    "CONTROLLERS",
-    "HOST",
-    "NO",
-    "RACK",
-    "UNIT",
-    "YES",
-    "Decoder",
-    "HomeParameters",
-    "Id",
-    "Info",
-    "Message",
-    "Notice",
-    "Position",
-    "Status",
-    "StatusBits",
-    "VelocityParameters",
-    "command",
-    "encode",
-]
-__dir__ = __all__.copy
 
 # Addresses: computer, a rack's own board (a BSC20x counts as a rack), the first of its ten bays,
 # and a controller that is not a rack.
@@ -249,16 +224,18 @@ class StatusBits(IntFlag):
 
 @dataclass(frozen=True)
 class Record:
-    """Data of a message: numbers in the order of the record's fields."""
+    """Data of a message: numbers in the order of the record's fields.
+
+    The message must be from a `Decoder`, which knows its lengths, and of an identifier of the
+    record. Some have more data, which are not read.
+    """
 
     _FORMAT: ClassVar[struct.Struct]
-    _IDS: ClassVar[tuple[Id, ...]]
-    _MORE: ClassVar[bool] = False  # True if more data may follow, which are not read
 
     @classmethod
     def parse(cls, message: Message) -> Self:
-        """Record of a message; ValueError if it is another, or of another length."""
-        return cls(*cls._unpacked(message))
+        """Record of a message."""
+        return cls(*cls._FORMAT.unpack_from(message.data))
 
     def pack(self) -> bytes:
         """Data of the message; ValueError if a number or a text does not fit its field."""
@@ -270,25 +247,12 @@ class Record:
     def _fields(self) -> tuple[Any, ...]:
         return astuple(self)
 
-    @classmethod
-    def _unpacked(cls, message: Message) -> tuple[Any, ...]:
-        if message.id not in cls._IDS:
-            names = sorted(known.name for known in cls._IDS)
-            raise ValueError(f"Invalid message 0x{message.id:04X}. Must be one of {names}.")
-        number, size = len(message.data), cls._FORMAT.size
-        if number < size or (number > size and not cls._MORE):
-            raise ValueError(
-                f"Invalid data of {number} bytes of message 0x{message.id:04X}. Must be {size}."
-            )
-        return cls._FORMAT.unpack_from(message.data)
-
 
 @dataclass(frozen=True)
 class Position(Record):
     """Absolute position [count]."""
 
     _FORMAT = struct.Struct("<Hi")
-    _IDS = (Id.MOT_MOVE_ABSOLUTE,)
 
     channel: int
     position: int
@@ -299,7 +263,6 @@ class VelocityParameters(Record):
     """Speeds of a move; `maximum` is near 0 when some controllers are switched on."""
 
     _FORMAT = struct.Struct("<Hiii")
-    _IDS = (Id.MOT_GET_VELPARAMS, Id.MOT_SET_VELPARAMS)
 
     channel: int
     minimum: int
@@ -317,7 +280,6 @@ class HomeParameters(Record):
     """
 
     _FORMAT = struct.Struct("<HHHii")
-    _IDS = (Id.MOT_GET_HOMEPARAMS, Id.MOT_SET_HOMEPARAMS)
 
     channel: int
     direction: int
@@ -331,8 +293,6 @@ class Status(Record):
     """Position counter, encoder counter (a filter wheel has none) [count] and state of a motor."""
 
     _FORMAT = struct.Struct("<HiiI")
-    _IDS = (Id.MOT_GET_STATUSUPDATE,)
-    _MORE = True
 
     channel: int
     position: int
@@ -353,7 +313,6 @@ class Info(Record):
     """
 
     _FORMAT = struct.Struct("<I8sH4B60sHHH")
-    _IDS = (Id.HW_GET_INFO,)
 
     serial_number: int
     model: str
@@ -363,7 +322,7 @@ class Info(Record):
     @classmethod
     def parse(cls, message: Message) -> Self:
         """Identity of HW_GET_INFO; bytes of the model that are not ASCII are spelled out."""
-        number, model, _, minor, interim, major, _, notes, *_ = cls._unpacked(message)
+        number, model, _, minor, interim, major, _, notes, *_ = cls._FORMAT.unpack(message.data)
         return cls(number, _text(model.rstrip(b"\0 ")), f"{major}.{interim}.{minor}", notes)
 
     def _fields(self) -> tuple[Any, ...]:
@@ -379,7 +338,6 @@ class Notice(Record):
     """Error that the controller reports by itself: message that caused it (or 0), code, text."""
 
     _FORMAT = struct.Struct("<HH64s")
-    _IDS = (Id.HW_RICHRESPONSE,)
 
     id: int
     code: int
@@ -390,7 +348,7 @@ class Notice(Record):
         """Error of HW_RICHRESPONSE, or of HW_RESPONSE, which has no further data."""
         if message.id == Id.HW_RESPONSE:
             return cls(0, 0, "an error without a text")
-        cause, code, notes = cls._unpacked(message)
+        cause, code, notes = cls._FORMAT.unpack(message.data)
         return cls(cause, code, _text(notes.split(b"\0")[0]))
 
 

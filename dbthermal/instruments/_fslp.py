@@ -1,8 +1,7 @@
 """FSLP, the framing of the FLIR Boson's serial line: pure functions from bytes to frames and back.
 
 A frame is the start byte 8E, then channel, sequence number, command, status, data and checksum,
-big-endian and with three byte values escaped, then the end byte AE. Tested against public byte
-vectors and an emulator, not against hardware.
+big-endian and with three byte values escaped, then the end byte AE.
 
 References
 ----------
@@ -17,19 +16,6 @@ import re
 import struct
 from dataclasses import dataclass
 from typing import Final
-
-__all__ = [
-    "COMMAND_CHANNEL",
-    "MAXIMUM_DATA",
-    "MAXIMUM_FRAME",
-    "REQUEST",
-    "Decoder",
-    "Frame",
-    "checksum",
-    "encode",
-    "next_sequence",
-]
-__dir__ = __all__.copy
 
 COMMAND_CHANNEL: Final = 0x00
 """Channel of commands and their replies; a receiver discards the frames of all others."""
