@@ -44,6 +44,8 @@ class Subspace:
 
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
+        if self.orders == 1:  # of pieces
+            return namespace(self.functions).sum(self.object_part**2, 1)[:, np.newaxis]
         result = namespace(self.functions).zeros_like(self.object_part.T[self.steps :])
         for column, (start, stop) in enumerate(self.spans):
             result[max(column - self.steps, 0) :, start:stop] += (
