@@ -102,6 +102,11 @@ test-slow: .venv/documenting ## run the long tests, and the notebooks on the rec
 	$(python) -m pytest --numprocesses="$$JOBS" -m slow
 	$(parallel) chain
 
+# A process keeps the memory that it has freed, in one heap for all threads (GNU's C library; others ignore this): the arrays of
+# films are made anew so often that clearing their pages takes half of all the time spent in the system otherwise.
+reproduce: export MALLOC_ARENA_MAX := 1
+reproduce: export MALLOC_MMAP_MAX_ := 0
+reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
 reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, two at a time
 	$(parallel) full
 

@@ -7,7 +7,8 @@ cubic convolution by Keys (1981), doi:10.1109/TASSP.1981.1163711, so that the no
 sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -51,6 +52,13 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
+    found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
+
+    def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
+        """Return what was computed for a key before: a capture is read many times."""
+        if key not in self.found:
+            self.found[key] = compute()
+        return self.found[key]
 
     def source(self, rows: slice) -> slice:
         """Rows of the image that hold some rows, and what the second camera shows of them."""
@@ -227,13 +235,20 @@ def read(
     good = ~quality.unusable(flags)
     if "noise_factor" in block and np.any(block["noise_factor"][others] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
-        usual = np.mean(_roughness(seen)[:, good] ** 2, axis=1) ** 0.5
-        found = (_roughness(counts[others]) / usual[:, np.newaxis]).mean(axis=0)
-        shape = (-1, displacement.shape[1])
-        ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(shape)
-        mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
-        gain *= np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel()
+        key = (rows.start, rows.stop, source.start, source.stop)
+        gain *= displacement.once(
+            key, lambda: _shared(seen[:, :, good], counts[others], gain, displacement.shape[1])
+        )
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
+
+
+def _shared(seen: Array, resampled: Array, gain: Array, width: int) -> Array:
+    """Measured noise (pixel) [1] of resampled counts over that which a `gain` states."""
+    usual = np.mean(_roughness(seen) ** 2, axis=1) ** 0.5
+    found = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
+    ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(-1, width)
+    mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
+    return np.asarray(np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel())
 
 
 def _blurred(
@@ -250,12 +265,8 @@ def _blurred(
     counts, known = quality.bridge(counts, valid, time)
     here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
     usable = ~quality.unusable(status)
-    along = [(rows, more), (slice(width), slice(width))]
-    plain = csr_array(kron(*(_gaussian(*one, displacement.blur) for one in along)))
-    weights = plain @ diags_array(1.0 * usable)
-    total = weights.sum(axis=1)
-    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=usable[here])
-    weights = csr_array(diags_array(inverse) @ weights)
+    key = (rows.start, rows.stop, displacement.blur)
+    inverse, *noise = displacement.once(key, lambda: _of_blur(displacement, rows, usable))
 
     def smoothed(values: Array) -> Array:
         """The weights applied to values (time, pixel), along one axis after the other."""
@@ -267,16 +278,35 @@ def _blurred(
     reach = int(TAIL * displacement.blur)
     taps = _gaussian(slice(reach, reach + 1), slice(2 * reach + 1), displacement.blur)[0]
     known = known & usable
-    share = np.maximum(smoothed(np.where(known, 1.0, 0.0)), _NO_WEIGHT)
+    every = known[:1] if np.all(known == known[:1]) else known  # the same in all frames
+    share = np.maximum(smoothed(np.where(every, 1.0, 0.0)), _NO_WEIGHT)
     blurred = np.stack([smoothed(one * known) / share for one in counts])
-    # Of independent noise, blurred, or resampled and blurred; and what was measured of shared one.
+    # The noise of independent samples, times what was measured of shared one.
+    own, both, before = noise
+    measured = np.divide(gain[1, here], before, out=np.ones_like(before), where=before > 0.0)
+    return blurred, valid[:, here], status[here], np.stack([own, both * measured])
+
+
+def _of_blur(displacement: Displacement, rows: slice, usable: Mask) -> Array:
+    """
+    Blur of some rows (4, pixel): its scale, and the noise [1] that it, both and resampling leave.
+
+    Of the pixels that are usable, of the rows around.
+    """
+    more, width = displacement.around(rows), displacement.shape[1]
+    here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
+    along = [(rows, more), (slice(width), slice(width))]
+    plain = csr_array(kron(*(_gaussian(*one, displacement.blur) for one in along)))
+    weights = plain @ diags_array(1.0 * usable)
+    total = weights.sum(axis=1)
+    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=usable[here])
+    weights = csr_array(diags_array(inverse) @ weights)
     paired = displacement.weights(more, displacement.source(rows))
     own, both, before = (
         np.sqrt(np.asarray((one**2).sum(axis=1)).ravel())
         for one in (weights, weights @ paired, paired)
     )
-    measured = np.divide(gain[1], before, out=np.ones_like(before), where=before > 0.0)
-    return blurred, valid[:, here], status[here], np.stack([own, both * measured[here]])
+    return np.stack([inverse, own, both, before[here]])
 
 
 def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
@@ -287,7 +317,7 @@ def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
 
 def _roughness(counts: Array) -> Array:
     """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
-    return np.asarray(np.median(np.abs(np.diff(counts, axis=1)), axis=1))
+    return np.asarray(np.median(np.abs(np.diff(counts, axis=1)), axis=1, overwrite_input=True))
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:

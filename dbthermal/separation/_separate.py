@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment
+from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
@@ -31,6 +32,8 @@ _UNEXPLAINED: Final = (
     "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
     "clocks differ, the intervals of the other pixels are too small."
 )
+# Method and pooling of what is separated first.
+_ALONE: Final = ("subspace", 0)
 # Rows and columns, at least, in which a shift can be found.
 _WIDE: Final = 24
 
@@ -45,6 +48,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     surroundings_std: float = 2.0,
     prior: str | xr.DataArray | xr.Dataset | None = None,
     settings: "SubspaceSettings | None" = None,
+    alone: xr.Dataset | None = None,
     workers: int = 2,
     progress: bool = False,
 ) -> xr.Dataset:
@@ -68,6 +72,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         As in `complete`.
     settings : SubspaceSettings, optional
         Options of the method "subspace".
+    alone : Dataset, optional
+        Result of `solve` for the same arguments, if at hand: the first step is not done again.
     workers : int
         Number of threads.
     progress : bool
@@ -103,11 +109,16 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
+    if alone is not None:
+        if (alone.attrs.get("method"), alone.attrs.get("pooled")) != _ALONE:
+            raise ValueError("Invalid result alone. Must be of 'subspace', without materials.")
+        alone = laid_on(alone, corrected, "the result alone", "the capture")
     if reflection_shift is None:
-        alone, reflection_shift, doubts = _apart(one, corrected, response, workers)
+        alone, reflection_shift, doubts = _apart(one, corrected, response, workers, alone)
         source = "none" if reflection_shift is None else "found"
     else:
-        alone, source, doubts = one(reflection_shift=reflection_shift), "given", []
+        alone = one(reflection_shift=reflection_shift) if alone is None else alone
+        source, doubts = "given", []
     result, pooled = alone, None
     if materials is None and find_spec("skimage") is not None:
         found = pooling.materials(alone, corrected, response, borders=True)
@@ -135,7 +146,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 
 def _apart(
-    one: Callable[..., xr.Dataset], corrected: xr.Dataset, response: xr.Dataset, workers: int
+    one: Callable[..., xr.Dataset],
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    workers: int,
+    known: xr.Dataset | None,
 ) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
     """First separation, the shift of the reflections if it needs one, and what is not explained."""
     apart = 0.0
@@ -151,7 +166,8 @@ def _apart(
             left, moving = _pixels_apart(alone)
             if left / moving < apart:
                 return alone, shift, []
-    return one(), None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
+    first = one() if known is None else known
+    return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
 
 
 def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2) -> float:

@@ -1,5 +1,7 @@
 """Two cameras side by side: the object as certain as from one place, right or flagged."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -114,6 +116,17 @@ def test_result_does_not_depend_on_workers(moved: tuple[xr.Dataset, ...]) -> Non
     _, capture, shift, result = moved
     one = separation.solve(capture, RIG.response(), reflection_shift=shift, workers=1)
     xr.testing.assert_identical(one, result)
+
+
+def test_what_is_at_hand_is_not_separated_again(moved: tuple[xr.Dataset, ...]) -> None:
+    """`separate` gives bit for bit the same with a result of `solve`, and refuses another's."""
+    _, capture, shift, alone = moved
+    whole = partial(separation.separate, capture, RIG.response(), reflection_shift=shift)
+    xr.testing.assert_identical(whole(alone=alone), whole())
+    pooled = alone.assign_attrs(pooled=1)
+    for other, message in ((pooled, "without materials"), (alone.isel(x=slice(9)), "size 9")):
+        with pytest.raises(ValueError, match=message):
+            whole(alone=other)
 
 
 def test_a_field_of_zero_changes_nothing() -> None:

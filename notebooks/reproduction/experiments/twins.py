@@ -86,7 +86,9 @@ def judge_twin(
         read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
         ways = {"alone": over_the_image(scene, separated)}
         if cameras != "one place":
-            whole = separation.separate(corrected, response, reflection_shift=shift)
+            whole = separation.separate(
+                corrected, response, reflection_shift=shift, alone=separated
+            )
             ways["pooled"] = over_the_image(scene, whole)
             ways["completed"] = over_the_image(scene, whole, completed=True)
         image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))

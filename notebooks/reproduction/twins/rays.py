@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from numba import njit
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 Array = npt.NDArray[np.float64]
@@ -122,6 +123,40 @@ class Hits:
         return Hits(self.face[rays], self.distance[rays], self.weights[rays])
 
 
+@njit(nogil=True, error_model="numpy", cache=True)
+def _on_faces(
+    face: npt.NDArray[np.int64], origins: Array, directions: Array, corners: Array
+) -> tuple[Array, Array]:
+    """Distance (ray,) and weights (ray, 3) in the faces' planes, as by Moller, Trumbore (1997)."""
+    distance, weights = np.full(face.size, np.inf), np.zeros((face.size, 3))
+    right, left, way, normal, across = np.empty((5, 3))
+    for ray in range(face.size):
+        if face[ray] == MISSED:
+            continue
+        first, second, third = corners[face[ray]]
+        towards = directions[ray]
+        for k in range(3):
+            right[k], left[k] = second[k] - first[k], third[k] - first[k]
+            way[k] = origins[ray, k] - first[k]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            normal[k] = towards[i] * left[j] - towards[j] * left[i]
+            across[k] = way[i] * right[j] - way[j] * right[i]
+        scale = right[0] * normal[0] + right[1] * normal[1] + right[2] * normal[2]
+        u = (way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]) / scale
+        v = (towards[0] * across[0] + towards[1] * across[1] + towards[2] * across[2]) / scale
+        # A ray along the edge of a face may leave it by rounding: back onto it.
+        inside = np.maximum(1.0 - u - v, 0.0), np.maximum(u, 0.0), np.maximum(v, 0.0)
+        total, along = inside[0] + inside[1] + inside[2], 0.0
+        for k in range(3):
+            weights[ray, k] = inside[k] / total
+        for k in range(3):
+            place = weights[ray, 0] * first[k] + weights[ray, 1] * second[k]
+            along += (place + weights[ray, 2] * third[k] - origins[ray, k]) * towards[k]
+        distance[ray] = along
+    return distance, weights
+
+
 class Caster:
     """Ray caster for one mesh [m], whose normals point outward."""
 
@@ -138,27 +173,9 @@ class Caster:
 
         The face is found in single precision, the point on it in double.
         """
-        origins, directions = np.broadcast_arrays(origins, directions)
+        origins = np.array(np.broadcast_to(origins, directions.shape))
         face = np.asarray(self._intersector.intersects_first(origins, directions), dtype=np.int64)
-        hits = Hits(face, np.full(face.shape, np.inf), np.zeros((face.size, 3)))
-        met = hits.met
-        weights = self._weights(face[met], origins[met], directions[met])
-        place = np.einsum("rc,rcx->rx", weights, self.corners[face[met]])
-        hits.weights[met] = weights
-        hits.distance[met] = np.einsum("rx,rx->r", place - origins[met], directions[met])
-        return hits
-
-    def _weights(self, face: npt.NDArray[np.int64], origins: Array, directions: Array) -> Array:
-        """Barycentric weights (ray, 3) in the faces' planes: Moller, Trumbore (1997)."""
-        first, second, third = self.corners[face].swapaxes(0, 1)
-        right, left, way = second - first, third - first, origins - first
-        normal = np.cross(directions, left)
-        scale = np.einsum("rx,rx->r", right, normal)
-        u = np.einsum("rx,rx->r", way, normal) / scale
-        v = np.einsum("rx,rx->r", directions, np.cross(way, right)) / scale
-        # A ray along the edge of a face may leave it by rounding: back onto it.
-        inside = np.maximum(np.stack([1.0 - u - v, u, v], axis=-1), 0.0)
-        return np.asarray(inside / inside.sum(axis=-1, keepdims=True))
+        return Hits(face, *_on_faces(face, origins, np.array(directions), self.corners))
 
     def points(self, hits: Hits) -> Array:
         """Points of intersection (ray, 3) [m]; all rays must meet the mesh."""
