@@ -47,6 +47,7 @@ __all__ = [
     "Stream",
     "camera_kind",
     "next_shutter",
+    "over_v4l2",
 ]
 __dir__ = __all__.copy
 
@@ -227,6 +228,17 @@ class CameraKind:
     open_frames: OpenFrames
     open_control: OpenControl | None = None
     telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
+
+
+def over_v4l2(decode: Callable[[Counts], Metadata] | None = None) -> OpenFrames:
+    """Opening of frames by `v4l2.open_url`, which is imported then: it is Linux's alone."""
+
+    def open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
+        from dbthermal.instruments import v4l2  # noqa: PLC0415
+
+        return v4l2.open_url(url, stream, decode)
+
+    return open_frames
 
 
 def camera_kind(name: str) -> CameraKind:

@@ -86,9 +86,8 @@ class Devices:
     sources: Mapping[str, FrameSource]  # frames by band, in the session's order
     cameras: Mapping[str, CameraControl] = field(default_factory=dict)  # command ports by band
     wheel: FilterWheel | None = None
-    logger: TC08 | None = None
-    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
     thermocouples: Thermocouples | None = None  # readings of the logger
+    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
 
     def readings(self) -> dict[str, Reading]:
         """Instruments that are read beside the frames, for `recording.record`.
@@ -128,8 +127,8 @@ class Devices:
             identities[band] = identity
         if self.wheel is not None:
             identities[WHEEL] = self.wheel.identity()
-        if self.logger is not None:
-            identities["thermocouples"] = self.logger.identity()
+        if self.thermocouples is not None:
+            identities["thermocouples"] = self.thermocouples.logger.identity()
         return identities
 
     def prepare(self) -> None:
@@ -234,7 +233,7 @@ def open_devices(
             if camera.control is not None and open_control is not None:
                 url = f"sim://{camera.kind}/{band}" if session.simulated else camera.control
                 cameras[band] = stack.enter_context(open_control(url, world))
-        wheel = logger = scans = None
+        wheel = thermocouples = None
         if session.filters:
             url = "sim://apt" if session.simulated else session.devices[WHEEL]
             opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
@@ -243,8 +242,8 @@ def open_devices(
             url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
             logger = stack.enter_context(TC08.from_url(url, world=world))
             logger.set_channels(session.thermocouples)
-            scans = Thermocouples(logger, session.thermocouples)
-        yield Devices(session, sources, cameras, wheel, logger, world, scans)
+            thermocouples = Thermocouples(logger, session.thermocouples)
+        yield Devices(session, sources, cameras, wheel, thermocouples, world)
 
 
 def _emulated(module: str) -> Any:

@@ -5,20 +5,13 @@ then follows from frozen images alone, see `camera.next_shutter`. Its offsets ar
 camera does so.
 """
 
-from contextlib import AbstractContextManager
 from typing import Final
 
-from dbthermal.instruments.camera import CameraKind, FrameSource, Stream
+from dbthermal.instruments.camera import CameraKind, over_v4l2
 
 __all__ = ["KIND"]
 __dir__ = __all__.copy
 
 
-def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
-    from dbthermal.instruments import v4l2  # noqa: PLC0415 - Linux only
-
-    return v4l2.open_url(url, stream)
-
-
-KIND: Final = CameraKind(_open_frames)
+KIND: Final = CameraKind(over_v4l2())
 """The kind of camera of a session's ``kind: y16``."""

@@ -48,6 +48,7 @@ Values = npt.NDArray[Any]
 _NO_NODES: Final = "band"  # folder of an array, in which zarr seeks no nodes: for unfinished files
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _THREADS: Final = 8
+_LOOKS: Final = 10  # for a folder, which may be moved between the two steps of a look
 _COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
 
 
@@ -288,14 +289,14 @@ class HeldFolder:
 
     def place(self) -> Path:
         """Path at which the folder lies now: FileNotFoundError if it was deleted."""
-        paths = (self._path, Path(os.path.realpath(self._link)))
-        for path in paths:
-            with suppress(OSError):
-                if os.path.samestat(os.fstat(self._descriptor), path.stat()):
-                    return path
+        for _ in range(_LOOKS):
+            for path in (self._path, Path(os.path.realpath(self._link))):
+                with suppress(OSError):
+                    if os.path.samestat(os.fstat(self._descriptor), path.stat()):
+                        return path
         raise FileNotFoundError(
-            f"No folder '{paths[0]}' any more: it was deleted, replaced or taken to another disk. "
-            "Must stay while it is written to."
+            f"No folder '{self._path}' any more: it was deleted, replaced or taken to another "
+            "disk. Must stay while it is written to."
         )
 
 

@@ -38,7 +38,7 @@ def test_whole_rig_is_opened_and_closed() -> None:
     with rig(from_yaml(TEXT)) as devices:
         assert list(devices.sources) == list(devices.cameras) == ["8-14", "9.5"]
         assert devices.wheel is not None
-        assert devices.logger is not None
+        assert devices.thermocouples is not None
         devices.wheel.status()
     for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
         with pytest.raises(TransportError, match="must stay connected and open"):
@@ -47,7 +47,7 @@ def test_whole_rig_is_opened_and_closed() -> None:
         with pytest.raises(ConnectionError, match="it is closed"):
             source.read()
     with pytest.raises(RuntimeError, match="closed"):
-        devices.logger.identity()
+        devices.thermocouples.logger.identity()
 
 
 def test_opening_changes_nothing(devices: Devices) -> None:
@@ -191,8 +191,8 @@ def test_instrument_that_fails_is_a_failed_reading(devices: Devices) -> None:
     readings = Devices(devices.session, {}, {"9.5": cast(Boson, camera)}).readings()
     with pytest.raises(BosonTimeoutError, match="No reply to 'FPA temperature"):
         readings["fpa 9.5"].read()
-    assert devices.logger is not None
-    devices.logger.close()
+    assert devices.thermocouples is not None
+    devices.thermocouples.logger.close()
     with pytest.raises(RuntimeError, match="closed"):
         devices.readings()["plate"].read()
 

@@ -9,7 +9,6 @@ sends and resets nothing, and nothing is ever written to the camera's flash memo
 import threading
 import time as system_time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from enum import IntEnum
 from typing import Any, Final, TypeVar
 
@@ -17,14 +16,7 @@ from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.boson import commands
 from dbthermal.instruments.boson.commands import Reading, Setting
-from dbthermal.instruments.camera import (
-    CameraKind,
-    FfcMode,
-    FfcStatus,
-    FrameSource,
-    Identity,
-    Stream,
-)
+from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, Identity, over_v4l2
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 __all__ = [
@@ -251,12 +243,5 @@ class Boson(Closing):
         raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
 
 
-def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
-    """Frames of a Boson on Linux, with its telemetry."""
-    from dbthermal.instruments import v4l2  # noqa: PLC0415 - Linux only
-
-    return v4l2.open_url(url, stream, decode=telemetry.metadata)
-
-
-KIND: Final = CameraKind(_open_frames, Boson.from_url, telemetry_rows=(0, telemetry.ROWS))
+KIND: Final = CameraKind(over_v4l2(telemetry.metadata), Boson.from_url, (0, telemetry.ROWS))
 """The kind of camera of a session's ``kind: boson``."""
