@@ -11,7 +11,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
@@ -278,15 +277,14 @@ def _return(turned: Any, start: int, size: int, samples: Any) -> None:
 def _compiled(digest: str) -> Callable[..., None]:
     """Steps of all pixels of a tile, compiled once for sources of one digest."""
 
-    @njit(nogil=True, error_model="numpy")
+    @kernels.entered
     def separate(
         model: Model, signals: Array, materials: Array, least: float, work: Work, solved: Solved
     ) -> None:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
-        frames, pixels = signals.shape[1:]
-        block = max(_BLOCK, _TURNED // frames)
-        inside, outside = np.empty((block, 2, frames)), np.empty((block, 4, frames), np.float32)
+        inside, outside, pixels = work.inside, work.outside, signals.shape[2]
+        block = len(inside)
         for start in range(0, pixels, block):
             size = min(block, pixels - start)
             _turn(signals, start, size, inside)
@@ -354,6 +352,7 @@ def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
 def _work_space(functions: smooth.Subspace) -> Work:
     """Arrays for the signals and curves of one pixel."""
     frames, columns = functions.functions.shape
+    block = max(_BLOCK, _TURNED // frames)
     rest: dict[str, Any] = {
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
         "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
@@ -362,6 +361,8 @@ def _work_space(functions: smooth.Subspace) -> Work:
         "spectra": np.empty((2, functions.rising.shape[1])),
         "scatter": np.empty((functions.orders, 3)),
         "material": np.empty(6),
+        "inside": np.empty((block, 2, frames)),
+        "outside": np.empty((block, 4, frames), np.float32),
     }
     curves = {name: np.empty(frames) for name in Work._fields}
     return Work(**curves | rest)

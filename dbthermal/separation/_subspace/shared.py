@@ -34,7 +34,7 @@ class Model(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Signals and curves (time) of one pixel."""
+    """Signals and curves (time) of one pixel, and of some as they are read and written."""
 
     first: Array  # signals [K]
     second: Array
@@ -68,3 +68,5 @@ class Work(NamedTuple):
     spectra: Array  # (2, degree)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
     material: Array  # ratio, inverse energy, emissivity, its two variances, spread; NaN for none
+    inside: Array  # signals of some pixels [K] (pixel, 2, time)
+    outside: Any  # their films, in single precision (pixel, 4, time)
