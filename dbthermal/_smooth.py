@@ -6,7 +6,7 @@ then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Final
 
@@ -42,6 +42,7 @@ class Subspace:
         frames, columns = self.functions.shape
         return np.full((columns, 2), [0, frames]) if self.pieces is None else self.pieces
 
+    @cached_property
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
         result = namespace(self.functions).zeros_like(self.object_part.T[self.steps :])
@@ -106,11 +107,10 @@ def piecewise(
     for start, stop, basis in parts:
         together[column : column + basis.shape[1], start:stop] = basis.T
         column += basis.shape[1]
-    if not camera_steps(segment):  # of two pieces, orthonormal as they are
-        return Subspace(together.T, together.T, len(together) - 1, rising, spans)
-    functions, object_part = _without_steps(
-        together.T, camera_steps(segment), np.empty((time.size, 0))
-    )
+    plain, steps = together.T, camera_steps(segment)
+    if not steps:  # of two pieces, orthonormal as they are
+        return Subspace(plain, plain, len(together) - 1, rising, spans)
+    functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
     return Subspace(functions, object_part, functions.shape[1] - 1, rising)
 
 

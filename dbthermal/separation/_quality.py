@@ -61,13 +61,15 @@ def read(
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
     valid = np.ones(counts.shape[1:], dtype=bool)
-    if not schema.measured(np.array([counts.min(), counts.max()])).all():  # NaN is both
+    ends = np.stack([counts.min(axis=1), counts.max(axis=1)], axis=1)
+    if not schema.measured(ends).all():  # NaN is both
         valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
     known = grains(part) if known is None else known
-    saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, known, strict=True)]
+    bands = zip(counts, known, ends, strict=True)
+    saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
     frozen, copied = _frozen(same, valid, [it.chance for it in known])
     valid &= ~copied[:, np.newaxis]

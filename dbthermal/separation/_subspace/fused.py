@@ -150,7 +150,7 @@ class Solved(NamedTuple):
 
     films: npt.NDArray[np.float32]  # object, deviation, background, deviation (4, time, pixel) [K]
     record: Any  # `RECORD` (pixel)
-    sums: Array  # (pixel, 2, block) [K]
+    sums: Array  # (2, block, pixel) [K]
 
 
 @inlined
@@ -207,10 +207,13 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w = ratios.order + model.steps, ratios.weights
-    for j in range(count):
-        work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
-    kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
-    kernels.combined(model.functions, model.spans, work.columns, count, residual)
+    if model.stepless:  # the smooth curves of the object are those of the signals
+        kernels.copy(work.target, residual)
+    else:
+        for j in range(count):
+            work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
+        kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
+        kernels.combined(model.functions, model.spans, work.columns, count, residual)
     for t in range(rapid.size):
         rapid[t] = work.first[t] - rapid[t]
         residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
@@ -293,7 +296,7 @@ def _compiled(digest: str) -> Callable[..., None]:
                 kernels.copy(inside[p, 0], work.first)
                 kernels.copy(inside[p, 1], work.second)
                 kernels.copy(materials[here], work.material)
-                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[here])
+                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[..., here])
             _return(outside, start, size, solved.films)
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
@@ -309,9 +312,9 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     first, second = tile.curves
     rate, gray = _ratios(first, second)
     columns = np.ascontiguousarray(functions.functions.T)
-    of_object = columns  # the same array, if it holds the same, stays in the cache
-    if functions.object_part is not functions.functions:
-        of_object = np.ascontiguousarray(functions.object_part.T)
+    stepless = functions.object_part is functions.functions
+    # The same array, if it holds the same, stays in the cache.
+    of_object = columns if stepless else np.ascontiguousarray(functions.object_part.T)
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
@@ -324,8 +327,9 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        leverage=np.ascontiguousarray(functions.leverage().T),
+        leverage=np.ascontiguousarray(functions.leverage.T),
         steps=int(functions.steps),
+        stepless=stepless,
         noise=(float(tile.noise[0]), float(tile.noise[1])),
         pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
@@ -381,14 +385,16 @@ def solve(
         rest = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *rest], 1)
     films = np.empty((4, frames, pixels), np.float32)
-    record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
+    record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     _separate(shared, signals, materials, float(least), work, Solved(films, record, sums))
-    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
+    named: dict[str, Any] = {
+        name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
+    }
     freedom = frames - functions.steps - record["order"]
     named |= {
         "freedom": freedom,
         "beyond": named["beyond"] > 0,
         **dict(zip(FILMS, films, strict=True)),
     }
-    return Solution(sums=sums.transpose(1, 2, 0), **named)
+    return Solution(sums=sums, **named)

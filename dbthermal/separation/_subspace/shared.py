@@ -20,6 +20,7 @@ class Model(NamedTuple):
     spread: float  # of the first of these
     leverage: Array  # (order, time)
     steps: int
+    stepless: bool  # no function has a step of the camera: both are the same
     noise: tuple[float, float]  # [K]
     pattern: tuple[float, float]  # [K]
     drift: float  # limit of the background's, over the square root of three [K]
