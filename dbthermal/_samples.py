@@ -279,9 +279,12 @@ def frozen(same: Mask, chance: float) -> Mask:
 
 def copies(same: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
+    least = _needed(len(valid), chance)
+    if not np.any(np.count_nonzero(same, axis=1) >= least):  # as nearly always
+        return np.zeros(len(valid), dtype=bool)
     moving = ~same.all(axis=0)
     both = moving if valid.all() else valid[1:] & valid[:-1] & moving
-    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= _needed(len(valid), chance))
+    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= least)
     return np.concatenate([[False], copied])
 
 

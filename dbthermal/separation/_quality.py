@@ -1,6 +1,7 @@
 """Data quality: which samples of a capture are valid, and which pixels cannot be used."""
 
 from collections.abc import Iterator, Mapping
+from functools import reduce
 from typing import Any, Final
 
 import numpy as np
@@ -200,7 +201,7 @@ def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, 
     Of the samples that repeat the one before, by band.
     """
     copied = [samples.copies(*pair, valid) for pair in zip(same, chances, strict=True)]
-    pixels = samples.frozen(np.all(same, axis=0), float(np.prod(chances)))
+    pixels = samples.frozen(reduce(np.logical_and, same), float(np.prod(chances)))
     for band, copy, chance in zip(same, copied, chances, strict=True):
         pixels |= samples.frozen(band, chance) | samples.frozen(copy[:, np.newaxis], 0.0)
     return pixels, np.any(copied, axis=0)

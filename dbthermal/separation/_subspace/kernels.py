@@ -142,8 +142,7 @@ def polynomial(c: tuple[float, ...], x: float) -> float:
 @compiled
 def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
     """Polynomial of ten rising coefficients, and its derivative."""
-    value, slope = c[9], 0.0
-    slope, value = value, value * x + c[8]
+    slope, value = c[9], c[9] * x + c[8]
     slope, value = slope * x + value, value * x + c[7]
     slope, value = slope * x + value, value * x + c[6]
     slope, value = slope * x + value, value * x + c[5]
