@@ -187,12 +187,19 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
     return Grain(std, chance if chance < _COARSE else 1.0)
 
 
-def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain) -> Mask:
-    """Pixels (pixel) of counts (time, pixel) of which the highest or lowest value is a heap."""
+def heaped(
+    counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: npt.NDArray[Any] | None = None
+) -> Mask:
+    """
+    Pixels (pixel) of counts (time, pixel) of which the highest or lowest value is a heap.
+
+    The lowest and highest values (2, pixel) of all samples, valid or not, may be known.
+    """
     result = np.zeros(counts.shape[1], dtype=bool)
     if band.chance < 1.0:
         for highest in (False, True):
-            end, number = end_of(counts, valid, highest=highest)
+            known = None if ends is None else ends[int(highest)]
+            end, number = end_of(counts, valid, highest=highest, known=known)
             (pixels,) = np.nonzero(number >= FEWEST)
             pixels = pixels[number[pixels] < valid[:, pixels].sum(axis=0)]
             near = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
@@ -201,11 +208,21 @@ def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain) -> Mask:
 
 
 def end_of(
-    counts: npt.NDArray[Any], valid: Mask, *, highest: bool
+    counts: npt.NDArray[Any],
+    valid: Mask,
+    *,
+    highest: bool,
+    known: npt.NDArray[Any] | None = None,
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
-    """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
+    """
+    Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there.
+
+    The value may be known if all samples are valid.
+    """
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
-    if used is True:
+    if used is True and known is not None:
+        end = known
+    elif used is True:
         end = counts.max(axis=0) if highest else counts.min(axis=0)
     elif highest:
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
@@ -262,9 +279,12 @@ def frozen(same: Mask, chance: float) -> Mask:
 
 def copies(same: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
+    least = _needed(len(valid), chance)
+    if not np.any(np.count_nonzero(same, axis=1) >= least):  # as nearly always
+        return np.zeros(len(valid), dtype=bool)
     moving = ~same.all(axis=0)
     both = moving if valid.all() else valid[1:] & valid[:-1] & moving
-    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= _needed(len(valid), chance))
+    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= least)
     return np.concatenate([[False], copied])
 
 

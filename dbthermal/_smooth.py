@@ -6,7 +6,7 @@ then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Final
 
@@ -43,6 +43,7 @@ class Subspace:
         frames, columns = self.functions.shape
         return np.full((columns, 2), [0, frames]) if self.pieces is None else self.pieces
 
+    @cached_property
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
         if self.of_pieces is not None:
@@ -108,12 +109,11 @@ def piecewise(
     for start, stop, basis, _ in parts:
         together[column : column + basis.shape[1], start:stop] = basis.T
         column += basis.shape[1]
-    if not camera_steps(segment):  # of two pieces, orthonormal as they are
+    plain, steps = together.T, camera_steps(segment)
+    if not steps:  # of two pieces, orthonormal as they are
         leverage = np.concatenate([part[3] for part in parts])
-        return Subspace(together.T, together.T, len(together) - 1, rising, spans, leverage)
-    functions, object_part = _without_steps(
-        together.T, camera_steps(segment), np.empty((time.size, 0))
-    )
+        return Subspace(plain, plain, len(together) - 1, rising, spans, leverage)
+    functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
     return Subspace(functions, object_part, functions.shape[1] - 1, rising)
 
 

@@ -62,7 +62,7 @@ def test_bad_order(order: int) -> None:
 def test_leverage_is_the_hat_matrix() -> None:
     """For each order the leverage is the diagonal of the projection, and adds up to the order."""
     time = np.cumsum(np.linspace(0.1, 0.5, 25))
-    result = smooth.subspace(time, 5).leverage()
+    result = smooth.subspace(time, 5).leverage
     for order in range(1, 6):
         design = np.vander(time - time.mean(), order)
         hat = design @ np.linalg.pinv(design)
@@ -116,7 +116,7 @@ def test_leverage_with_steps_is_the_variance_of_the_object_part() -> None:
         assert used.sum() == order + 1
         own = functions.object_part[:, used] @ (functions.functions[:, used].T @ noise)
         np.testing.assert_allclose(
-            own.var(axis=1), functions.leverage()[:, order - 1], rtol=0.15, atol=0
+            own.var(axis=1), functions.leverage[:, order - 1], rtol=0.15, atol=0
         )
 
 

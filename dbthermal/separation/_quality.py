@@ -1,6 +1,7 @@
 """Data quality: which samples of a capture are valid, and which pixels cannot be used."""
 
 from collections.abc import Iterator, Mapping
+from functools import reduce
 from typing import Any, Final
 
 import numpy as np
@@ -61,13 +62,15 @@ def read(
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
     valid = np.ones(counts.shape[1:], dtype=bool)
-    if not schema.measured(np.array([counts.min(), counts.max()])).all():  # NaN is both
+    ends = np.stack([counts.min(axis=1), counts.max(axis=1)], axis=1)
+    if not schema.measured(ends).all():  # NaN is both
         valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
     known = grains(part) if known is None else known
-    saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, known, strict=True)]
+    bands = zip(counts, known, ends, strict=True)
+    saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
     frozen, copied = _frozen(same, valid, [it.chance for it in known])
     valid &= ~copied[:, np.newaxis]
@@ -198,7 +201,7 @@ def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, 
     Of the samples that repeat the one before, by band.
     """
     copied = [samples.copies(*pair, valid) for pair in zip(same, chances, strict=True)]
-    pixels = samples.frozen(np.all(same, axis=0), float(np.prod(chances)))
+    pixels = samples.frozen(reduce(np.logical_and, same), float(np.prod(chances)))
     for band, copy, chance in zip(same, copied, chances, strict=True):
         pixels |= samples.frozen(band, chance) | samples.frozen(copy[:, np.newaxis], 0.0)
     return pixels, np.any(copied, axis=0)

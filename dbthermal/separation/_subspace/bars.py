@@ -91,8 +91,8 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
     """Variance of the object, and whether the background hardly rests; see `emission.estimate`."""
     count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
     # Of eq. 6 by implicit differentiation, and what the residual of a frame of rest holds.
-    sensitivity, smooth_variance = work.sensitivity, work.smooth_variance
-    kernels.combined(model.object_part, model.spans, work.coefficients[0], count, sensitivity)
+    sensitivity, smooth_variance, curve = work.sensitivity, work.smooth_variance, work.rapid
+    kernels.combined(model.object_part, model.spans, work.coefficients[0], count, curve)
     resting, more, leverage = 0.0, 1.0 + log(work.first.size) / count, model.leverage
     beside = 1.0 / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
     one, two = weights(ratios, first)
@@ -102,7 +102,7 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
         # The second band's signal before the last step, of the value of h; see `emission._newton`.
         other = (work.target[t] - work.lack[t] - one * work.emitted[t]) * inverse
         partial = other + first * (work.emitted[t] - other)
-        sensitivity[t] = (partial - sensitivity[t]) * flat
+        sensitivity[t] = (partial - curve[t]) * flat
         smooth_variance[t] = leverage[ratios.order - 1, t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
@@ -191,10 +191,10 @@ def _background(
     if pattern[0] > 0.0 or pattern[1] > 0.0:
         direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
         kernels.blackbody(model.first, work.background, work.mean, work.spare)
-        kernels.blackbody(model.first, work.temperature, work.mean, work.rapid)
-        kernels.blackbody(model.second, work.temperature, work.mean, work.null_residual)
+        kernels.blackbody(model.first, work.temperature, work.mean, work.kernel)
+        kernels.blackbody(model.second, work.temperature, work.mean, work.lack)
         for t in range(variance.size):
-            slope0, slope1 = work.rapid[t], work.null_residual[t]
+            slope0, slope1 = work.kernel[t], work.lack[t]
             steepness = w[0] * first * slope0 + w[1] * last * slope1
             through = direct0 * first * slope0 + direct1 * last * slope1
             a, b = w[0] / steepness, w[1] / steepness

@@ -11,7 +11,6 @@ from math import acos, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
@@ -140,7 +139,7 @@ def _scatters(tree: Tree, scratch: Scratch) -> None:
                 a, b, d = a - held * held, b - held * other, d - other * other
         scratch.fitted[i, 0], scratch.fitted[i, 1], scratch.fitted[i, 2] = a, b, d
         if tree.chosen[i] >= tree.columns[i]:
-            scratch.scatter[i] = scratch.fitted[i]
+            kernels.copy(scratch.fitted[i], scratch.scatter[i])
 
 
 @compiled
@@ -301,7 +300,7 @@ def _pixel(tree: Tree, scratch: Scratch, ratio: float, begins: Mask) -> None:
         axes[0, -1] = 1.0 / length if known else axes[0, 0]
         axes[1, -1] = ratio / length if known else axes[1, 0]
     _best(tree, scratch)
-    scratch.starting[:] = scratch.least[0]
+    kernels.copy(scratch.least[0], scratch.starting)
     apart = 0.0
     for number in range(pieces.AXES):
         place, lowest = 0, np.inf
@@ -333,7 +332,7 @@ def _near(axis: Array, taken: Array, count: int, apart: float) -> bool:
 def _compiled(digest: str) -> Callable[..., None]:
     """Divisions of all pixels of a tile, compiled once for sources of one digest."""
 
-    @njit(nogil=True, error_model="numpy")
+    @kernels.entered
     def divide(
         tree: Tree,
         signals: Array,

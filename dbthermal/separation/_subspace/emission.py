@@ -87,7 +87,7 @@ def estimate(
     xp = namespace(noise)
     # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
     sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
-    leverage, used = functions.leverage()[:, ratios.order - 1], ratios.order + functions.steps
+    leverage, used = functions.leverage[:, ratios.order - 1], ratios.order + functions.steps
     smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.

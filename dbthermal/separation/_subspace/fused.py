@@ -11,7 +11,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
@@ -151,7 +150,7 @@ class Solved(NamedTuple):
 
     films: npt.NDArray[np.float32]  # object, deviation, background, deviation (4, time, pixel) [K]
     record: Any  # `RECORD` (pixel)
-    sums: Array  # (pixel, 2, block) [K]
+    sums: Array  # (2, block, pixel) [K]
 
 
 @inlined
@@ -208,10 +207,13 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w = ratios.order + model.steps, ratios.weights
-    for j in range(count):
-        work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
-    kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
-    kernels.combined(model.functions, model.spans, work.columns, count, residual)
+    if model.stepless:  # the smooth curves of the object are those of the signals
+        kernels.copy(work.target, residual)
+    else:
+        for j in range(count):
+            work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
+        kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
+        kernels.combined(model.functions, model.spans, work.columns, count, residual)
     for t in range(rapid.size):
         rapid[t] = work.first[t] - rapid[t]
         residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
@@ -278,7 +280,7 @@ def _return(turned: Any, places: Whole, samples: Any) -> None:
 def _compiled(digest: str) -> Callable[..., None]:
     """Steps of some pixels of a tile, compiled once for sources of one digest."""
 
-    @njit(nogil=True, error_model="numpy")
+    @kernels.entered
     def separate(
         model: Model,
         signals: Array,
@@ -290,9 +292,8 @@ def _compiled(digest: str) -> Callable[..., None]:
     ) -> None:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
-        frames, pixels = signals.shape[1], places.size
-        block = min(max(_BLOCK, _TURNED // frames), pixels)
-        inside, outside = np.empty((block, 2, frames)), np.empty((block, 4, frames), np.float32)
+        inside, outside, pixels = work.inside, work.outside, places.size
+        block = len(inside)
         for start in range(0, pixels, block):
             together = places[start : start + block]
             _turn(signals, together, inside)
@@ -301,7 +302,7 @@ def _compiled(digest: str) -> Callable[..., None]:
                 kernels.copy(inside[p, 0], work.first)
                 kernels.copy(inside[p, 1], work.second)
                 kernels.copy(materials[here], work.material)
-                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[here])
+                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[..., here])
             _return(outside, together, solved.films)
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
@@ -343,15 +344,16 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
 def _columns(functions: smooth.Subspace) -> dict[str, Any]:
     """Fields of a `Model` that hold functions of time, columns along it."""
     columns = np.ascontiguousarray(functions.functions.T)
-    of_object = columns  # the same array, if it holds the same, stays in the cache
-    if functions.object_part is not functions.functions:
-        of_object = np.ascontiguousarray(functions.object_part.T)
+    stepless = functions.object_part is functions.functions
+    # The same array, if it holds the same, stays in the cache.
+    of_object = columns if stepless else np.ascontiguousarray(functions.object_part.T)
     return {
         "functions": columns,
         "object_part": of_object,
         "spans": functions.spans,
-        "leverage": np.ascontiguousarray(functions.leverage().T),
+        "leverage": np.ascontiguousarray(functions.leverage.T),
         "steps": int(functions.steps),
+        "stepless": stepless,
     }
 
 
@@ -366,12 +368,17 @@ def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
 
 def _work_space(frames: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
-    curves = {name: np.empty(frames) for name in Work._fields}
+    curves, block = (
+        {name: np.empty(frames) for name in Work._fields},
+        max(_BLOCK, _TURNED // frames),
+    )
     return curves | {
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
         "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
         "spectra": np.empty((2, degrees)),
         "material": np.empty(6),
+        "inside": np.empty((block, 2, frames)),
+        "outside": np.empty((block, 4, frames), np.float32),
     }
 
 
@@ -398,7 +405,7 @@ def solve_parts(
         rest = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *rest], 1)
     films = np.empty((4, frames, pixels), np.float32)
-    record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
+    record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved, freedom = Solved(films, record, sums), np.empty(pixels, np.intp)
     space = _work_space(frames, len(shared.rising))
@@ -408,10 +415,12 @@ def solve_parts(
         space["scatter"] = np.empty((functions.orders, 3))
         _separate(model, signals, places, materials, float(least), Work(**space), solved)
         freedom[places] = frames - functions.steps - record["order"][places]
-    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
+    named: dict[str, Any] = {
+        name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
+    }
     named |= {
         "freedom": freedom,
         "beyond": named["beyond"] > 0,
         **dict(zip(FILMS, films, strict=True)),
     }
-    return Solution(sums=sums.transpose(1, 2, 0), **named)
+    return Solution(sums=sums, **named)

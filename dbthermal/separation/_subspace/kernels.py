@@ -33,16 +33,20 @@ _SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), P
 DIGEST: Final = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_SOURCES))).hexdigest()
 """Of the sources, with which compiled code is kept."""
 
+# Nothing is allocated within: to count references to the parts of arrays takes a fifth of the time.
+_OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+entered: Final[Callable[..., Any]] = njit(**_OPTIONS)
+"""Decorator of compiled functions that are called from outside."""
+
 # Sums may be taken in any order; NaN stays NaN.
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
-compiled: Final[Callable[..., Any]] = njit(nogil=True, fastmath=_FLAGS, error_model="numpy")
+compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
 """Decorator of functions that are compiled into those that call them."""
 
-_WITHIN: Final[dict[str, Any]] = {"forceinline": True, "no_cpython_wrapper": True}
-inlined: Final[Callable[..., Any]] = njit(
-    nogil=True, fastmath=_FLAGS, error_model="numpy", **_WITHIN
-)
+_WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}
+inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
 """As `compiled`, for what has a work space: to hand over its some 300 numbers takes long."""
+_numbers: Final[Callable[..., Any]] = njit(fastmath=_FLAGS | {"nnan"}, **_OPTIONS)
 
 
 class Table(NamedTuple):
@@ -138,8 +142,7 @@ def polynomial(c: tuple[float, ...], x: float) -> float:
 @compiled
 def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
     """Polynomial of ten rising coefficients, and its derivative."""
-    value, slope = c[9], 0.0
-    slope, value = value, value * x + c[8]
+    slope, value = c[9], c[9] * x + c[8]
     slope, value = slope * x + value, value * x + c[7]
     slope, value = slope * x + value, value * x + c[6]
     slope, value = slope * x + value, value * x + c[5]
@@ -228,7 +231,7 @@ def mean(values: Array) -> float:
     return total / values.size
 
 
-@njit(nogil=True, fastmath=_FLAGS | {"nnan"}, error_model="numpy")
+@_numbers
 def range_of(values: Array) -> Any:
     """Largest less smallest value; with a NaN any number, or these would be taken one by one."""
     low, high = values[0], values[0]

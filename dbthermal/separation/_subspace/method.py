@@ -51,13 +51,14 @@ formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import select
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, require_device
 from dbthermal.separation._quality import status_bits
@@ -170,8 +171,17 @@ def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
 
 
 def _functions(tile: Tile) -> smooth.Subspace:
-    order = min(reflection_ratio.HIGHEST_ORDER, tile.time.size // 4)
-    return smooth.subspace(tile.time, order, segment=tile.segment)
+    segment = tile.segment
+    return _known_functions(tile.time.tobytes(), None if segment is None else segment.tobytes())
+
+
+@lru_cache(maxsize=4)
+def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
+    """Smooth functions over some times: most tiles have the same."""
+    time = np.frombuffer(times)
+    segment = None if events is None else np.frombuffer(events, dtype=np.intp)
+    order = min(reflection_ratio.HIGHEST_ORDER, time.size // 4)
+    return smooth.subspace(time, order, segment=segment)
 
 
 def _solve(
@@ -257,7 +267,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     still |= solution.scatter[0, 0] <= 0
     still = (still & ~solution.pooled) | ~np.isfinite(solution.inverse_energy)
     # Ratios of 1, where eq. 5 is singular, are not excluded.
-    singular = solution.epsilon_variance > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
+    singular = solution.epsilon_variance > 1.0 / chdtri(others, reflection_ratio.CHANCE)
     gray = ~still & (singular | solution.gray)
     defined = ~still & ~gray & ~solution.constant
     nonphysical = defined & np.any((emissivity <= 0) | (emissivity >= 1), axis=0)
@@ -265,7 +275,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     constant = ~still & ~gray & solution.constant
     # Before an object that hardly changes, what changes would be the background: comes and goes.
     resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
-    swapped[resting] = ~residuals.returning(tile.signals[0][:, resting])
+    swapped[resting] = ~residuals.returning(select(tile.signals[0], resting))
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
     excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom)
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained

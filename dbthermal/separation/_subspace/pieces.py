@@ -315,13 +315,12 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     mean = left + curve / (length * deviation)
     costs = []
     for level in range(levels - 1):
-        cost = np.empty((1 << level, mean.shape[1]))
-        for piece, part in enumerate(np.split(mean, len(cost))):
-            start = piece * len(part)
-            basis, chosen = functions(places[start : start + len(part)].tobytes(), None)
-            held = basis[:, :chosen].T @ part
-            cost[piece] = (part**2).sum(axis=0) - (held**2).sum(axis=0) + COST * chosen
-        costs.append(cost)
+        parts = mean.reshape(1 << level, -1, mean.shape[1])
+        found = [functions(one.tobytes(), None) for one in places.reshape(len(parts), -1)]
+        chosen = found[0][1]
+        held = np.stack([basis[:, :chosen] for basis, _ in found]).mT @ parts
+        energy = np.einsum("itp,itp->ip", parts, parts) - np.einsum("ijp,ijp->ip", held, held)
+        costs.append(energy + COST * chosen)
     smoothly = (left**2).sum(axis=0) + COST * used
     least, whole = _halve(costs)
     return np.asarray((smoothly > least + _MARGIN * COST) & ~whole[0][0])

@@ -20,6 +20,7 @@ class Model(NamedTuple):
     spread: float  # of the first of these
     leverage: Array  # (order, time)
     steps: int
+    stepless: bool  # no function has a step of the camera: both are the same
     noise: tuple[float, float]  # [K]
     pattern: tuple[float, float]  # [K]
     drift: float  # limit of the background's, over the square root of three [K]
@@ -34,7 +35,7 @@ class Model(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Signals and curves (time) of one pixel."""
+    """Signals and curves (time) of one pixel, and of some as they are read and written."""
 
     first: Array  # signals [K]
     second: Array
@@ -68,3 +69,5 @@ class Work(NamedTuple):
     spectra: Array  # (2, degree)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
     material: Array  # ratio, inverse energy, emissivity, its two variances, spread; NaN for none
+    inside: Array  # signals of some pixels [K] (pixel, 2, time)
+    outside: Any  # their films, in single precision (pixel, 4, time)
