@@ -16,6 +16,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._inputs import check
+from dbthermal.separation._pooling import alone as single
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._solve import get_method, solve
 
@@ -56,8 +57,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
     Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
     reflections move, with the shift between the cameras' reflections (`alignment.reflection_shift`)
-    if fewer are apart with it; then with the pixels of each material pooled (`materials`); last,
-    what is still unknown is completed (`complete`).
+    if fewer are apart with it; then with the pixels of each material pooled (`materials`), except,
+    of cameras apart, those that only alone have no flag or lie at its border; last, what is still
+    unknown is completed (`complete`).
 
     Parameters
     ----------
@@ -129,6 +131,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         materials = pooling.without_borders(joined, alone, response)
     if materials is not None and (pooled is None or not materials.equals(pooled)):
         result = one(pool=materials, reflection_shift=reflection_shift)
+    if materials is not None and reflection_shift is not None:
+        single.hold(alone, result, materials)
     result = complete(
         result,
         corrected,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from test_displaced import field
 
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation
@@ -72,6 +73,42 @@ def test_material_elsewhere_completes_within_noise(half: Case) -> None:
     assert cover > 0.9
     still = whole["status"].where(missing.any("time"), 0).astype(int)
     assert bool((((still & int(Status.COMPLETED_FROM_MATERIAL)) != 0) | (still == 0)).all())
+
+
+def test_few_pixels_tell_no_material(half: Case) -> None:
+    """Three pixels do not say how much those of their label differ: the prior completes these."""
+    _, capture, alone = half
+    told = np.argwhere(alone["status"].values == 0)[:3]
+    labels = xr.full_like(alone["status"], -1, dtype=int)
+    labels.values[alone["status"].values != 0] = 0
+    labels.values[tuple(told.T)] = 0
+    pooled = alone.assign_attrs(pooled=1)  # as if they were pooled, each with its own
+    whole = separation.complete(pooled, capture, RESPONSE, labels)
+    assert not bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
+    labels.values[tuple(np.argwhere(alone["status"].values == 0)[3:6].T)] = 0
+    whole = separation.complete(pooled, capture, RESPONSE, labels)
+    assert bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
+
+
+def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
+    """Two cameras see two backgrounds there: what one band shows of its own is no emission."""
+    picture = Picture(shape=(24, 64), walkers=2, warmer=(10.0, 12.0))
+    shift = np.zeros((2, *picture.shape))
+    shift[1] = 16.0
+    rng = np.random.default_rng(3)
+    scene = picture.draw(TIME, emissivity_of(0.86, 0.72), rng, shift)
+    scene["object_temperature"][..., :14] = ROOM
+    capture, labels = observe(scene, RESPONSE, rng), xr.zeros_like(scene["emissivity"][0], int)
+    known, labels = field(shift), labels.drop_vars("band")
+    whole = separation.separate(capture, RESPONSE, reflection_shift=known, materials=labels)
+    beyond = (whole["status"] & int(Status.NO_REFLECTION_PAIR)) != 0
+    off = abs(whole["emissivity"] - scene["emissivity"]).where(beyond)[..., :14]
+    error = abs(whole["object_temperature"] - scene["object_temperature"]).where(beyond)
+    cover = float((error < 1.96 * whole["object_temperature_std"]).where(beyond).mean())
+    print(f"emissivities off by {float(off.max()):.3f}, intervals hold {cover:.3f}")
+    assert float(beyond[:, :14].mean()) > 0.9
+    assert float(off.max()) < 0.1
+    assert cover > 0.9
 
 
 def test_nobody_walks() -> None:

@@ -113,10 +113,11 @@ def bins(tile: Tile, valid: Mask) -> Bins:
     return Bins(total / np.maximum(frames, 1.0), frames, starts)
 
 
-def curve(tile: Tile, means: Bins, offset: Array) -> Curve:
+def curve(tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0) -> Curve:
     """Other bands over the first; offsets (band - 1) [K] of a pixel against them are not known.
 
     The variance is that of the noise, or the bins' if it is more: there the background fluctuates.
+    The first band has a variance of strays [K^2], beside the noise, which the others do not follow.
     """
     weight, first = means.frames, means.signals[0]
     total = np.maximum(weight.sum(axis=0), 1.0)
@@ -124,7 +125,7 @@ def curve(tile: Tile, means: Bins, offset: Array) -> Curve:
     centred = np.where(weight > 0, first - middle, 0.0)
     energy = (weight * centred**2).sum(axis=0)
     bins_used = np.count_nonzero(weight, axis=0)
-    centred = centred * (energy > _SEEN * tile.noise[0] ** 2 * bins_used)
+    centred = centred * (energy > _SEEN * (tile.noise[0] ** 2 * bins_used + stray * total))
     half = np.maximum(np.abs(centred).max(axis=0), _LEAST_RANGE)
     base = _lagrange(centred / half)  # (node, bin, pixel)
     gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)

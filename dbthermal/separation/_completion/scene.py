@@ -31,6 +31,8 @@ _FLUCTUATION: Final = 2.0
 _LEAST: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
+# Pixels of a material that tell its emissivity, and how much they differ, at least.
+_FEWEST: Final = 4
 # Stated temperatures below are in degrees Celsius, or no room's [K].
 _COLDEST: Final = 150.0
 # Residual, in standard deviations of the noise, from which a result is of another capture.
@@ -101,10 +103,11 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
     told = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
     for label in np.unique(labels[told & (labels >= 0)]):
         here, wanted = told & (labels == label), ~known & (labels == label)
+        if here.sum() < _FEWEST:
+            continue
         value[:, wanted] = np.median(shared[:, here], axis=-1)[..., np.newaxis]
         # Those of the label that were not pooled tell how much its pixels differ.
-        between = np.cov(shared[:, here]) if here.sum() > 1 else 0.0
-        around = np.median(shared_covariance[..., here], axis=-1) + between
+        around = np.median(shared_covariance[..., here], axis=-1) + np.cov(shared[:, here])
         covariance[..., wanted] = around[..., np.newaxis]
         source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
@@ -183,8 +186,11 @@ def solve(
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
         means = posterior.bins(tile, valid)
-        data = posterior.curve(tile, means, scene.offset)
-        static = posterior.moments(tile, data, scene.mixture(source, places), level)
+        prior = scene.mixture(source, places)
+        # Of cameras apart, what the first band shows of its own background is no emission.
+        stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
+        data = posterior.curve(tile, means, scene.offset, stray**2)
+        static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
         variance = np.maximum(variance, _LEAST[1] ** 2)
         found = frames.solve(tile, static.point, static.level, variance, apart=scene.apart)
@@ -225,7 +231,8 @@ def find_level(scene: Scene) -> Level:
     if not parts:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(parts, axis=1)
-    level = replace(scene.level, fluctuation=max(float(np.sqrt(np.median(fluctuation))), _LEAST[1]))
+    # Their mean, for those that are completed may be any of them: most of a scene may be at rest.
+    level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _LEAST[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.
     variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
     room, wide = float(np.mean(scene.level.signal)), float(np.mean(np.square(scene.level.std)))
