@@ -187,9 +187,7 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
     return Grain(std, chance if chance < _COARSE else 1.0)
 
 
-def heaped(
-    counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: npt.NDArray[Any] | None = None
-) -> Mask:
+def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None, None)) -> Mask:
     """
     Pixels (pixel) of counts (time, pixel) of which the highest or lowest value is a heap.
 
@@ -198,8 +196,7 @@ def heaped(
     result = np.zeros(counts.shape[1], dtype=bool)
     if band.chance < 1.0:
         for highest in (False, True):
-            known = None if ends is None else ends[int(highest)]
-            end, number = end_of(counts, valid, highest=highest, known=known)
+            end, number = end_of(counts, valid, highest=highest, plain=ends[int(highest)])
             (pixels,) = np.nonzero(number >= FEWEST)
             pixels = pixels[number[pixels] < valid[:, pixels].sum(axis=0)]
             near = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
@@ -208,20 +205,16 @@ def heaped(
 
 
 def end_of(
-    counts: npt.NDArray[Any],
-    valid: Mask,
-    *,
-    highest: bool,
-    known: npt.NDArray[Any] | None = None,
+    counts: npt.NDArray[Any], valid: Mask, *, highest: bool, plain: Any = None
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
     """
     Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there.
 
-    The value may be known if all samples are valid.
+    That of all samples, valid or not, may be known as `plain`.
     """
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
-    if used is True and known is not None:
-        end = known
+    if used is True and plain is not None:
+        end = plain
     elif used is True:
         end = counts.max(axis=0) if highest else counts.min(axis=0)
     elif highest:

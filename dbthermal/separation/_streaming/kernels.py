@@ -16,7 +16,7 @@ from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels
-from dbthermal.separation._subspace.kernels import Table, compiled
+from dbthermal.separation._subspace.kernels import Table, allocating
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
 
 Planes = npt.NDArray[np.float32]
@@ -127,7 +127,7 @@ ROWS: Final = (18, 5)
 """Numbers of the scratch rows."""
 
 
-@compiled
+@allocating
 def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
     """Add a frame's row to the sums, and to the number of samples that are numbers in both."""
     for x in range(one.size):
@@ -137,7 +137,7 @@ def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
         number[x] += _ONE if good else _ZERO
 
 
-@compiled
+@allocating
 def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
     """
     Means (band, y, x) of frames (band, frame, y, x) [count], in place; NaN of less than half.
@@ -157,7 +157,7 @@ def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
             mean[1, y, x] = other[x] / number[x] if enough else np.nan
 
 
-@compiled
+@allocating
 def _bridge(means: Any) -> bool:
     """Fill means (band, mean) that are NaN by lines between their neighbours; false if too many."""
     size, missing = means.shape[1], 0
@@ -180,7 +180,7 @@ def _bridge(means: Any) -> bool:
     return bool(3 * missing <= size)
 
 
-@compiled
+@allocating
 def _fitted(
     means: Any,
     slopes: tuple[float, float],
@@ -214,7 +214,7 @@ def _fitted(
     return variance
 
 
-@compiled
+@allocating
 def _object(
     camera: Camera,
     found: Any,
@@ -278,7 +278,7 @@ def _object(
         line[15 + i][x] = maps[4 + i]
 
 
-@compiled
+@allocating
 def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
     """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
     table, other = camera.first, camera.second
@@ -312,7 +312,7 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
         out[4][x] = _ONE if high | low else out[4][x]
 
 
-@compiled
+@allocating
 def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
     line, here, found, pixel = work
@@ -342,7 +342,7 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
     _object(camera, found, pixel, noise, variance, (first, last), line, x)
 
 
-@compiled
+@allocating
 def _emit(
     block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
 ) -> None:

@@ -42,6 +42,8 @@ entered: Final[Callable[..., Any]] = njit(**_OPTIONS)
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
 compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
 """Decorator of functions that are compiled into those that call them."""
+allocating: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS | {"_nrt": True})
+"""As `compiled`, for functions that make arrays."""
 
 _WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}
 inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
