@@ -3,7 +3,7 @@ r"""Steps 1 to 4 of `method` for two bands, one pixel after another, compiled.
 The equations of `steps`, whose results are repeated within rounding.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import lru_cache
 from math import sqrt
@@ -387,17 +387,21 @@ def solve(
 ) -> Solution:
     """As `steps.solve`, of two bands."""
     every = np.arange(tile.signals.shape[2])
-    return solve_parts(tile, [(every, functions)], drift, least)
+    return solve_parts(tile, functions, [(every, functions)], drift, least)
 
 
 def solve_parts(
     tile: Tile,
-    parts: Sequence[tuple[Whole, smooth.Subspace]],
+    functions: smooth.Subspace,
+    parts: Iterable[tuple[Whole, smooth.Subspace]],
     drift: float,
     least: float = emissions.BEND,
 ) -> Solution:
-    """As `solve`, of pixels in parts, each with functions of its own of the same rising ones."""
-    shared, material = _share(tile, parts[0][1], drift), tile.material
+    """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
+
+    One part after another is taken: of a long capture the functions of all would be much memory.
+    """
+    shared, material = _share(tile, functions, drift), tile.material
     frames, pixels = tile.signals.shape[1:]
     materials = np.full((pixels, 6), np.nan)
     if material is not None:
@@ -409,12 +413,12 @@ def solve_parts(
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved, freedom = Solved(films, record, sums), np.empty(pixels, np.intp)
     space = _work_space(frames, len(shared.rising))
-    for places, functions in parts:
-        model, count = shared._replace(**_columns(functions)), functions.functions.shape[1]
+    for places, own in parts:
+        model, count = shared._replace(**_columns(own)), own.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((2, count)), np.empty(count)
-        space["scatter"] = np.empty((functions.orders, 3))
+        space["scatter"] = np.empty((own.orders, 3))
         _separate(model, signals, places, materials, float(least), Work(**space), solved)
-        freedom[places] = frames - functions.steps - record["order"][places]
+        freedom[places] = frames - own.steps - record["order"][places]
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }

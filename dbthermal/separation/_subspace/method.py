@@ -352,18 +352,17 @@ def _divided(
     number: int = smooth.PIECE_ORDER,
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
-    parts = []
-    for places in pieces.alike(first):
-        begins = first[:, places[0]]
-        divided = smooth.piecewise(
-            tile.time, begins, functions.rising, segment=tile.segment, number=number
-        )
-        parts.append((places, divided))
+
+    def pieces_of(begins: Mask) -> smooth.Subspace:
+        rising, segment = functions.rising, tile.segment
+        return smooth.piecewise(tile.time, begins, rising, segment=segment, number=number)
+
+    groups = pieces.alike(first)
+    parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
     if _compiled(tile, settings):
-        return fused.solve_parts(tile, parts, settings.background_drift, least)
-    alone = [_solve(tile.select_pixels(places), it, settings, least) for places, it in parts]
-    order = np.argsort(np.concatenate([places for places, _ in parts]))
-    return alone[0].join(alone[1:]).select_pixels(order)
+        return fused.solve_parts(tile, functions, parts, settings.background_drift, least)
+    alone = [_solve(tile.select_pixels(places), own, settings, least) for places, own in parts]
+    return alone[0].join(alone[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 METHOD: Final = Method(
