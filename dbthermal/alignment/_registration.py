@@ -265,26 +265,21 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
 
 @njit(nogil=True, error_model="numpy")
 def _splined(splines: Array, places: Array) -> Array:
-    """Values (image, place) of cubic splines (y, x, image) at places (2, place) off the border.
-
-    In the order of SciPy's `map_coordinates`, of which they are bit for bit the values.
-    """
+    """Values (image, place) of cubic splines (y, x, image) at places (2, place) off the border."""
     result, weights = np.zeros((places.shape[1], splines.shape[2])), np.empty((2, 4))
     for place in range(places.shape[1]):
         for axis in range(2):
             t = places[axis, place] - int(places[axis, place])
-            u = 1.0 - t
-            weights[axis, 0] = u * u * u / 6.0
+            weights[axis, 0], weights[axis, 3] = (1.0 - t) ** 3 / 6.0, t**3 / 6.0
             weights[axis, 1] = (t * t * (t - 2.0) * 3.0 + 4.0) / 6.0
-            weights[axis, 2] = (u * u * (u - 2.0) * 3.0 + 4.0) / 6.0
-            weights[axis, 3] = 1.0 - weights[axis, 0] - weights[axis, 1] - weights[axis, 2]
+            weights[axis, 2] = 1.0 - weights[axis, 0] - weights[axis, 1] - weights[axis, 3]
         top, left = int(places[0, place]) - 1, int(places[1, place]) - 1
         for row in range(4):
             for column in range(4):
+                weight = weights[0, row] * weights[1, column]
                 for image in range(splines.shape[2]):
-                    part = splines[top + row, left + column, image] * weights[0, row]
-                    result[place, image] += part * weights[1, column]
-    return np.ascontiguousarray(result.T)
+                    result[place, image] += weight * splines[top + row, left + column, image]
+    return result.T
 
 
 with suppress(RuntimeError):  # without a folder that may be written each process compiles
