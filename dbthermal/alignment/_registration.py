@@ -1,13 +1,11 @@
 """Registration of several views of one object, by robust least squares between smooth curves."""
 
-from contextlib import suppress
 from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
-from numba import njit
-from scipy.ndimage import gaussian_filter, median_filter, spline_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
@@ -214,7 +212,7 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
     some hundredths of a pixel.
     """
     shape = pair[0].shape[1:]
-    count, splines = len(pair[0]), np.stack([spline_filter(image) for image in pair[1]], axis=-1)
+    count, splines = len(pair[0]), [spline_filter(image) for image in pair[1]]
     span = np.array([*shape[::-1], 1, *shape[::-1], 1, *shape[::-1]], dtype=float)[free]
     unit = span ** -np.array([1, 1, 1, 1, 1, 1, 2, 2])[free]
     steps = _STEP * unit[:, np.newaxis] * np.eye(9)[free]
@@ -226,7 +224,10 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         places = positions(matrix, shape)
         inside = _inside(places, band)
         first, seen = pair[0][:, inside], places[:, inside]
-        values, *around = (_splined(splines, seen + step) for step in _AROUND)
+        values, *around = (
+            np.stack([map_coordinates(spline, seen + step, prefilter=False) for spline in splines])
+            for step in _AROUND
+        )
         slopes = np.stack([around[1] - around[0], around[3] - around[2]])
         motion = [
             positions(matrix + step, shape)[:, inside] - positions(matrix - step, shape)[:, inside]
@@ -261,29 +262,6 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         if np.max(np.abs(found[: len(free)])) < _CONVERGED:
             break
     return matrix
-
-
-@njit(nogil=True, error_model="numpy")
-def _splined(splines: Array, places: Array) -> Array:
-    """Values (image, place) of cubic splines (y, x, image) at places (2, place) off the border."""
-    result, weights = np.zeros((places.shape[1], splines.shape[2])), np.empty((2, 4))
-    for place in range(places.shape[1]):
-        for axis in range(2):
-            t = places[axis, place] - int(places[axis, place])
-            weights[axis, 0], weights[axis, 3] = (1.0 - t) ** 3 / 6.0, t**3 / 6.0
-            weights[axis, 1] = (t * t * (t - 2.0) * 3.0 + 4.0) / 6.0
-            weights[axis, 2] = 1.0 - weights[axis, 0] - weights[axis, 1] - weights[axis, 3]
-        top, left = int(places[0, place]) - 1, int(places[1, place]) - 1
-        for row in range(4):
-            for column in range(4):
-                weight = weights[0, row] * weights[1, column]
-                for image in range(splines.shape[2]):
-                    result[place, image] += weight * splines[top + row, left + column, image]
-    return result.T
-
-
-with suppress(RuntimeError):  # without a folder that may be written each process compiles
-    _splined.enable_caching()
 
 
 def _inside(places: Array, band: str) -> Mask:

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.ndimage import map_coordinates, spline_filter
 
 from dbthermal import alignment, schema, separation, simulation
 from dbthermal.alignment import _registration as registration
@@ -29,16 +28,6 @@ def picture(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
         distance = np.hypot(along / axes[0], across / axes[1])
         result += height / (1 + np.exp((distance - 1) * axes[0] / 0.7))
     return result
-
-
-def test_splines_are_scipys() -> None:
-    """Pictures between their pixels, off the border, are those of `scipy.ndimage`."""
-    rng = np.random.default_rng(1)
-    splines = np.stack([spline_filter(one) for one in rng.normal(size=(3, 20, 30))])
-    places = rng.uniform(2.0, (17.0, 27.0), (500, 2)).T
-    expected = [map_coordinates(one, places, prefilter=False) for one in splines]
-    found = registration._splined(np.stack(list(splines), axis=-1), places)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.ndarray:
