@@ -376,9 +376,8 @@ def _write(
     order = np.argsort(bands)
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
     for name in map(str, result.data_vars):
-        dims, film = result.variables[name].dims, result.variables[name].values
-        target = film[..., cut.window[0], cut.window[1]]
-        shape = target.shape[-2:]
+        target = result.variables[name].values[..., *cut.window]
+        dims, shape = result.variables[name].dims, target.shape[-2:]
         if name == "status":
             target[...] = cut.status.reshape(shape)
         elif not complete or any(getattr(estimate, name) is None for _, _, estimate in estimates):

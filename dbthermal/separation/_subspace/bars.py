@@ -1,13 +1,16 @@
-"""Variances of the outputs of one pixel of two bands (eq. 8, 10), compiled; as in `emission`."""
+"""Variances of the outputs of one pixel of two bands (eq. 8, 10), and if its residual is noise.
+
+Compiled; as in `emission` and `residuals`.
+"""
 
 from math import log, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, regression
+from dbthermal.separation._subspace import kernels, regression, residuals
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Line, Ratio, weights
 from dbthermal.separation._subspace.shared import Model, Work
@@ -202,3 +205,99 @@ def _background(
             value = (pattern[0] * (direct0 - through * a)) ** 2
             value += (pattern[1] * (direct1 - through * b)) ** 2
             variance[t] += value / work.spare[t] ** 2
+
+
+@inlined
+def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
+    """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
+    residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
+    count, w = ratios.order + model.steps, ratios.weights
+    if model.stepless:  # the smooth curves of the object are those of the signals
+        kernels.copy(work.target, residual)
+    else:
+        for j in range(count):
+            work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
+        kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
+        kernels.combined(model.functions, model.spans, work.columns, count, residual)
+    for t in range(rapid.size):
+        rapid[t] = work.first[t] - rapid[t]
+        residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
+    record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
+    for block in range(model.parts.size - 1):
+        one, other = 0.0, 0.0
+        # Whole numbers without a sign: an index from the end need not be looked for.
+        for t in range(np.uintp(model.parts[block]), np.uintp(model.parts[block + 1])):
+            one += residual[t]
+            other += work.target[t]
+        sums[0, block], sums[1, block] = one, other
+
+
+@inlined
+def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
+    """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
+    residual, rapid, steep = work.null_residual, work.rapid, work.spare
+    frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
+    energy = kernels.dot(residual, residual)
+    lagged = 0.0
+    for lag in range(1, residuals.LAGS + 1):
+        lagged += kernels.dot(residual[lag:], residual[: frames - lag])
+    correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
+    common = ratios.weights[0] * noise**2
+    free = (frames - ratios.order - model.steps) * common
+    # A matched filter with the differences between frames, of a band that is late or early.
+    late, early, changes = free, -free, 0.0
+    limit, steep[frames - 1] = residuals.CHANGE * sqrt(2.0) * noise, 0.0
+    for t in range(frames - 1):
+        change = rapid[t + 1] - rapid[t]
+        late += residual[t] * change
+        early += residual[t + 1] * change
+        changes += change**2
+        steep[t] = 1.0 if abs(change) > limit else 0.0
+    score = max(abs(late), abs(early)) / sqrt(null * changes) if null * changes > 0 else 0.0
+    # Energy in the frames at a change.
+    count, at_changes = steep[0], steep[0] * residual[0] ** 2
+    for t in range(1, frames):
+        at = max(steep[t], steep[t - 1])
+        count += at
+        at_changes += at * residual[t] ** 2
+    variance = 2.0 / (9.0 * max(count, 1.0))
+    mean = at_changes / (null * count) if count > 0 else 1.0
+    score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
+    return (
+        correlation * sqrt(residuals.LAGS * frames),
+        score,
+        _unexplained(model, ratios, work, common),
+    )
+
+
+@inlined
+def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
+    """As `residuals.unexplained`."""
+    blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
+    sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
+    products, squares = work.kernel, work.mean
+    for t in range(residual.size):
+        independent = rapid[t] - share * residual[t]
+        products[t] = residual[t] * independent
+        squares[t] = independent**2
+    for block in range(blocks):
+        total, product, square = 0.0, 0.0, 0.0
+        for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):
+            total += residual[t]
+            product += products[t]
+            square += squares[t]
+        sums[block] = total
+        together += product**2 / square if square > 0 else 0.0
+    if together / ratios.null_variance > model.limits[0]:
+        return True
+    edges, step = model.edges, 1
+    while blocks > 1:
+        for block in range(blocks):
+            length = edges[(block + 1) * step] - edges[block * step]
+            if sums[block] ** 2 > model.limits[1] * ratios.null_variance * length:
+                return True
+        blocks //= 2
+        step *= 2
+        for block in range(blocks):
+            sums[block] = sums[2 * block] + sums[2 * block + 1]
+    return False

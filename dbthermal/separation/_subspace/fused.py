@@ -6,7 +6,6 @@ The equations of `steps`, whose results are repeated within rounding.
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import lru_cache
-from math import sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -31,77 +30,6 @@ _BLOCK: Final = 8
 _VECTOR: Final = 64  # numbers that a loop takes at once, at most
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
-
-
-@inlined
-def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
-    """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
-    residual, rapid, steep = work.null_residual, work.rapid, work.spare
-    frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
-    energy = kernels.dot(residual, residual)
-    lagged = 0.0
-    for lag in range(1, residuals.LAGS + 1):
-        lagged += kernels.dot(residual[lag:], residual[: frames - lag])
-    correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
-    common = ratios.weights[0] * noise**2
-    free = (frames - ratios.order - model.steps) * common
-    # A matched filter with the differences between frames, of a band that is late or early.
-    late, early, changes = free, -free, 0.0
-    limit, steep[frames - 1] = residuals.CHANGE * sqrt(2.0) * noise, 0.0
-    for t in range(frames - 1):
-        change = rapid[t + 1] - rapid[t]
-        late += residual[t] * change
-        early += residual[t + 1] * change
-        changes += change**2
-        steep[t] = 1.0 if abs(change) > limit else 0.0
-    score = max(abs(late), abs(early)) / sqrt(null * changes) if null * changes > 0 else 0.0
-    # Energy in the frames at a change.
-    count, at_changes = steep[0], steep[0] * residual[0] ** 2
-    for t in range(1, frames):
-        at = max(steep[t], steep[t - 1])
-        count += at
-        at_changes += at * residual[t] ** 2
-    variance = 2.0 / (9.0 * max(count, 1.0))
-    mean = at_changes / (null * count) if count > 0 else 1.0
-    score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
-    return (
-        correlation * sqrt(residuals.LAGS * frames),
-        score,
-        _unexplained(model, ratios, work, common),
-    )
-
-
-@inlined
-def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
-    """As `residuals.unexplained`."""
-    blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
-    products, squares = work.kernel, work.mean
-    for t in range(residual.size):
-        independent = rapid[t] - share * residual[t]
-        products[t] = residual[t] * independent
-        squares[t] = independent**2
-    for block in range(blocks):
-        total, product, square = 0.0, 0.0, 0.0
-        for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):
-            total += residual[t]
-            product += products[t]
-            square += squares[t]
-        sums[block] = total
-        together += product**2 / square if square > 0 else 0.0
-    if together / ratios.null_variance > model.limits[0]:
-        return True
-    edges, step = model.edges, 1
-    while blocks > 1:
-        for block in range(blocks):
-            length = edges[(block + 1) * step] - edges[block * step]
-            if sums[block] ** 2 > model.limits[1] * ratios.null_variance * length:
-                return True
-        blocks //= 2
-        step *= 2
-        for block in range(blocks):
-            sums[block] = sums[2 * block] + sums[2 * block + 1]
-    return False
 
 
 @inlined
@@ -187,7 +115,7 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
             work.removed[t] = work.bend[t]
             work.straight[t] = work.second[t] - work.bend[t]
     deviations = bars.bars(model, ratios, line, work)
-    _judge(model, ratios, work, record, sums)
+    bars.judge(model, ratios, work, record, sums)
     object_ = _film(work.temperature, work.variance, model, films[0], films[1])
     background = _film(work.background, work.background_variance, model, films[2], films[3])
     for i, judged in enumerate((object_, background)):
@@ -200,31 +128,6 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
     record.drift_variance = deviations.drift_variance
     record.emissivity[0], record.emissivity[1] = line.emissivity
     _write_symmetric(deviations.covariance, record.emissivity_covariance)
-
-
-@inlined
-def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
-    """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
-    residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
-    count, w = ratios.order + model.steps, ratios.weights
-    if model.stepless:  # the smooth curves of the object are those of the signals
-        kernels.copy(work.target, residual)
-    else:
-        for j in range(count):
-            work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
-        kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
-        kernels.combined(model.functions, model.spans, work.columns, count, residual)
-    for t in range(rapid.size):
-        rapid[t] = work.first[t] - rapid[t]
-        residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
-    record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
-    for block in range(model.parts.size - 1):
-        one, other = 0.0, 0.0
-        # Whole numbers without a sign: an index from the end need not be looked for.
-        for t in range(np.uintp(model.parts[block]), np.uintp(model.parts[block + 1])):
-            one += residual[t]
-            other += work.target[t]
-        sums[0, block], sums[1, block] = one, other
 
 
 @inlined
@@ -368,10 +271,8 @@ def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
 
 def _work_space(frames: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
-    curves, block = (
-        {name: np.empty(frames) for name in Work._fields},
-        max(_BLOCK, _TURNED // frames),
-    )
+    curves = {name: np.empty(frames) for name in Work._fields}
+    block = max(_BLOCK, _TURNED // frames)
     return curves | {
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
         "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
