@@ -194,7 +194,7 @@ def tell_of_compiling() -> None:
             self.said = True
 
         def on_end(self, _: event.Event) -> None:
-            pass
+            """Say nothing more: a listener must have it."""
 
     event.register("numba:compile", Told())  # type: ignore[no-untyped-call]
 
