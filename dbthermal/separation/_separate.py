@@ -33,8 +33,6 @@ _UNEXPLAINED: Final = (
     "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
     "clocks differ, the intervals of the other pixels are too small."
 )
-# Method and pooling of what is separated first.
-_ALONE: Final = ("subspace", 0)
 # Rows and columns, at least, in which a shift can be found.
 _WIDE: Final = 24
 
@@ -112,8 +110,12 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     response = known.response  # with one noise for all steps
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     if alone is not None:
-        if (alone.attrs.get("method"), alone.attrs.get("pooled")) != _ALONE:
-            raise ValueError("Invalid result alone. Must be of 'subspace', without materials.")
+        made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}
+        if any(alone.attrs.get(name) != value for name, value in made.items()):
+            raise ValueError(
+                "Invalid result alone. Must be of 'subspace', without materials, with "
+                f"{made['settings']}."
+            )
         alone = laid_on(alone, corrected, "the result alone", "the capture")
     if reflection_shift is None:
         alone, reflection_shift, doubts = _apart(one, corrected, response, workers, alone)

@@ -124,7 +124,9 @@ def test_what_is_at_hand_is_not_separated_again(moved: tuple[xr.Dataset, ...]) -
     whole = partial(separation.separate, capture, RIG.response(), reflection_shift=shift)
     xr.testing.assert_identical(whole(alone=alone), whole())
     pooled = alone.assign_attrs(pooled=1)
-    for other, message in ((pooled, "without materials"), (alone.isel(x=slice(9)), "size 9")):
+    unlike = alone.assign_attrs(settings="SubspaceSettings(background_drift=1.0, device=None)")
+    wrong = [(pooled, "without materials"), (unlike, "background_drift=3.0")]
+    for other, message in (*wrong, (alone.isel(x=slice(9)), "size 9")):
         with pytest.raises(ValueError, match=message):
             whole(alone=other)
 
