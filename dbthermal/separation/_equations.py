@@ -43,7 +43,7 @@ class Equations:
     loose: Whole  # solved pixels without such neighbours
     bends: list[Polynomial]  # u_m(x) - u_1(x) of u_1(x), for all bands but the first
 
-    def _there(self, signal: Array, change: Array) -> Array:
+    def beside(self, signal: Array, change: Array) -> Array:
         """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
         result = np.asarray(self.there @ signal)
         result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
@@ -68,7 +68,7 @@ class Equations:
         rest = np.setdiff1d(self.loose, backward)
         signal, step = alone, np.zeros_like(alone)
         for _ in range(_STEPS):
-            there = self._there(signal, change)
+            there = self.beside(signal, change)
             right = target - self.other_bands(others, there)
             following = signal.copy()
             following[forward] = right[forward] / own[forward]
@@ -80,7 +80,7 @@ class Equations:
             step, signal = np.abs(following - signal), following
             if step.max(initial=0.0) < CONVERGED:
                 break
-        there = self._there(signal, change)
+        there = self.beside(signal, change)
         # A backward pixel's own equation holds for another x(p) than that between its neighbours.
         right = target[backward] - own[backward] * signal[backward]
         right -= self.other_bands(back, there[backward])

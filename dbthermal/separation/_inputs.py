@@ -60,6 +60,8 @@ class Inputs:
     """Method, capture, responses, noise and known quantities, in the capture's band order."""
 
     response: xr.Dataset  # with the noise that is used, for the whole capture and all its parts
+    response_kind: str  # "exact" or "linear"
+    name: str  # of the method
     method: Method
     settings: Any  # of the type that the method has, or None
     seed: int  # of random starts
@@ -160,6 +162,8 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     order = [int(band) for band in np.argsort(noise, kind="stable")]
     return Inputs(
         response=response,
+        response_kind=response_kind,
+        name=name,
         method=method,
         settings=settings,
         seed=seed,
@@ -170,7 +174,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         bands=order,
         emissivity=value,
         emissivity_covariance=covariance,
-        labels=_labels(corrected, pool),
+        labels=numbered(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
     )
 
@@ -391,7 +395,7 @@ def _displacement(
     return displaced.check(shift, corrected, reference)
 
 
-def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
+def numbered(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
     """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
     if pool is None:
         return None

@@ -194,6 +194,29 @@ def solve(
     return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
 
 
+def beside(inputs: Inputs, result: xr.Dataset) -> Joint:
+    """Object of both places of a result that is solved already."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        film = result["object_temperature"].values.reshape(result.sizes["time"], -1).copy()
+        emissivity = system.inside(system.first_emissivity(inputs, result))
+        solved = np.all(np.isfinite(emissivity), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
+        equations = system.equations(inputs, emissivity, solved)
+        change = _first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
+        curve, there = inputs.curves[inputs.bands[0]], np.empty_like(film)
+        _bridge(film, solved)
+        for at in range(0, len(film), _FRAMES):
+            part = slice(at, at + _FRAMES)
+            signal = np.where(solved, curve.signal(film[part]) - curve.reference, 0.0).T
+            other = equations.beside(signal, change[:, part]).T + curve.reference
+            there[part] = np.where(solved, curve.temperature(other), np.nan)
+    shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
+    films = {
+        name: (("time", "y", "x"), part.reshape(shape))
+        for name, part in (("object_temperature", film), ("background_temperature", there))
+    }
+    return Joint(inputs, xr.Dataset(films), emissivity, np.ones(solved.size), unsettled)
+
+
 def _both(
     curve: Curve,
     solved: Mask,

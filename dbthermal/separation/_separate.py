@@ -1,24 +1,33 @@
 """The default way through a capture: all steps of the separation, in one call."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
 
 from dbthermal import alignment
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
+from dbthermal.separation import _displaced as displaced
+from dbthermal.separation import _joint as joint
+from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._completion.prior import stated
-from dbthermal.separation._inputs import check
+from dbthermal.separation._inputs import Inputs, check, numbered
 from dbthermal.separation._pooling import alone as single
 from dbthermal.separation._pooling import materials as pooling
-from dbthermal.separation._solve import get_method, solve
+from dbthermal.separation._pooling import pool
+from dbthermal.separation._solve import get_method, separated, solve
+from dbthermal.separation._tiles import Material
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -123,18 +132,22 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     else:
         alone = one(reflection_shift=reflection_shift) if alone is None else alone
         source, doubts = "given", []
-    result, pooled = alone, None
+    result = alone
+    if reflection_shift is not None:
+        shift = displaced.check(reflection_shift, corrected, known.bands[0])
+        known = replace(known, displacement=shift)
     if materials is None and find_spec("skimage") is not None:
         found = pooling.materials(alone, corrected, response, borders=True)
         regions = pooling.others(found, alone)
-        pooled = pooling.without_borders(regions, alone, response)
-        result = one(pool=pooled, reflection_shift=reflection_shift)
-        joined = pooling.joined(regions, alone, result, response)
+        narrower = pooling.without_borders(regions, alone, response)
+        told = _told(replace(known, labels=numbered(corrected, narrower)), alone, workers)
+        joined = pooling.joined(regions, alone, told, response)
         materials = pooling.without_borders(joined, alone, response)
-    if materials is not None and (pooled is None or not materials.equals(pooled)):
-        result = one(pool=materials, reflection_shift=reflection_shift)
-    if materials is not None and reflection_shift is not None:
-        single.hold(alone, result, materials)
+    if materials is not None:
+        known = replace(known, labels=numbered(corrected, materials))
+        result = separated(known, start=alone, workers=workers, progress=progress)
+        if reflection_shift is not None:
+            single.hold(alone, result, materials)
     result = complete(
         result,
         corrected,
@@ -149,6 +162,20 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if materials is not None:
         result["material"] = materials
     return warned(result.assign_attrs(reflection_shift=source), *doubts)
+
+
+def _told(inputs: Inputs, alone: xr.Dataset, workers: int) -> Material | None:
+    """Ratios and emissivity of each material, from a result of each pixel alone."""
+    with (
+        threadpool_limits(limits=1, user_api="blas"),
+        ThreadPoolExecutor(workers) as threads,
+        tqdm(disable=True) as bar,
+    ):
+        if inputs.displacement is None:
+            return pool.materials(inputs, threads, bar)
+        both = joint.beside(inputs, alone)
+        apart = replace(inputs, difference=both.difference)
+        return neighbours.materials(apart, threads, bar, every=True)
 
 
 def _apart(

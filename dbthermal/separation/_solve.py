@@ -49,8 +49,6 @@ _MODULES: Final = {
 }
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
-# Turns of the pooled emissivities and the object of each camera's own place.
-_TURNS: Final = 2
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -210,28 +208,34 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         reflection_shift=reflection_shift,
         response_kind=response_kind,
     )
-    height, width = corrected.sizes["y"], corrected.sizes["x"]
-    variables = dict(schema.STAGES["separated"])
+    return separated(inputs, workers=workers, progress=progress)
+
+
+def separated(
+    inputs: Inputs, *, start: xr.Dataset | None = None, workers: int = 2, progress: bool = False
+) -> xr.Dataset:
+    """Separate checked inputs; those of materials and a shift from a result to `start` from."""
+    variables, capture = dict(schema.STAGES["separated"]), inputs.capture
     if inputs.method.survey:
         name = "emissivity_covariance"
         variables[name] = schema.OPTIONAL["separated"][name]
-    result = _allocate(corrected, variables)
+    result = _allocate(capture, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(
-            total=height * width * (1 if inputs.labels is None else 2),
+            total=result["status"].size * (1 if inputs.labels is None else 2),
             unit="pixel",
-            desc=method,
+            desc=inputs.name,
             disable=not progress,
         ) as bar,
     ):
         if inputs.displacement is None:
-            pooled = None if pool is None else pooling.materials(inputs, threads, bar)
+            pooled = pooling.materials(inputs, threads, bar)
             _separate_all(inputs, pooled, result, threads, bar)
         else:
-            _solve_jointly(inputs, result, threads, bar)
-    sources = inputs.response.attrs, corrected.attrs
+            _solve_jointly(inputs, result, start, threads, bar)
+    sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
@@ -239,15 +243,15 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
-        method=method,
-        pooled=int(pool is not None),
-        response_kind=response_kind,
+        method=inputs.name,
+        pooled=int(inputs.labels is not None),
+        response_kind=inputs.response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
         **({"warnings": [*doubts]} if doubts else {}),
         noise_source=inputs.response.attrs["noise_source"],
-        emissivity_source="capture" if emissivity is None else "given",
+        emissivity_source="capture" if inputs.emissivity is None else "given",
         not_estimated=" ".join(inputs.method.not_estimated + ratios),
-        reference_band=str(corrected["band"].values[inputs.bands[0]]),
+        reference_band=str(capture["band"].values[inputs.bands[0]]),
         **({} if inputs.settings is None else {"settings": repr(inputs.settings)}),
     )
 
@@ -286,13 +290,18 @@ def get_method(name: str) -> Method:
 
 
 def _solve_jointly(
-    inputs: Inputs, result: xr.Dataset, threads: ThreadPoolExecutor, bar: "tqdm[Any]"
+    inputs: Inputs,
+    result: xr.Dataset,
+    start: xr.Dataset | None,
+    threads: ThreadPoolExecutor,
+    bar: "tqdm[Any]",
 ) -> None:
     """
     Separate twice, the second time with the object of each camera's own place.
 
     With the ratios of bands that are blurred alike, found beforehand, if no materials are known.
-    Pooled emissivities and the object of each place are told in turns, each from the other's last.
+    Pooled emissivities and the object of each place are each told with the other's last, which
+    a result to `start` from has too.
     """
     material, blur = None, 0.0
     if inputs.labels is None and inputs.method.survey is not None:
@@ -300,16 +309,19 @@ def _solve_jointly(
         if alike is not None:
             _separate_all(alike, material, result, threads, bar)
             material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
-    _separate_all(inputs, material, result, threads, bar)
-    both = joint.solve(inputs, result, threads, blur=blur)
-    for turn in range(0 if inputs.labels is None else _TURNS):
-        apart = inputs
+    if start is None:
+        _separate_all(inputs, material, result, threads, bar)
+        both = joint.solve(inputs, result, threads, blur=blur)
+    else:
+        both = joint.beside(inputs, start)
+    if inputs.labels is not None:
+        material, apart = None, inputs
         if both is not None:
             # Without the difference the backgrounds, which bend the bands apart, are far off.
             films = result[["object_temperature", "background_temperature"]].copy(deep=True)
-            both = replace(both, result=films)
+            both = replace(both, result=films) if start is None else both
             apart = replace(inputs, difference=both.difference)
-        material = neighbours.materials(apart, threads, bar, every=turn == 0)
+        material = neighbours.materials(apart, threads, bar, every=True)
         _separate_all(apart, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, material=material, before=both)
     if both is None:

@@ -32,6 +32,8 @@ from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.separation._pooling import feature_maps, gradients, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
+from dbthermal.separation._subspace.reflection_ratio import ratio_variance
+from dbthermal.separation._tiles import Material
 
 NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 
@@ -203,7 +205,7 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 def joined(
     labels: xr.DataArray,
     alone: xr.Dataset,
-    pooled: xr.Dataset,
+    pooled: Material | None,
     response: xr.Dataset,
     *,
     resolution: float = 0.1,
@@ -214,12 +216,21 @@ def joined(
     object; pooled ratios are not. Also joined is what has no step at the border: an emissivity that
     changes over its material.
     """
+    if pooled is None:
+        return labels
     cells = np.asarray(labels.values + 1, dtype=np.intp)
-    _, features = _features(pooled, _bands(pooled, response)[0])
+    bands, noise = _bands(alone, response)
+    inverse = pooled.inverse_energy + pooled.spread
+    features = _both(
+        pooled.ratio[1:].reshape(-1, *cells.shape),
+        ratio_variance(pooled.ratio, inverse, noise)[1:].reshape(-1, *cells.shape),
+        pooled.emissivity.reshape(cells.shape),
+        (pooled.noise_variance + pooled.drift_variance).reshape(cells.shape),
+    )
     found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
     pairs = region_merging.neighbours(cells)
     found.join_alike(pairs, resolution)
-    _, own = _features(alone, _bands(alone, response)[0])
+    _, own = _features(alone, bands)
     boxes, grown = find_objects(cells), True
     while grown:
         grown = False
@@ -238,7 +249,7 @@ def joined(
             if _continuous(here == one, here == other, own.window(window), resolution):
                 found.join(one, other)
                 grown = True
-    return _labelled(cells, found, pooled)
+    return _labelled(cells, found, alone)
 
 
 def _checked(
@@ -277,17 +288,25 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
         result[name].values.astype(np.float64)
         for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
     )
-    others, reference = bands[1:], bands[:1]
-    vague = ~(ratio_std[others] < _VAGUE * np.abs(ratio[others]))
-    ratio = np.where(vague, np.nan, ratio[others])
-    emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
-    both = Features(
-        np.concatenate([ratio, emissivity[reference]]),
-        np.concatenate([ratio_std[others] ** 2, emissivity_std[reference] ** 2]),
-        np.arange(len(bands)) == len(others),
-        np.append(np.full(len(others), _TOLERANCE), 0.0),
+    others, first = bands[1:], bands[0]
+    both = _both(
+        ratio[others], ratio_std[others] ** 2, emissivity[first], emissivity_std[first] ** 2
     )
     return Features(*(part[: len(others)] for part in vars(both).values())), both
+
+
+def _both(
+    ratio: Array, ratio_variance: Array, emissivity: Array, emissivity_variance: Array
+) -> Features:
+    """Ratios (band, y, x) of all bands but the reference, and its emissivity (y, x); if told."""
+    vague = ~(ratio_variance < (_VAGUE * ratio) ** 2)
+    emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
+    return Features(
+        np.concatenate([np.where(vague, np.nan, ratio), emissivity[np.newaxis]]),
+        np.concatenate([ratio_variance, emissivity_variance[np.newaxis]]),
+        np.arange(len(ratio) + 1) == len(ratio),
+        np.append(np.full(len(ratio), _TOLERANCE), 0.0),
+    )
 
 
 def _cells(
