@@ -135,8 +135,8 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
+    rule = "two or more" if method.any_bands else "exactly two"
     if len(bands) < 2 or (len(bands) > 2 and not method.any_bands):
-        rule = "two or more" if method.any_bands else "exactly two"
         raise ValueError(f"Invalid bands {bands} for method '{name}'. Must be {rule}.")
     if (frames := corrected.sizes["time"]) < method.minimum_frames:
         rule = f"Must have at least {method.minimum_frames}."
@@ -289,8 +289,7 @@ def _noise(
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:
     """Check a clock that is far from even by the signals, for a method that relies on it."""
     time = capture["time"].values.astype(np.float64)
-    even = np.linspace(time[0], time[-1], time.size)
-    off = np.abs(time - even).max() * (time.size - 1)
+    off = np.abs(time - np.linspace(time[0], time[-1], time.size)).max() * (time.size - 1)
     if method.check_clock is None or off <= _NEARLY_EVEN * (time[-1] - time[0]):
         return
     counts, frames = quality.sample(capture, _CLOCK_PIXELS)
@@ -318,10 +317,8 @@ def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
     schema.check_variable(capture["pattern_std"], schema.PATTERN_STD, "'pattern_std'")
     counts = capture["pattern_std"].values.astype(np.float64)
     if not np.all((counts >= 0) & schema.measured(counts)):
-        raise ValueError(
-            f"Invalid pattern_std {counts.tolist()} count of the corrected. Must be zero or "
-            "positive, and finite."
-        )
+        values = counts.tolist()
+        raise ValueError(f"Invalid pattern_std {values} count. Must be zero or positive, finite.")
     return np.asarray(counts / [curve.reference_slope for curve in curves])
 
 
@@ -400,5 +397,4 @@ def numbered(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
     if pool is None:
         return None
     flat = _selection(corrected, pool, "pool", "iu", ("y", "x")).values.ravel()
-    names = np.unique(flat[flat >= 0])
-    return np.where(flat >= 0, np.searchsorted(names, flat), -1).astype(np.intp)
+    return np.where(flat >= 0, np.searchsorted(np.unique(flat[flat >= 0]), flat), -1)

@@ -145,7 +145,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         materials = pooling.without_borders(joined, alone, response)
     if materials is not None:
         known = replace(known, labels=numbered(corrected, materials))
-        result = separated(known, start=alone, workers=workers, progress=progress)
+        result = separated(known, alone=alone, workers=workers, progress=progress)
         if reflection_shift is not None:
             single.hold(alone, result, materials)
     result = complete(

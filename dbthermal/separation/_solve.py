@@ -22,21 +22,11 @@ from dbthermal.separation._pooling import pool as pooling
 from dbthermal.separation._tiles import Estimate, Mask, Material
 
 if TYPE_CHECKING:
-    from dbthermal.separation._baselines.bcp import BcpSettings
-    from dbthermal.separation._baselines.calibrated import CalibratedSettings
-    from dbthermal.separation._baselines.naive import NaiveSettings
-    from dbthermal.separation._baselines.pyrometry import RatioSettings
-    from dbthermal.separation._dbvt import DbvtSettings
-    from dbthermal.separation._subspace.method import SubspaceSettings
+    from dbthermal import separation as one
 
-    Settings: TypeAlias = (
-        SubspaceSettings
-        | CalibratedSettings
-        | DbvtSettings
-        | NaiveSettings
-        | RatioSettings
-        | BcpSettings
-    )
+    _Compared: TypeAlias = one.NaiveSettings | one.RatioSettings | one.BcpSettings
+    _Known: TypeAlias = one.CalibratedSettings | one.DbvtSettings
+    Settings: TypeAlias = one.SubspaceSettings | _Known | _Compared
 
 _MODULES: Final = {
     "subspace": ("_subspace.method", "METHOD"),
@@ -47,6 +37,7 @@ _MODULES: Final = {
     "bcp": ("_baselines.bcp", "METHOD"),
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
+_COVARIANCE: Final = "emissivity_covariance"
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
@@ -149,7 +140,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
 
     Notes
     -----
-    Two errors of "subspace" carry no flag, because nothing in the bands shows them: an exchange of
+    Two errors of "subspace" carry no flag, for nothing in the bands shows them: an exchange of
     object and background, but for emissivities below a half, which are flagged as a suspicion; and
     a background that drifts along with the object's curve. The temperature holds then, and the
     emissivity's deviation carries the drift that `SubspaceSettings.background_drift` states.
@@ -164,11 +155,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
               I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
 
-    The ratios are those of bands that are blurred alike, by a pixel, and as certain as neighbours
-    agree on them. With these the pixels are solved as if x(p) were x(r), then all together for the
-    object, and each once more with what follows for x(p) in the other bands: 3 to 4 times the cost
-    where the object is not the same in both places. A pixel of which the second camera does not see
-    the reflection has the bit `no_reflection_pair`.
+    The ratios are those of bands blurred alike, as certain as neighbours agree on them. With these
+    the pixels are solved as if x(p) were x(r), then all together for the object, and each once more
+    with what follows for x(p): 3 to 4 times the cost where the two differ. A pixel of which the
+    second camera does not see the reflection has the bit `no_reflection_pair`.
 
     References
     ----------
@@ -212,29 +202,29 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
 
 
 def separated(
-    inputs: Inputs, *, start: xr.Dataset | None = None, workers: int = 2, progress: bool = False
+    inputs: Inputs, *, alone: xr.Dataset | None = None, workers: int = 2, progress: bool = False
 ) -> xr.Dataset:
-    """Separate checked inputs; those of materials and a shift from a result to `start` from."""
-    variables, capture = dict(schema.STAGES["separated"]), inputs.capture
+    """Separate checked inputs; to pool cameras apart, from a result of each pixel `alone`."""
+    variables, capture = schema.STAGES["separated"], inputs.capture
+    apart, pooled = inputs.displacement is not None, inputs.labels is not None
+    if alone is None and apart and pooled:
+        alone = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     if inputs.method.survey:
-        name = "emissivity_covariance"
-        variables[name] = schema.OPTIONAL["separated"][name]
+        variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
+    pixels = result["status"].size * (1 + pooled)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
-        tqdm(
-            total=result["status"].size * (1 if inputs.labels is None else 2),
-            unit="pixel",
-            desc=inputs.name,
-            disable=not progress,
-        ) as bar,
+        tqdm(total=pixels, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
-        if inputs.displacement is None:
-            pooled = pooling.materials(inputs, threads, bar)
-            _separate_all(inputs, pooled, result, threads, bar)
+        if alone is not None and apart:
+            _pool_jointly(inputs, alone, result, threads, bar)
+        elif apart:
+            _solve_jointly(inputs, result, threads, bar)
         else:
-            _solve_jointly(inputs, result, start, threads, bar)
+            material = pooling.materials(inputs, threads, bar) if pooled else None
+            _separate_all(inputs, material, result, threads, bar)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
@@ -244,7 +234,7 @@ def separated(
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=inputs.name,
-        pooled=int(inputs.labels is not None),
+        pooled=int(pooled),
         response_kind=inputs.response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
         **({"warnings": [*doubts]} if doubts else {}),
@@ -290,47 +280,44 @@ def get_method(name: str) -> Method:
 
 
 def _solve_jointly(
+    inputs: Inputs, result: xr.Dataset, threads: ThreadPoolExecutor, bar: "tqdm[Any]"
+) -> None:
+    """Separate by ratios of bands blurred alike; then with the object of each camera's place."""
+    material, blur = None, 0.0
+    alike = None if inputs.method.survey is None else neighbours.blurred(inputs)
+    if alike is not None:
+        _separate_all(alike, None, result, threads, bar)
+        material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
+    _separate_all(inputs, material, result, threads, bar)
+    both = joint.solve(inputs, result, threads, blur=blur)
+    if both is not None:
+        apart = replace(inputs, difference=both.difference)
+        _separate_all(apart, material, result, threads, bar)
+        both.finish()
+
+
+def _pool_jointly(
     inputs: Inputs,
+    alone: xr.Dataset,
     result: xr.Dataset,
-    start: xr.Dataset | None,
     threads: ThreadPoolExecutor,
     bar: "tqdm[Any]",
 ) -> None:
-    """
-    Separate twice, the second time with the object of each camera's own place.
+    """Pool materials and solve for the object of each place in turns, from a result without."""
 
-    With the ratios of bands that are blurred alike, found beforehand, if no materials are known.
-    Pooled emissivities and the object of each place are each told with the other's last, which
-    a result to `start` from has too.
-    """
-    material, blur = None, 0.0
-    if inputs.labels is None and inputs.method.survey is not None:
-        alike = neighbours.blurred(inputs)
-        if alike is not None:
-            _separate_all(alike, material, result, threads, bar)
-            material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
-    if start is None:
-        _separate_all(inputs, material, result, threads, bar)
-        both = joint.solve(inputs, result, threads, blur=blur)
-    else:
-        both = joint.beside(inputs, start)
-    if inputs.labels is not None:
-        material, apart = None, inputs
-        if both is not None:
-            # Without the difference the backgrounds, which bend the bands apart, are far off.
-            films = result[["object_temperature", "background_temperature"]].copy(deep=True)
-            both = replace(both, result=films) if start is None else both
-            apart = replace(inputs, difference=both.difference)
-        material = neighbours.materials(apart, threads, bar, every=True)
+    def pool(both: joint.Joint, *, every: bool) -> Material | None:
+        # Without the difference the backgrounds, which bend the bands apart, are far off.
+        apart = replace(inputs, difference=both.difference)
+        material = neighbours.materials(apart, threads, bar, every=every)
         _separate_all(apart, material, result, threads, bar)
-        both = joint.solve(inputs, result, threads, material=material, before=both)
-    if both is None:
-        return
-    apart = replace(inputs, difference=both.difference)
-    if inputs.labels is not None:
-        material = neighbours.materials(apart, threads, bar)
-    _separate_all(apart, material, result, threads, bar)
-    both.finish()
+        return material
+
+    first = joint.beside(inputs, alone)
+    material = pool(first, every=True)
+    both = joint.solve(inputs, result, threads, material=material, before=first)
+    if both is not None:
+        pool(both, every=False)
+        both.finish()
 
 
 def _separate_all(
