@@ -174,7 +174,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         bands=order,
         emissivity=value,
         emissivity_covariance=covariance,
-        labels=numbered(corrected, pool),
+        labels=None if pool is None else numbered(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
     )
 
@@ -392,9 +392,7 @@ def _displacement(
     return displaced.check(shift, corrected, reference)
 
 
-def numbered(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
+def numbered(corrected: xr.Dataset, pool: xr.DataArray) -> Labels:
     """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
-    if pool is None:
-        return None
     flat = _selection(corrected, pool, "pool", "iu", ("y", "x")).values.ravel()
     return np.where(flat >= 0, np.searchsorted(np.unique(flat[flat >= 0]), flat), -1)

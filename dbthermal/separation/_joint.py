@@ -88,6 +88,11 @@ class Joint:
             parts.append(one[pixels] * (curve.signal(beside) - curve.signal(here)))
         return np.asarray(np.nan_to_num(parts, nan=0.0))
 
+    def kept(self) -> "Joint":
+        """Return it with films of its own: those of the result may be written anew."""
+        films = self.result[["object_temperature", "background_temperature"]]
+        return replace(self, result=films.copy(deep=True))
+
     def finish(self) -> None:
         """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
         displacement, status = self.inputs.displacement, self.result["status"].values

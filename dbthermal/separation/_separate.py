@@ -1,7 +1,6 @@
 """The default way through a capture: all steps of the separation, in one call."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -9,8 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
-from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from dbthermal import alignment
 from dbthermal._coordinates import laid_on
@@ -18,14 +15,11 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
-from dbthermal.separation import _joint as joint
-from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._completion.prior import stated
-from dbthermal.separation._inputs import Inputs, check, numbered
+from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import alone as single
 from dbthermal.separation._pooling import materials as pooling
-from dbthermal.separation._pooling import pool
 from dbthermal.separation._solve import get_method, separated, solve
 from dbthermal.separation._tiles import Material
 
@@ -136,18 +130,13 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
-    if materials is None and find_spec("skimage") is not None:
-        found = pooling.materials(alone, corrected, response, borders=True)
-        regions = pooling.others(found, alone)
-        narrower = pooling.without_borders(regions, alone, response)
-        told = _told(replace(known, labels=numbered(corrected, narrower)), alone, workers)
-        joined = pooling.joined(regions, alone, told, response)
-        materials = pooling.without_borders(joined, alone, response)
+    again = partial(separated, alone=alone, workers=workers, progress=progress)
     if materials is not None:
-        known = replace(known, labels=numbered(corrected, materials))
-        result = separated(known, alone=alone, workers=workers, progress=progress)
-        if reflection_shift is not None:
-            single.hold(alone, result, materials)
+        result = again(replace(known, labels=numbered(corrected, materials)))
+    elif find_spec("skimage") is not None:
+        result, materials = _over_found_materials(again, known, corrected, alone)
+    if materials is not None and reflection_shift is not None:
+        single.hold(alone, result, materials)
     result = complete(
         result,
         corrected,
@@ -164,18 +153,21 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     return warned(result.assign_attrs(reflection_shift=source), *doubts)
 
 
-def _told(inputs: Inputs, alone: xr.Dataset, workers: int) -> Material | None:
-    """Ratios and emissivity of each material, from a result of each pixel alone."""
-    with (
-        threadpool_limits(limits=1, user_api="blas"),
-        ThreadPoolExecutor(workers) as threads,
-        tqdm(disable=True) as bar,
-    ):
-        if inputs.displacement is None:
-            return pool.materials(inputs, threads, bar)
-        both = joint.beside(inputs, alone)
-        apart = replace(inputs, difference=both.difference)
-        return neighbours.materials(apart, threads, bar, every=True)
+def _over_found_materials(
+    again: Callable[..., xr.Dataset], known: Inputs, corrected: xr.Dataset, alone: xr.Dataset
+) -> tuple[xr.Dataset, xr.DataArray]:
+    """Separate over materials that are found in a result of each pixel alone, and these."""
+    found = pooling.materials(alone, corrected, known.response, borders=True)
+    regions = pooling.others(found, alone)
+    groups = [pooling.without_borders(regions, alone, known.response)]
+
+    def joined(told: Material | None) -> Labels:
+        wider = pooling.joined(regions, alone, told, known.response)
+        groups.append(pooling.without_borders(wider, alone, known.response))
+        return numbered(corrected, groups[-1])
+
+    result = again(replace(known, labels=numbered(corrected, groups[0])), regroup=joined)
+    return result, groups[-1]
 
 
 def _apart(

@@ -14,11 +14,11 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
-from dbthermal.separation import _joint as joint
-from dbthermal.separation import _neighbours as neighbours
+from dbthermal.separation import _side_by_side as side_by_side
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
+from dbthermal.separation._side_by_side import Regroup
 from dbthermal.separation._tiles import Estimate, Mask, Material
 
 if TYPE_CHECKING:
@@ -202,9 +202,19 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
 
 
 def separated(
-    inputs: Inputs, *, alone: xr.Dataset | None = None, workers: int = 2, progress: bool = False
+    inputs: Inputs,
+    *,
+    alone: xr.Dataset | None = None,
+    regroup: Regroup | None = None,
+    workers: int = 2,
+    progress: bool = False,
 ) -> xr.Dataset:
-    """Separate checked inputs; to pool cameras apart, from a result of each pixel `alone`."""
+    """
+    Separate checked inputs.
+
+    To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
+    What is told of the materials may `regroup` them.
+    """
     variables, capture = schema.STAGES["separated"], inputs.capture
     apart, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and apart and pooled:
@@ -218,13 +228,16 @@ def separated(
         ThreadPoolExecutor(workers) as threads,
         tqdm(total=pixels, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
+        each = partial(_separate_all, result, threads, bar)
         if alone is not None and apart:
-            _pool_jointly(inputs, alone, result, threads, bar)
+            side_by_side.pooled(inputs, alone, result, each, threads, bar, regroup)
         elif apart:
-            _solve_jointly(inputs, result, threads, bar)
+            side_by_side.alone(inputs, result, each, threads)
+        elif pooled:
+            survey = partial(pooling.materials, threads=threads, bar=bar)
+            each(*side_by_side.regrouped(inputs, survey, regroup))
         else:
-            material = pooling.materials(inputs, threads, bar) if pooled else None
-            _separate_all(inputs, material, result, threads, bar)
+            each(inputs, None)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
@@ -279,53 +292,12 @@ def get_method(name: str) -> Method:
     return method
 
 
-def _solve_jointly(
-    inputs: Inputs, result: xr.Dataset, threads: ThreadPoolExecutor, bar: "tqdm[Any]"
-) -> None:
-    """Separate by ratios of bands blurred alike; then with the object of each camera's place."""
-    material, blur = None, 0.0
-    alike = None if inputs.method.survey is None else neighbours.blurred(inputs)
-    if alike is not None:
-        _separate_all(alike, None, result, threads, bar)
-        material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
-    _separate_all(inputs, material, result, threads, bar)
-    both = joint.solve(inputs, result, threads, blur=blur)
-    if both is not None:
-        apart = replace(inputs, difference=both.difference)
-        _separate_all(apart, material, result, threads, bar)
-        both.finish()
-
-
-def _pool_jointly(
-    inputs: Inputs,
-    alone: xr.Dataset,
+def _separate_all(
     result: xr.Dataset,
     threads: ThreadPoolExecutor,
     bar: "tqdm[Any]",
-) -> None:
-    """Pool materials and solve for the object of each place in turns, from a result without."""
-
-    def pool(both: joint.Joint, *, every: bool) -> Material | None:
-        # Without the difference the backgrounds, which bend the bands apart, are far off.
-        apart = replace(inputs, difference=both.difference)
-        material = neighbours.materials(apart, threads, bar, every=every)
-        _separate_all(apart, material, result, threads, bar)
-        return material
-
-    first = joint.beside(inputs, alone)
-    material = pool(first, every=True)
-    both = joint.solve(inputs, result, threads, material=material, before=first)
-    if both is not None:
-        pool(both, every=False)
-        both.finish()
-
-
-def _separate_all(
     inputs: Inputs,
     material: Material | None,
-    result: xr.Dataset,
-    threads: ThreadPoolExecutor,
-    bar: "tqdm[Any]",
 ) -> None:
     """Separate all blocks of rows into the result."""
     list(threads.map(partial(_separate, inputs, material, result, bar), inputs.blocks))

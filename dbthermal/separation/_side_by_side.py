@@ -1,0 +1,81 @@
+"""Two cameras side by side: pixels separated alone, and solved together for the object, in turns.
+
+The pixels alone take the object of the second camera's place for that of the first one's, or know
+by how much the two differ from all pixels together (`_joint`); these need the emissivities.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import xarray as xr
+
+from dbthermal.separation import _joint as joint
+from dbthermal.separation import _neighbours as neighbours
+from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._tiles import Material
+
+Each: TypeAlias = Callable[[Inputs, Material | None], object]
+"""Separates each pixel alone, into the result."""
+Regroup: TypeAlias = Callable[[Material | None], Labels]
+"""Labels (pixel) of materials, of what is told of those before."""
+
+# Turns of the materials and the object of each camera's own place.
+_TURNS: Final = 3
+
+
+def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
+    """Separate without materials, by the ratios of bands that are blurred alike."""
+    material, blur = None, 0.0
+    alike = None if inputs.method.survey is None else neighbours.blurred(inputs)
+    if alike is not None:
+        each(alike, None)
+        material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
+    each(inputs, material)
+    both = joint.solve(inputs, result, threads, blur=blur)
+    if both is not None:
+        each(replace(inputs, difference=both.difference), material)
+        both.finish()
+
+
+def pooled(
+    inputs: Inputs,
+    before: xr.Dataset,
+    result: xr.Dataset,
+    each: Each,
+    threads: Executor,
+    bar: Any,
+    regroup: Regroup | None = None,
+) -> None:
+    """Separate with materials, from a result of each pixel alone before.
+
+    The first are told with the object of pixels alone, and may be off as these are; the second,
+    which may regroup them, with that of the first; and the last with that of what they are then.
+    """
+    both: joint.Joint | None = joint.beside(inputs, before)
+    for turn in range(_TURNS):
+        # Without the difference the backgrounds, which bend the bands apart, are far off.
+        both = None if both is None else both.kept()
+        inputs = replace(inputs, difference=None if both is None else both.difference)
+        survey = partial(neighbours.materials, threads=threads, bar=bar, every=turn == 0)
+        inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
+        each(inputs, material)
+        both = joint.solve(inputs, result, threads, material=material, before=both)
+    if both is not None:
+        each(replace(inputs, difference=both.difference), material)
+        both.finish()
+
+
+def regrouped(
+    inputs: Inputs, survey: Callable[[Inputs], Material | None], regroup: Regroup | None
+) -> tuple[Inputs, Material | None]:
+    """Inputs and a survey of their materials; of other ones, if that regroups them."""
+    material = survey(inputs)
+    labels = None if regroup is None else regroup(material)
+    if labels is None or np.all(labels == inputs.labels):
+        return inputs, material
+    inputs = replace(inputs, labels=labels)
+    return inputs, survey(inputs)
