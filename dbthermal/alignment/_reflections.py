@@ -10,6 +10,7 @@ import xarray as xr
 from scipy import sparse
 from scipy.linalg import solveh_banded
 from scipy.ndimage import distance_transform_edt, gaussian_filter
+from threadpoolctl import threadpool_limits
 
 from dbthermal import noise as noises
 from dbthermal import response as responses
@@ -87,7 +88,12 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         If an input is not as described, the image is too small, nothing that both bands see changes
         rapidly, or the shift is beyond a third of the image.
     """
-    capture = _Capture.of(corrected, response)
+    with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
+        return _found(corrected, _Capture.of(corrected, response))
+
+
+def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
+    """Field of a checked capture, from coarse to fine."""
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))

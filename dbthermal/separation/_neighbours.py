@@ -81,9 +81,7 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
     )
 
 
-def materials(
-    inputs: Inputs, threads: Executor, bar: Any, *, every: bool = False
-) -> Material | None:
+def materials(inputs: Inputs, threads: Executor, bar: Any) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
     Surveyed are the pixels that no neighbour's blur reaches. What twice the blur changes may be as
@@ -98,7 +96,7 @@ def materials(
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
         alike = replace(inputs, displacement=replace(displacement, blur=blur))
         surveyed = np.where(inner, labels, -1).ravel()
-        more = pool.materials(alike, threads, bar, every=every, surveyed=surveyed)
+        more = pool.materials(alike, threads, bar, surveyed=surveyed)
         if more is not None:  # else all materials are too narrow
             found = more if found is None else _blurred(found, more, inputs)
     if found is None:

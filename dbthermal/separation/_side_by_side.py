@@ -60,7 +60,7 @@ def pooled(
         # Without the difference the backgrounds, which bend the bands apart, are far off.
         both = None if both is None else both.kept()
         inputs = replace(inputs, difference=None if both is None else both.difference)
-        survey = partial(neighbours.materials, threads=threads, bar=bar, every=turn == 0)
+        survey = partial(neighbours.materials, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
         each(inputs, material)
         both = joint.solve(inputs, result, threads, material=material, before=both)

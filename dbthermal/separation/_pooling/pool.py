@@ -29,16 +29,14 @@ def materials(
     threads: Executor,
     bar: Any,
     *,
-    every: bool = False,
     surveyed: Labels | None = None,
     known: Material | None = None,
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
     Pixels that have an emissivity alone are a selection by their ratios: unless they are nearly
-    all, or `every` is set, all are surveyed again with the ratios of their material. The labels
-    (pixel) of those that are `surveyed`, -1 for others, if not all are. Ratios that are `known`
-    stay.
+    all, all are surveyed again with the ratios of their material. If not all are `surveyed`, the
+    labels (pixel) of those that are, -1 for others: once, for their ratios. Those `known` stay.
     """
     whole = inputs.labels
     if whole is None:
@@ -62,7 +60,7 @@ def materials(
     if known is not None:
         return pooled(replace(known, emissivity=np.full_like(known.emissivity, np.nan)))[0]
     material, told = pooled(None)
-    if material is None or every or told > _MOST_TOLD:
+    if material is None or surveyed is not None or told > _MOST_TOLD:
         return material
     return pooled(replace(material, emissivity=np.full_like(material.emissivity, np.nan)))[0]
 
