@@ -1,0 +1,98 @@
+"""Two cameras side by side: pixels alone and together in turns, and materials told between them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_displaced import GLASS, RIG, SMALL, TIME, field, film, smooth_shift
+
+from dbthermal import separation
+from dbthermal.separation import _displaced as displaced
+from dbthermal.separation import _joint as joint
+from dbthermal.separation._inputs import Inputs, Labels, check
+from dbthermal.separation._solve import get_method, separated
+from dbthermal.separation._tiles import Material
+
+SHIFT = smooth_shift(SMALL.shape, 2.4, 1.2)
+HALVES = xr.DataArray(np.repeat([[0, 1]], 24, axis=1) + np.zeros((20, 1), int), dims=("y", "x"))
+
+
+@pytest.fixture(scope="module")
+def plate() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """Scene and capture of a plate of glass displaced by 2.4 pixels, and each pixel alone."""
+    scene, capture = film(SMALL, SHIFT, 4)
+    return (
+        scene,
+        capture,
+        separation.solve(capture, RIG.response(), reflection_shift=field(SHIFT)),
+    )
+
+
+def pooled_inputs(capture: xr.Dataset, labels: xr.DataArray) -> Inputs:
+    """Checked inputs of the default method with materials and the known field."""
+    method, shift = get_method("subspace"), field(SHIFT)
+    return check(capture, RIG.response(), method, "subspace", pool=labels, reflection_shift=shift)
+
+
+def test_solve_pools_from_each_pixel_alone(plate: tuple[xr.Dataset, ...]) -> None:
+    """With a result at hand the pooled one is bit for bit that without."""
+    _, capture, alone = plate
+    again = separated(pooled_inputs(capture, HALVES), alone=alone)
+    whole = separation.solve(
+        capture, RIG.response(), pool=HALVES, reflection_shift=field(SHIFT), workers=1
+    )
+    xr.testing.assert_identical(again, whole)
+
+
+def test_object_of_the_second_place_is_told_from_a_result(plate: tuple[xr.Dataset, ...]) -> None:
+    """What the second camera sees of the object is nearer to the truth than that of the first."""
+    scene, capture, alone = plate
+    inputs = pooled_inputs(capture, HALVES)
+    both = joint.beside(inputs, alone)
+    resample = displaced.check(field(SHIFT), capture, inputs.bands[0]).resample
+    true = scene["object_temperature"].values.reshape(TIME.size, -1)
+    inside = (np.abs(resample.sum(axis=1) - 1.0) < 1e-6) & (alone["status"].values.ravel() == 0)
+    there = (resample @ true.T)[inside].T
+    film = both.result["background_temperature"].values.reshape(TIME.size, -1)[:, inside]
+    here = alone["object_temperature"].values.reshape(TIME.size, -1)[:, inside]
+    errors = [float(np.sqrt(np.nanmean((one - there) ** 2))) for one in (film, here)]
+    print(f"RMSE of the object at the second place {errors[0]:.3f} K, of the first {errors[1]:.3f}")
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_materials_are_regrouped_by_what_is_told(plate: tuple[xr.Dataset, ...]) -> None:
+    """Two halves of one glass are told apart by noise; as one they have one emissivity."""
+    scene, capture, alone = plate
+    told: list[Material | None] = []
+
+    def as_one(material: Material | None) -> Labels:
+        told.append(material)
+        return np.zeros(HALVES.size, dtype=np.intp)
+
+    one = separated(pooled_inputs(capture, HALVES), alone=alone, regroup=as_one)
+    two = separated(pooled_inputs(capture, HALVES), alone=alone)
+    assert len(told) == 1
+    assert told[0] is not None
+    halves = told[0].ratio[1].reshape(HALVES.shape)[10, [4, -4]]
+    true = float((1.0 - GLASS[1]) / (1.0 - GLASS[0]))
+    print(f"ratios of the halves {halves}, true {true:.3f}")
+    assert halves[0] != halves[1]
+    assert np.allclose(halves, true, rtol=0.05)
+    good = (one["status"] == 0) & (two["status"] == 0)
+    errors = [
+        float(((it["object_temperature"] - scene["object_temperature"]) ** 2).where(good).mean())
+        for it in (one, two, alone)
+    ]
+    print(f"mean square errors [K^2] of one material, of halves, alone: {errors}")
+    assert errors[0] < errors[2]
+    assert not one["emissivity"].equals(two["emissivity"])
+
+
+def test_cameras_at_one_place_are_regrouped_too() -> None:
+    """Without a shift materials are told once and regrouped by that."""
+    capture = film(SMALL, np.zeros((2, *SMALL.shape)), 5)[1]
+    inputs = replace(pooled_inputs(capture, HALVES), displacement=None)
+    one = separated(inputs, regroup=lambda _: np.zeros(HALVES.size, dtype=np.intp))
+    whole = separation.solve(capture, RIG.response(), pool=xr.zeros_like(HALVES))
+    xr.testing.assert_identical(one, whole)
