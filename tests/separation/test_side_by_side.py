@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from test_displaced import GLASS, RIG, SMALL, TIME, field, film, smooth_shift
+from test_displaced import GLASS, RIG, SMALL, TIME, field, film
 
 from dbthermal import separation
 from dbthermal.separation import _displaced as displaced
@@ -13,6 +13,7 @@ from dbthermal.separation import _joint as joint
 from dbthermal.separation._inputs import Inputs, Labels, check
 from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._tiles import Material
+from reproduction.experiments.pictures import smooth_shift
 
 SHIFT = smooth_shift(SMALL.shape, 2.4, 1.2)
 HALVES = xr.DataArray(np.repeat([[0, 1]], 24, axis=1) + np.zeros((20, 1), int), dims=("y", "x"))
