@@ -213,25 +213,21 @@ def joined(
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
-    object; pooled ratios are not. Also joined is what has no step at the border: an emissivity that
-    changes over its material.
+    object; pooled ratios are not. Also joined is what has no step at the border, as where an
+    emissivity changes.
     """
     if pooled is None:
         return labels
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     bands, noise = _bands(alone, response)
-    inverse = pooled.inverse_energy + pooled.spread
-    features = _both(
-        pooled.ratio[1:].reshape(-1, *cells.shape),
-        ratio_variance(pooled.ratio, inverse, noise)[1:].reshape(-1, *cells.shape),
-        pooled.emissivity.reshape(cells.shape),
-        (pooled.noise_variance + pooled.drift_variance).reshape(cells.shape),
-    )
+    variance = ratio_variance(pooled.ratio, pooled.inverse_energy + pooled.spread, noise)
+    emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
+    parts = pooled.ratio[1:], variance[1:], *emissivity
+    features = _both(*(part.reshape(-1, *cells.shape) for part in parts))
     found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
     pairs = region_merging.neighbours(cells)
     found.join_alike(pairs, resolution)
-    _, own = _features(alone, bands)
-    boxes, grown = find_objects(cells), True
+    own, boxes, grown = _features(alone, bands)[1], find_objects(cells), True
     while grown:
         grown = False
         for pair in pairs:
@@ -288,22 +284,18 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
         result[name].values.astype(np.float64)
         for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
     )
-    others, first = bands[1:], bands[0]
-    both = _both(
-        ratio[others], ratio_std[others] ** 2, emissivity[first], emissivity_std[first] ** 2
-    )
+    others, first = bands[1:], bands[:1]
+    variances = ratio_std[others] ** 2, emissivity_std[first] ** 2
+    both = _both(ratio[others], variances[0], emissivity[first], variances[1])
     return Features(*(part[: len(others)] for part in vars(both).values())), both
 
 
-def _both(
-    ratio: Array, ratio_variance: Array, emissivity: Array, emissivity_variance: Array
-) -> Features:
-    """Ratios (band, y, x) of all bands but the reference, and its emissivity (y, x); if told."""
-    vague = ~(ratio_variance < (_VAGUE * ratio) ** 2)
-    emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
+def _both(ratio: Array, variance: Array, emissivity: Array, of_emissivity: Array) -> Features:
+    """Ratios (band, y, x) of all bands but the reference, and its emissivity (1, y, x); if told."""
+    vague = ~(variance < (_VAGUE * ratio) ** 2)
     return Features(
-        np.concatenate([np.where(vague, np.nan, ratio), emissivity[np.newaxis]]),
-        np.concatenate([ratio_variance, emissivity_variance[np.newaxis]]),
+        np.where([*vague, np.any(vague, axis=0)], np.nan, np.concatenate([ratio, emissivity])),
+        np.concatenate([variance, of_emissivity]),
         np.arange(len(ratio) + 1) == len(ratio),
         np.append(np.full(len(ratio), _TOLERANCE), 0.0),
     )
