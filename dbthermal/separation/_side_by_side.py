@@ -64,6 +64,8 @@ def pooled(
         inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
         each(inputs, material)
         both = joint.solve(inputs, result, threads, material=material, before=both)
+        if both is None and turn > 0:  # the object hardly differs between the places
+            return
     if both is not None:
         each(replace(inputs, difference=both.difference), material)
         both.finish()
