@@ -123,7 +123,7 @@ def array_name(found: Collection[str], name: str | None, path: Path) -> str:
 
 def check_unit(unit: str, name: str) -> None:
     """Raise ValueError if the numbers of a file are no counts."""
-    if unit != "count":
+    if unit not in {"count", "counts"}:
         raise ValueError(
             f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
             "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
@@ -140,7 +140,8 @@ def byte_order(name: str, value: str) -> str:
 
 def stamps(clock: Clock, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
-    values = np.asarray(clock, dtype=np.float64)
+    stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
+    values = stated.values.astype(np.float64)
     if values.ndim == 0:
         if not 0 < values < np.inf:
             raise ValueError(f"Invalid clock {values} of '{name}'. Must be a positive rate in Hz.")

@@ -28,10 +28,15 @@ _FORM: Final = (
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
-    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?"""
-    r"""(m?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
+    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
+    r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
 )
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
+
+# Numbers of images along axes, as ImageJ and OME write them.
+_AXES: Final = re.compile(
+    r"""(?:^(?:channels|slices|frames)=|\bSize[CZT]=")([0-9]{1,9})""", re.MULTILINE
+)
 
 
 def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
@@ -63,7 +68,8 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     OSError, ImportError
         If a file cannot be opened, or tifffile, the extra ``recordings``, is not installed.
     ValueError
-        If the unit is another one; a file is no TIFF, damaged, or has fewer pages than it states;
+        If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, or
+        two bands in one;
         a page is compressed, in tiles, in colours or not of 16 bits, or differs in size; the counts
         take too much memory or have 8 bits; or the clock does not fit.
 
@@ -260,9 +266,12 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
 
 def _stated(description: str) -> int:
     """Number of images that ImageJ or tifffile wrote into a description, 0 if none is there."""
+    axes = [int(size) for size in _AXES.findall(description)]
+    if shaped := description.startswith('{"shape": ['):
+        shape = json.loads(description)["shape"]
+        axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
+    if sum(size > 1 for size in axes) > 1:
+        raise ValueError(f"Invalid axes of {axes} images. Must be one, time: a band is a file.")
     if found := _IMAGEJ.match(description):
         return int(found.group(1))
-    if not description.startswith('{"shape": ['):
-        return 0
-    shape = json.loads(description)["shape"]
-    return math.prod(shape[:-2]) if all(isinstance(size, int) for size in shape) else 0
+    return math.prod(axes) if shaped else 0

@@ -106,6 +106,8 @@ def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset])
     ("changes", "message"),
     [
         ({"offset": 100.0}, r"Invalid offset 100 s: .* do not overlap"),
+        ({"offset": np.nan}, r"Invalid offset nan s: .* do not overlap"),
+        ({"second": "timeless"}, "'time' is nothing"),
         ({"bands": ("a", "a")}, "Repeated band 'a'"),
         ({"second": "crop"}, r"Different sizes \(24, 32\) and \(24, 31\)"),
         ({"second": "undated"}, r"Unknown dates .* offset="),
@@ -123,6 +125,7 @@ def test_what_makes_no_capture(
         "undated": second.drop_attrs(deep=False),
         "temperatures": second.assign(counts=second.counts.astype("float32")),
         "picture": second.drop_vars("exposure_time"),
+        "timeless": second.drop_vars("time"),
     }
     options = {"bands": BANDS, **changes}
     other = others.get(str(options.pop("second", "")), second)
