@@ -110,6 +110,15 @@ def test_saving_replaces_all_of_the_earlier_result(capture: xr.Dataset, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
 
 
+@pytest.mark.parametrize("name", ["_FillValue", "missing_value", "scale_factor", "add_offset"])
+def test_attributes_that_change_numbers(capture: xr.Dataset, tmp_path: Path, name: str) -> None:
+    """What would open as other numbers than were saved is refused."""
+    changed = capture.assign(counts=capture["counts"].assign_attrs({name: 2}))
+    with pytest.raises(ValueError, match=f"Invalid attribute '{name}' of 'counts'"):
+        store.save(changed, tmp_path / "a.zarr", RECORD)
+    assert not (tmp_path / "a.zarr").exists()
+
+
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     """Values are read when they are used: a later save is told by a dataset opened before it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
