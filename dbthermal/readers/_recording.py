@@ -5,7 +5,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -39,7 +39,8 @@ DAMAGE: Final = (
     *(RuntimeError, SyntaxError, SystemError, TypeError, ValueError, Warning, TokenError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# An image is smoother than with its bytes swapped, by this factor, or the order is not known.
+# An image is smoother than with its bytes swapped, or its rows cut at another place, by this
+# factor, or the form is not known.
 _SMOOTHER: Final = 2.0
 
 
@@ -94,10 +95,10 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
         )
 
 
-def smoother(counts: Counts) -> int:
-    """Byte order in which the first clear frame is smoother: 1 as it is, -1 swapped, 0 unclear."""
+def smoother(counts: Counts, other: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:
+    """Form in which the first clear frame is smoother: 1 as it is, -1 the other, 0 unclear."""
     for frame in counts:
-        as_is, swapped = _roughness(frame), _roughness(frame.byteswap())
+        as_is, swapped = _roughness(frame), _roughness(other(frame))
         if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
             return sign
     return 0

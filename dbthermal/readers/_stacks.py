@@ -25,6 +25,7 @@ _FORM: Final = (
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
     ("is_tiled", "tiled pages", False, "False: save it in strips"),
 )
+_FIRST: Final = 8  # frames that tell rows from columns
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
@@ -120,8 +121,8 @@ def raw(
     """Counts of a file of bare 16-bit numbers, frame after frame.
 
     Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
-    fit the size of the file without remainder, and an image that is smoother with its bytes swapped
-    is refused.
+    fit the size of the file without remainder, and an image that is smoother with its bytes
+    swapped, or rows and columns exchanged, is refused.
 
     Parameters
     ----------
@@ -168,6 +169,9 @@ def raw(
     if recordings.smoother(counts) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+    if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
+        rule = "Must be rows, then columns"
+        raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return recordings.clocked(counts, clock, name, format="raw", **decided)
 

@@ -159,6 +159,10 @@ def test_raw(tmp_path: Path) -> None:
     assert_array_equal(bare(path, byte_order="big").counts, counts)
     with pytest.raises(ValueError, match=r"rougher than with bytes swapped"):
         bare(path)
+    path.write_bytes(counts.tobytes())
+    with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
+        bare(path, shape=(32, 24))
+    path.write_bytes(counts.astype(">u2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
         bare(path, shape=(0, 32))
     with pytest.raises(ValueError, match="Invalid frame_header -1"):
