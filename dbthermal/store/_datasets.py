@@ -64,7 +64,9 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     Parameters
     ----------
     dataset : Dataset
-        Of any stage; it is not changed.
+        Of any stage; it is not changed. TypeError for a DataArray, ValueError for attributes by
+        which other numbers would be opened: `_FillValue`, `missing_value`, `scale_factor`,
+        `add_offset`.
     path : str or Path
         Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
     provenance : mapping
@@ -81,6 +83,8 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
+    if not isinstance(dataset, xr.Dataset):
+        raise TypeError(f"Invalid dataset of type {type(dataset).__name__}. Must be a Dataset.")
     _save([dataset], path, provenance, None)
 
 

@@ -117,6 +117,8 @@ def test_attributes_that_change_numbers(capture: xr.Dataset, tmp_path: Path, nam
     with pytest.raises(ValueError, match=f"Invalid attribute '{name}' of 'counts'"):
         store.save(changed, tmp_path / "a.zarr", RECORD)
     assert not (tmp_path / "a.zarr").exists()
+    with pytest.raises(TypeError, match="Invalid dataset of type DataArray"):
+        store.save(capture["counts"], tmp_path / "a.zarr", RECORD)  # type: ignore[arg-type]
 
 
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
