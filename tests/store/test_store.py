@@ -121,6 +121,16 @@ def test_attributes_that_change_numbers(capture: xr.Dataset, tmp_path: Path, nam
         store.save(capture["counts"], tmp_path / "a.zarr", RECORD)  # type: ignore[arg-type]
 
 
+def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) -> None:
+    """What is saved inside a store, which would then be refused as changed, is refused itself."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    with pytest.raises(ValueError, match=r"Invalid path .*b\.zarr', inside a store"):
+        store.save(capture, tmp_path / "a.zarr" / "b.zarr", RECORD)
+    with pytest.raises(ValueError, match=r"Invalid path .*n\.json', inside a store"):
+        store.save_numbers({"a": 1}, tmp_path / "a.zarr" / "counts" / "n.json", RECORD)
+    store.open_dataset(tmp_path / "a.zarr").load()
+
+
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     """Values are read when they are used: a later save is told by a dataset opened before it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
