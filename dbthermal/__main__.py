@@ -56,7 +56,7 @@ def _kelvin(text: str) -> float:
 
 
 def _kelvin_or_path(text: str) -> float | Path:
-    return _kelvin(text) if re.fullmatch(r"[-\d.]+[CK]?", text) else Path(text)
+    return _kelvin(text) if re.fullmatch(r"[-+\d.]+ ?\W?[A-Za-z]?", text) else Path(text)
 
 
 _KINDS: Final[dict[str, Any]] = {
@@ -246,6 +246,7 @@ def _parser() -> argparse.ArgumentParser:
         title = f"{summary[0].upper()}{summary[1:]}."
         added = commands.add_parser(name, help=summary, description=title, epilog=ends, **plain)
         added.set_defaults(place=place)
+        added._negative_number_matcher = re.compile(r"-[\d.]+[CK]?$")  # no option: -5C
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []
@@ -325,9 +326,13 @@ def _carry_out(options: argparse.Namespace) -> int:
     for path in sources:
         if not path.exists():
             raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
+    taken = [source.resolve() for source in sources]
     for path in targets:
-        if path.resolve() in {source.resolve() for source in sources}:
-            raise ValueError(f"Invalid output '{path}': it is read. Must be another place.")
+        place = path.resolve()
+        if any(place in (one, *one.parents) or one in place.parents for one in taken):
+            found = f"Invalid output '{path}': it is another one, or it is read"
+            raise ValueError(f"{found}. Must be another place.")
+        taken.append(place)
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     if options.dry_run:

@@ -296,6 +296,12 @@ def test_nothing_is_overwritten(results: Path) -> None:
     assert store.open_dataset(results / "again.zarr").attrs["gain_offset_corrected"] == 1
     line = refused(results, "correct", "scene.zarr", "-o", "scene.zarr", "--overwrite")
     assert "it is read. Must be another place" in line
+    line = refused(results, "correct", "scene.zarr", "nuc.zarr", "-o", "scene.zarr/inner.zarr")
+    assert "it is read. Must be another place" in line
+    twice = ["-o", "new.zarr", "--correction-output", "./new.zarr"]
+    line = refused(results, "calibrate", "--blackbody", "scene.zarr", *twice)
+    assert "Invalid output 'new.zarr': it is another one" in line
+    assert not (results / "new.zarr").exists()
     assert "No file or folder 'none.zarr'" in refused(results, "info", "none.zarr")
 
 
@@ -511,6 +517,23 @@ def test_what_has_no_time_makes_no_curve(results: Path) -> None:
     assert "No file or folder 'nothing.yaml'" in line
     line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")
     assert "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper" in line
+    line = refused(results, "export", "result.zarr", "--variable", "noise", "-o", "x.tif")
+    assert "Unknown variable 'noise' for .tif. Must be one of ['background_temper" in line
+    line = refused(results, "report", "response.zarr", "-o", "x.html")
+    assert "Invalid result 'response.zarr' of stage 'response'" in line
+    apart = ["--method", "calibrated", "--emissivity", "0.9", "-o", "x.zarr"]
+    line = refused(results, "separate", "aligned.zarr", "response.zarr", *apart)
+    assert "Invalid --emissivity [0.9]. Must be one for each of the bands" in line
+
+
+def test_temperatures_below_zero(tmp_path: Path) -> None:
+    """A minus begins a temperature, as of a blackbody outdoors or the sky, and no option."""
+    line = refused(tmp_path, "calibrate", "--at", "-5C", "a.tif", "b.tif", "-o", "a.zarr")
+    assert "No file or folder 'a.tif'" in line
+    line = refused(tmp_path, "complete", *"abc", "--surroundings", "-40C", "-o", "d.zarr")
+    assert "No file or folder 'a'" in line
+    found = run(tmp_path, "calibrate", "--at", "5c", "a.tif", "b.tif", "-o", "a.zarr")
+    assert "Invalid temperature '5c'. Must be a number with its unit" in found.stderr
 
 
 @pytest.mark.parametrize(

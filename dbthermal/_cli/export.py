@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
-from dbthermal._cli.files import opened, provenance
+from dbthermal._cli.files import opened, provenance, staged
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -22,8 +22,9 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
     names = sorted(map(str, result.data_vars))
-    if suffix == ".csv":  # curves over time
-        names = [name for name in names if result[name].dims == ("time", "y", "x")]
+    if suffix != ".nc":  # pictures, or curves over time
+        dims, last = (("time", "y", "x"), 4) if suffix == ".csv" else (("y", "x"), 2)
+        names = [name for name in names if result[name].dims[-last:] == dims]
         if not names:
             rule = "Must be a result, as from: dbthermal separate"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
@@ -126,7 +127,7 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
     """Command `report`."""
     from dbthermal import reporting  # noqa: PLC0415 - optional
 
-    result, shown = opened(options.result), [opened(one) for one in options.shown]
+    (result,), shown = staged(options, result="separated"), [*map(opened, options.shown)]
     reporting.report(result, options.output, *shown, regions=_regions(result, options.region))
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 

@@ -77,7 +77,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(one.sizes["time"])
         if "exposure_time" in one:  # frames that are padded, or damaged, have none
             good = np.flatnonzero(one["exposure_time"].notnull().all("band"))
-        frames = one["counts"].isel(time=good[: options.frames]).load()
+        frames = one["counts"].isel(time=good[: max(options.frames, 0)]).load()
         movie = frames.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
     number = min(movie.sizes["frame"] for movie in movies)
@@ -151,6 +151,9 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         emissivities = None
         if options.emissivity:
             axis = {"band": source["band"].values}
+            if len(options.emissivity) != len(axis["band"]):
+                rule = f"Must be one for each of the bands {axis['band'].tolist()}"
+                raise ValueError(f"Invalid --emissivity {options.emissivity}. {rule}.")
             emissivities = xr.DataArray(options.emissivity, dims="band", coords=axis)
         separation.run(
             options.capture,

@@ -13,6 +13,7 @@ from dbthermal import _rows, schema
 from dbthermal import noise as noises
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import SEARCH, present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
@@ -99,6 +100,11 @@ def align(
         more than 20 frame periods, in turn) [s], `transform` (the matrices, row by row). Other
         variables over `time`, as `exposure_time` and `drift`, are dropped.
 
+    Warns
+    -----
+    UserWarning
+        If an offset leaves no frame of a band.
+
     Raises
     ------
     TypeError, ValueError
@@ -161,6 +167,9 @@ def align(
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
+    rule = f"at offsets of {offsets.tolist()} s: are they in seconds, do the recordings overlap?"
+    gone = [name for name, number in zip(names, lost, strict=True) if number == times.size]
+    result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
     result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
     if "pattern_std" in result:
         result["pattern_std"] = result["pattern_std"] * shares
@@ -223,6 +232,7 @@ def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
     column, row, scale = np.einsum(
         "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
     )
+    scale = np.where(scale * matrix[2, 2] > 0, scale, np.nan)  # else behind the camera
     return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
 
 
@@ -256,7 +266,8 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
     """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
     names = [str(name) for name in corrected["band"].values]
     shape = corrected["counts"].shape[2:]
-    expected = MAP if "axis" in transform.dims else TRANSFORM
+    given = schema.check_numbers(transform, "transform")
+    expected = MAP if "axis" in given.dims else TRANSFORM
     schema.check_variable(transform, expected, "the transform")
     values = transform.values[schema.band_positions(transform, names, "the transform")]
     if expected is MAP:

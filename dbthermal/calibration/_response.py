@@ -375,12 +375,14 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
     return Curve(band, amplitude, wavelength, shift, offset, reference, *range_)
 
 
-def _constant(attrs: Mapping[str, Any], key: str, band: str, *, positive: bool = True) -> float:
+def _constant(attrs: Any, key: str, band: str, *, positive: bool = True) -> float:
     """Constant of a file; ValueError by band if it is missing or not positive."""
-    if f"file_{key}" not in attrs:
+    if f"file_{key}" not in (attrs if isinstance(attrs, Mapping) else {}):
         rule = "Must be in the file, as in FLIR's: else fit a blackbody, by fit_response"
         raise ValueError(f"Missing {key} of band '{band}'. {rule}.")
     value = float(attrs[f"file_{key}"])
     if positive:
         planck.require_positive(f"{key} of band '{band}'", value)
+    elif not np.isfinite(value):
+        raise ValueError(f"Invalid {key} of band '{band}' {value}. Must be finite.")
     return value

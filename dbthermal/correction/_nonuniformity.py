@@ -392,7 +392,9 @@ def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
     """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
     _check(correction)
     maps = laid_on(correction, counts, "the correction", "the capture")[["gain", "offset", "bad"]]
-    for name in ("gain", "offset"):
-        if not np.all(schema.measured(maps[name])):
-            raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")
+    rising = {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}
+    for name, holds in rising.items():
+        if not np.all(schema.measured(maps[name]) & holds):
+            found = f"Invalid {name} of the correction: not finite, or not positive"
+            raise ValueError(f"{found}. Must be finite, and a gain positive.")
     return maps.drop_vars(["y", "x"], errors="ignore")

@@ -16,6 +16,7 @@ from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, sm
 _NO_FILTER: Final = "none"
 # Time constant of the object's warming, as a share of the capture.
 _TIME_CONSTANT: Final = 1.0 / 3.0
+_MOST_FRAMES: Final = 100_000  # they take some seconds a material
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class CaptureDesign:
     ------
     ValueError
         If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
-        longer than the period, or there are fewer than two frames.
+        longer than the period, or there are fewer than two frames or more than 100 000.
     """
 
     seconds: float = 35.0
@@ -65,8 +66,8 @@ class CaptureDesign:
         if self.duration > self.period:
             rule = f"Must be at most the period, {self.period} s"
             raise ValueError(f"Invalid duration {self.duration} s of a pulse. {rule}.")
-        if round(self.seconds * self.rate) < 2:
-            rule = "Must have at least two frames"
+        if not 1.5 <= self.seconds * self.rate <= _MOST_FRAMES:
+            rule = f"Must have two frames to {_MOST_FRAMES}: plan a shorter one, or a lower rate"
             raise ValueError(f"Invalid capture of {self.seconds} s at {self.rate} 1/s. {rule}.")
 
 

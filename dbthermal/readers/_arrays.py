@@ -2,9 +2,10 @@
 
 import warnings
 import zipfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,9 @@ from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._recording import Clock
+
+_PLACES: Final = {"time": 0, "y": 1, "x": 2, "band": None}  # of dims that have these names
+_ATTRIBUTES: Final = ("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value")
 
 
 def array(
@@ -52,7 +56,8 @@ def array(
         If h5py, the extra ``recordings``, is not installed for HDF5, which NetCDF 4 is too.
     ValueError
         If a file is of another format, or damaged; the array is not one of three dimensions and
-        uint16, is scaled, or is not in the file; as `tiff` for unit, clock, memory and 8 bits.
+        uint16, has other dims, is scaled, lacks values, or is not in the file; as `tiff` for unit,
+        clock, memory and 8 bits.
 
     Examples
     --------
@@ -64,21 +69,33 @@ def array(
     label = Path(source).name if isinstance(source, str | Path) else "array"
     recordings.check_unit(unit, label)
 
-    def check(values: Any) -> None:
-        _check(values.shape, values.dtype, memory, label)
-        own = getattr(values, "attrs", {}).get("units", unit)
-        recordings.check_unit(own.decode() if isinstance(own, bytes) else str(own), label)
+    own = dict[str, Any]()
+
+    def check(values: Any, dims: Sequence[Any]) -> None:
+        if any(_PLACES.get(dim, place) != place for place, dim in enumerate(dims)):
+            raise ValueError(f"Invalid dims {[*dims]} of '{label}'. Must be (time, y, x).")
+        attrs = getattr(values, "attrs", {})
+        own.update({name: attrs[name] for name in _ATTRIBUTES if name in attrs})
+        for scale in {"scale_factor", "add_offset"} & own.keys():
+            raise ValueError(f"Invalid '{scale}' of '{label}'. Must be counts as measured.")
+        dtype = getattr(values, "dtype", np.dtype(object))
+        _check(np.shape(values), dtype, memory, label)
+        said = own.get("units", own.get("unit", unit))
+        recordings.check_unit(said.decode() if isinstance(said, bytes) else str(said), label)
 
     with ExitStack() as stack:
         values = source
         if not isinstance(source, str | Path):
-            check(source)
+            check(source, source.dims if isinstance(source, xr.DataArray) else ())
         elif containers.kind_of(Path(source)):
             values = containers.read(Path(source), name, check, memory, stack)
         else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
+    fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
+    if np.ma.is_masked(values) or (fills and np.isin(counts, fills).any()):
+        raise ValueError(f"Missing counts in '{label}': masked, or {fills}. Must all be there.")
     return recordings.clocked(counts, clock, label, format="array")
 
 

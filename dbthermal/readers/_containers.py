@@ -28,7 +28,7 @@ def kind_of(path: Path) -> str:
 
 
 def read(
-    path: Path, name: str | None, check: Callable[[Any], None], memory: float, stack: ExitStack
+    path: Path, name: str | None, check: Callable[[Any, Any], None], memory: float, stack: ExitStack
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
     kind = kind_of(path)
@@ -41,11 +41,7 @@ def read(
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
         found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
         values, dims = found[recordings.array_name(found, name, path)]
-        if "time" in dims[1:]:
-            raise ValueError(f"Invalid dims {dims} of '{path.name}'. Must be (time, y, x).")
-        for scale in {"scale_factor", "add_offset"} & set(values.attrs):
-            raise ValueError(f"Invalid '{scale}' of '{path.name}'. Must be counts as measured.")
-        check(values)
+        check(values, dims)
         if isinstance(values, zarr.Array):
             _check_chunks(values, path)
         return values[...]

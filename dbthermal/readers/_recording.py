@@ -5,7 +5,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -39,7 +39,8 @@ DAMAGE: Final = (
     *(RuntimeError, SyntaxError, SystemError, TypeError, ValueError, Warning, TokenError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# An image is smoother than with its bytes swapped, by this factor, or the order is not known.
+# An image is smoother than with its bytes swapped, or its rows cut at another place, by this
+# factor, or the form is not known.
 _SMOOTHER: Final = 2.0
 
 
@@ -94,10 +95,10 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
         )
 
 
-def smoother(counts: Counts) -> int:
-    """Byte order in which the first clear frame is smoother: 1 as it is, -1 swapped, 0 unclear."""
+def smoother(counts: Counts, other: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:
+    """Form in which the first clear frame is smoother: 1 as it is, -1 the other, 0 unclear."""
     for frame in counts:
-        as_is, swapped = _roughness(frame), _roughness(frame.byteswap())
+        as_is, swapped = _roughness(frame), _roughness(other(frame))
         if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
             return sign
     return 0
@@ -123,7 +124,7 @@ def array_name(found: Collection[str], name: str | None, path: Path) -> str:
 
 def check_unit(unit: str, name: str) -> None:
     """Raise ValueError if the numbers of a file are no counts."""
-    if unit != "count":
+    if unit not in {"count", "counts"}:
         raise ValueError(
             f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
             "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
@@ -140,7 +141,8 @@ def byte_order(name: str, value: str) -> str:
 
 def stamps(clock: Clock, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
-    values = np.asarray(clock, dtype=np.float64)
+    stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
+    values = stated.values.astype(np.float64)
     if values.ndim == 0:
         if not 0 < values < np.inf:
             raise ValueError(f"Invalid clock {values} of '{name}'. Must be a positive rate in Hz.")

@@ -25,13 +25,19 @@ _FORM: Final = (
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
     ("is_tiled", "tiled pages", False, "False: save it in strips"),
 )
+_FIRST: Final = 8  # frames that tell rows from columns
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
-    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?"""
-    r"""(m?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
+    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
+    r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
 )
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
+
+# Numbers of images along axes, as ImageJ and OME write them.
+_AXES: Final = re.compile(
+    r"""(?:^(?:channels|slices|frames)=|\bSize[CZT]=")([0-9]{1,9})""", re.MULTILINE
+)
 
 
 def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
@@ -63,7 +69,8 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     OSError, ImportError
         If a file cannot be opened, or tifffile, the extra ``recordings``, is not installed.
     ValueError
-        If the unit is another one; a file is no TIFF, damaged, or has fewer pages than it states;
+        If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, or
+        two bands in one;
         a page is compressed, in tiles, in colours or not of 16 bits, or differs in size; the counts
         take too much memory or have 8 bits; or the clock does not fit.
 
@@ -114,8 +121,8 @@ def raw(
     """Counts of a file of bare 16-bit numbers, frame after frame.
 
     Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
-    fit the size of the file without remainder, and an image that is smoother with its bytes swapped
-    is refused.
+    fit the size of the file without remainder, and an image that is smoother with its bytes
+    swapped, or rows and columns exchanged, is refused.
 
     Parameters
     ----------
@@ -162,6 +169,9 @@ def raw(
     if recordings.smoother(counts) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+    if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
+        rule = "Must be rows, then columns"
+        raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return recordings.clocked(counts, clock, name, format="raw", **decided)
 
@@ -260,9 +270,12 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
 
 def _stated(description: str) -> int:
     """Number of images that ImageJ or tifffile wrote into a description, 0 if none is there."""
+    axes = [int(size) for size in _AXES.findall(description)]
+    if shaped := description.startswith('{"shape": ['):
+        shape = json.loads(description)["shape"]
+        axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
+    if sum(size > 1 for size in axes) > 1:
+        raise ValueError(f"Invalid axes of {axes} images. Must be one, time: a band is a file.")
     if found := _IMAGEJ.match(description):
         return int(found.group(1))
-    if not description.startswith('{"shape": ['):
-        return 0
-    shape = json.loads(description)["shape"]
-    return math.prod(shape[:-2]) if all(isinstance(size, int) for size in shape) else 0
+    return math.prod(axes) if shaped else 0

@@ -90,7 +90,7 @@ def two_bands(
         begun, later = (datetime.fromisoformat(str(date)) for date in dates)
         late = (later - begun).total_seconds()
     starts, stops = ([one["time"].values[place] for one in pair] for place in (0, -1))
-    overlap = min(stops[0], stops[1] + late) - max(starts[0], starts[1] + late)
+    overlap = np.minimum(stops[0], stops[1] + late) - np.maximum(starts[0], starts[1] + late)
     if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:
         raise ValueError(
             f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
@@ -157,8 +157,8 @@ def _temperatures(parts: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 def _check(one: xr.Dataset, name: str) -> None:
     """Refuse what is no recording of counts in one band."""
-    needed = {"counts": ("time", "y", "x"), "exposure_time": ("time",), "frame_flags": ("time",)}
-    for variable, dims in needed.items():
+    over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
+    for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in one or one[variable].dims != dims:
             found = one[variable].dims if variable in one else "nothing"
             raise ValueError(

@@ -351,14 +351,16 @@ def _known_emissivity(
         )
     if covariance is not None:
         together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
-        if not np.all(np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))) >= -_ROUNDED):
-            raise ValueError("Invalid emissivity_covariance. Must have no negative eigenvalue.")
+        least = np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))).min()  # of one half
+        if not np.all(abs(together - together.swapaxes(0, 1)) <= _ROUNDED) or least < -_ROUNDED:
+            rule = "Must be symmetric and have no negative eigenvalue"
+            raise ValueError(f"Invalid emissivity_covariance. {rule}.")
         return values, together
     deviations = np.zeros_like(values)
     if std is not None:
         deviations = _over_image(corrected, std, "emissivity_std")
-    if not np.all(deviations >= 0):
-        raise ValueError("Invalid emissivity_std. Must be zero or positive, not NaN.")
+    if not np.all((deviations >= 0) & schema.measured(deviations)):
+        raise ValueError("Invalid emissivity_std. Must be zero or positive, and finite.")
     return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
 
 

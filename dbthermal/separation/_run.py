@@ -240,10 +240,12 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
             "for each."
         )
     places = [Path(place).absolute() for place in targets]
-    for place in places:
-        if place.suffix != ".zarr" or places.count(place) > 1:
-            raise ValueError(f"Invalid target '{place}'. Must end in '.zarr', and be named once.")
     captures = [it if isinstance(it, xr.Dataset) else Path(it).absolute() for it in sources]
+    named = [*places, *(it for it in captures if isinstance(it, Path))]
+    for place in places:
+        if place.suffix != ".zarr" or named.count(place) > 1:
+            rule = "Must end in '.zarr', be no capture that is read, and be named once"
+            raise ValueError(f"Invalid target '{place}'. {rule}.")
     return list(zip(captures, places, strict=True))
 
 

@@ -33,6 +33,9 @@ _COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCode
 _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
+# Attributes by which other numbers would be opened than are saved.
+_DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"}
+
 
 def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
     """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x.
@@ -61,7 +64,9 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     Parameters
     ----------
     dataset : Dataset
-        Of any stage; it is not changed.
+        Of any stage; it is not changed. TypeError for a DataArray, ValueError for attributes by
+        which other numbers would be opened: `_FillValue`, `missing_value`, `scale_factor`,
+        `add_offset`.
     path : str or Path
         Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
     provenance : mapping
@@ -78,6 +83,8 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
+    if not isinstance(dataset, xr.Dataset):
+        raise TypeError(f"Invalid dataset of type {type(dataset).__name__}. Must be a Dataset.")
     _save([dataset], path, provenance, None)
 
 
@@ -127,6 +134,10 @@ def _save(
     with whole(path, ".zarr") as folder:
         folder.mkdir()
         for number, part in enumerate(parts):
+            for name, variable in part.variables.items():
+                for label in _DECODED & variable.attrs.keys():
+                    found = f"Invalid attribute '{label}' of '{name}'"
+                    raise ValueError(f"{found}. Must be left out: values are kept as they are.")
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
             encoding = {

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from dbthermal import __version__
 from dbthermal import _text as texts
-from dbthermal.store._integrity import AS_WRITTEN, warn_unchecked
+from dbthermal.store._integrity import AS_WRITTEN, SUMS, warn_unchecked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -302,19 +302,23 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     Parameters
     ----------
     path : str or Path
-        File or folder that is to be whole, or as it was. Its parents are made.
+        File or folder that is to be whole, or as it was. Its parents are made; ValueError if one
+        is a store, which would then be another than was written.
     suffix : str
         End of its name; ValueError for another one.
     """
     path = Path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    for folder in path.resolve().parents:
+        if (folder / SUMS).is_file():
+            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
-        part = Path(folder) / path.name
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as beside:
+        part = Path(beside) / path.name
         yield part
         if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(Path(folder) / "replaced")
+            path.rename(Path(beside) / "replaced")
         part.replace(path)
 
 

@@ -483,8 +483,9 @@ def test_wrong_options() -> None:
 
 
 def test_an_offset_beyond_the_capture_leaves_nothing() -> None:
-    """With an offset beyond the capture all frames of the shifted band count as lost."""
-    aligned = alignment.align(ramp(), offset=10.0, clock="b1")
+    """With an offset beyond the capture all frames of the shifted band count as lost; it warns."""
+    with pytest.warns(UserWarning, match=r"No frame of band 'b0' is left at offsets of \[0\.0, 10"):
+        aligned = alignment.align(ramp(), offset=10.0, clock="b1")
     assert aligned.attrs["frames_lost"] == [40, 0]
 
 

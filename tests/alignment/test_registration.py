@@ -113,6 +113,18 @@ def test_views_are_warped() -> None:
     assert len(aligned.attrs["transform"]) == 18
 
 
+def test_places_behind_the_camera_are_nan() -> None:
+    """Pixels that a homography sends behind the camera have no place; an array is no transform."""
+    horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.1, 0.0, 1.0]])
+    places = resampling.positions(horizon, (4, 20))
+    assert np.isfinite(places[:, :, :10]).all()
+    assert np.isnan(places[:, :, 10:]).all()
+    np.testing.assert_array_equal(places, resampling.positions(-horizon, (4, 20)))
+    assert np.isnan(resampling.positions(0 * horizon, (4, 20))).all()
+    with pytest.raises(TypeError, match="Invalid transform of type ndarray"):
+        alignment.align(views(np.eye(3)), transform=np.eye(3))  # type: ignore[arg-type]
+
+
 def test_a_shift_by_whole_pixels_moves_samples() -> None:
     """A transform by whole pixels changes no sample, and moves the bad pixels' flags along."""
     capture = views(np.eye(3))

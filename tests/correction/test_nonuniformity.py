@@ -288,6 +288,10 @@ def test_correction_must_be_whole(capture: xr.Dataset, correction: xr.Dataset) -
     """A NaN gain or missing bad pixels raise a ValueError."""
     with pytest.raises(ValueError, match="Invalid gain of the correction: not finite"):
         correct(capture, correction.assign(gain=correction["gain"] * np.nan))
+    turned = correction.assign(gain=-correction["gain"])
+    with pytest.raises(ValueError, match=r"Invalid gain of the correction: .* a gain positive"):
+        correct(capture, turned)
+    correct(capture, turned.assign(bad=xr.ones_like(correction["bad"])))
     with pytest.raises(ValueError, match="Missing 'bad'"):
         correct(capture, correction.drop_vars("bad"))
 

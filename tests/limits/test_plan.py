@@ -109,7 +109,8 @@ def test_bad_plan_is_a_clear_error(
 
 
 @pytest.mark.parametrize(
-    "change", [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}]
+    "change",
+    [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}, {"seconds": 1e9}],
 )
 def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
     """Invalid capture conditions raise a ValueError with the rule."""

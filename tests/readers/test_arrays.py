@@ -61,6 +61,48 @@ def test_arrays_of_other_libraries() -> None:
         read(frames.astype("uint16").assign_attrs(units="K"))
     with pytest.raises(ValueError, match=r"Invalid shape \(24, 32\) of 'array'"):
         read(scene()[0])
+    assert_array_equal(read(scene(), unit="counts").counts, scene())
+    with pytest.raises(ValueError, match="Invalid dtype object of 'array'"):
+        read(scene().tolist())
+
+
+@pytest.mark.parametrize("dims", [("y", "x", "t"), ("time", "x", "y"), ("band", "y", "x")])
+def test_dims_in_another_order(tmp_path: Path, dims: tuple[str, ...]) -> None:
+    """Dims whose names say that they are not (time, y, x) are refused, of a file and an array."""
+    array = xr.DataArray(scene(), dims=dims)
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
+    group.create_array("frames", data=scene(), dimension_names=dims)
+    for source in (array, tmp_path / "a.zarr"):
+        with pytest.raises(ValueError, match=r"Invalid dims \[.*'\. Must be \(time, y, x\)"):
+            read(source)
+
+
+def test_scaled_and_missing_counts(tmp_path: Path) -> None:
+    """A scale, a mask and a fill value that occurs are refused, of a file and an array."""
+    counts, array = scene(), xr.DataArray(scene(), dims=("time", "y", "x"))
+    with pytest.raises(ValueError, match="Invalid 'scale_factor' of 'array'"):
+        read(array.assign_attrs(scale_factor=0.01))
+    with pytest.raises(ValueError, match="Missing counts in 'array': masked"):
+        read(np.ma.masked_equal(counts, counts[1, 2, 3]))
+    with pytest.raises(ValueError, match="Invalid unit 'K' of 'array'"):
+        read(array.assign_attrs(unit="K"))
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
+    frames = group.create_array("frames", data=counts)
+    frames.attrs["_FillValue"] = 0
+    assert_array_equal(read(tmp_path / "a.zarr").counts, counts)
+    frames.attrs["_FillValue"] = int(counts[1, 2, 3])
+    with pytest.raises(ValueError, match=r"Missing counts in 'a\.zarr': .* Must all be there"):
+        read(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("clock", [True, "10", np.arange(3).astype("M8[s]")])
+def test_clocks_of_no_numbers(clock: Any) -> None:
+    """Dates, text and truth values are no times in seconds, nor are times in another unit."""
+    with pytest.raises(TypeError, match=r"Invalid dtype .* of the clock of 'array'"):
+        read(scene(), clock=clock)
+    milliseconds = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "ms"})
+    with pytest.raises(ValueError, match="Invalid units 'ms' of the clock of 'array'"):
+        read(scene(), clock=milliseconds)
 
 
 def written(path: Path, form: str) -> Path:

@@ -77,6 +77,17 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
         (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
         (scene() // np.uint16(256), {}, "one of their two bytes is always 0"),
+        (scene(4).reshape(2, 2, 24, 32), {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
+        (
+            scene(4).reshape(2, 2, 24, 32),
+            {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None},
+            r"Invalid axes of \[2, 2\] images",
+        ),
+        (
+            scene(4).reshape(2, 2, 24, 32),
+            {"ome": True, "metadata": {"axes": "CTYX"}},
+            r"Invalid axes of \[1, 2, 2\] images",
+        ),
     ],
 )
 def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: str) -> None:
@@ -97,7 +108,7 @@ def test_unit_must_be_stated(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "unit", ["C", "degC", "\N{DEGREE SIGN}C", "Celsius", "K", "mK", "centikelvin"]
+    "unit", ["C", "degC", "\N{DEGREE SIGN}C", "Celsius", "K", "mK", "cK", "0.01 K", "centikelvin"]
 )
 def test_unit_of_the_description(tmp_path: Path, unit: str) -> None:
     """A description whose values are temperatures is refused, as of ImageJ or JSON; others not."""
@@ -148,6 +159,10 @@ def test_raw(tmp_path: Path) -> None:
     assert_array_equal(bare(path, byte_order="big").counts, counts)
     with pytest.raises(ValueError, match=r"rougher than with bytes swapped"):
         bare(path)
+    path.write_bytes(counts.tobytes())
+    with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
+        bare(path, shape=(32, 24))
+    path.write_bytes(counts.astype(">u2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
         bare(path, shape=(0, 32))
     with pytest.raises(ValueError, match="Invalid frame_header -1"):

@@ -106,6 +106,8 @@ def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset])
     ("changes", "message"),
     [
         ({"offset": 100.0}, r"Invalid offset 100 s: .* do not overlap"),
+        ({"offset": np.nan}, r"Invalid offset nan s: .* do not overlap"),
+        ({"second": "timeless"}, "'time' is nothing"),
         ({"bands": ("a", "a")}, "Repeated band 'a'"),
         ({"second": "crop"}, r"Different sizes \(24, 32\) and \(24, 31\)"),
         ({"second": "undated"}, r"Unknown dates .* offset="),
@@ -123,6 +125,7 @@ def test_what_makes_no_capture(
         "undated": second.drop_attrs(deep=False),
         "temperatures": second.assign(counts=second.counts.astype("float32")),
         "picture": second.drop_vars("exposure_time"),
+        "timeless": second.drop_vars("time"),
     }
     options = {"bands": BANDS, **changes}
     other = others.get(str(options.pop("second", "")), second)
@@ -169,6 +172,7 @@ def test_maker_form(f: float) -> None:
         ("planck_R1", None, "Missing planck_R1 of band '8-14'. Must be in the file, as in FLIR's"),
         ("planck_B", 0.0, r"Invalid planck_B of band '8-14' 0\.0. Must be finite and positive"),
         ("planck_F", 1e9, "Invalid planck_F"),
+        ("planck_O", np.nan, "Invalid planck_O of band '8-14' nan. Must be finite"),
         ("range_min", 600.0, r"Invalid ranges \[\[600\.0, 423\.15\]\] K"),
     ],
 )
@@ -183,6 +187,8 @@ def test_maker_constants_are_checked(key: str, value: float | None, message: str
         attrs[f"file_{key}"] = value
     with pytest.raises(ValueError, match=message):
         calibration.maker_response({"8-14": attrs})
+    with pytest.raises(ValueError, match="Missing range_min of band 'file_"):  # of no band
+        calibration.maker_response(attrs)  # type: ignore[arg-type]
 
 
 def test_from_two_files_to_temperatures(

@@ -142,6 +142,10 @@ def test_emissivities_whose_errors_go_together(glass: Glass) -> None:
     assert 0.92 < share < 0.98
     with pytest.raises(ValueError, match="no negative eigenvalue"):
         solve(emissivity_covariance=covariance - 0.1)
+    with pytest.raises(ValueError, match="Must be symmetric"):
+        solve(emissivity_covariance=covariance + xr.zeros_like(covariance) + np.eye(2)[0] * 1e-3)
+    with pytest.raises(ValueError, match=r"Invalid emissivity_std.*, and finite"):
+        solve(emissivity_std=np.inf * known)
     with pytest.raises(ValueError, match="beside an emissivity_covariance"):
         solve(emissivity_covariance=covariance, emissivity_std=abs(known))
 

@@ -116,6 +116,8 @@ def test_several_captures_are_one_call(path: Path, tmp_path: Path) -> None:
     assert (targets[0] / "zarr.json").stat().st_mtime_ns > before[0]  # of another run
     with pytest.raises(ValueError, match="Invalid number of targets 2 for 3 captures"):
         separation.run(sources, targets[:2], response)
+    with pytest.raises(ValueError, match=r"Invalid target .* be no capture that is read"):
+        separation.run(sources[0], sources[0], response)
     with pytest.raises(ValueError, match=r"Invalid target .*first.* Must .* be named once"):
         separation.run(sources, [*targets[:2], targets[0]], response)
 

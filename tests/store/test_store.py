@@ -110,6 +110,27 @@ def test_saving_replaces_all_of_the_earlier_result(capture: xr.Dataset, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
 
 
+@pytest.mark.parametrize("name", ["_FillValue", "missing_value", "scale_factor", "add_offset"])
+def test_attributes_that_change_numbers(capture: xr.Dataset, tmp_path: Path, name: str) -> None:
+    """What would open as other numbers than were saved is refused."""
+    changed = capture.assign(counts=capture["counts"].assign_attrs({name: 2}))
+    with pytest.raises(ValueError, match=f"Invalid attribute '{name}' of 'counts'"):
+        store.save(changed, tmp_path / "a.zarr", RECORD)
+    assert not (tmp_path / "a.zarr").exists()
+    with pytest.raises(TypeError, match="Invalid dataset of type DataArray"):
+        store.save(capture["counts"], tmp_path / "a.zarr", RECORD)  # type: ignore[arg-type]
+
+
+def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) -> None:
+    """What is saved inside a store, which would then be refused as changed, is refused itself."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    with pytest.raises(ValueError, match=r"Invalid path .*b\.zarr', inside a store"):
+        store.save(capture, tmp_path / "a.zarr" / "b.zarr", RECORD)
+    with pytest.raises(ValueError, match=r"Invalid path .*n\.json', inside a store"):
+        store.save_numbers({"a": 1}, tmp_path / "a.zarr" / "counts" / "n.json", RECORD)
+    store.open_dataset(tmp_path / "a.zarr").load()
+
+
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     """Values are read when they are used: a later save is told by a dataset opened before it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
