@@ -69,6 +69,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
         return recording.open_sweep(*options.sweep, frames=options.frames)
+    if options.frames < 1:
+        raise ValueError(f"Invalid --frames {options.frames}. Must be at least 1.")
     movies = []
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
@@ -77,7 +79,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(one.sizes["time"])
         if "exposure_time" in one:  # frames that are padded, or damaged, have none
             good = np.flatnonzero(one["exposure_time"].notnull().all("band"))
-        frames = one["counts"].isel(time=good[: max(options.frames, 0)]).load()
+        frames = one["counts"].isel(time=good[: options.frames]).load()
         movie = frames.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
     number = min(movie.sizes["frame"] for movie in movies)

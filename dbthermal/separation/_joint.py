@@ -199,7 +199,7 @@ def solve(
     return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
 
 
-def beside(inputs: Inputs, result: xr.Dataset) -> Joint:
+def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     """Object of both places of a result that is solved already."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film = result["object_temperature"].values.reshape(result.sizes["time"], -1).copy()

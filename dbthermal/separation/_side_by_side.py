@@ -55,12 +55,12 @@ def pooled(
     The first are told with the object of pixels alone, and may be off as these are; the second,
     which may regroup them, with that of the first; and the last with that of what they are then.
     """
-    both: joint.Joint | None = joint.beside(inputs, before)
+    survey = partial(neighbours.materials, threads=threads, bar=bar)
+    both: joint.Joint | None = joint.from_result(inputs, before)
     for turn in range(_TURNS):
         # Without the difference the backgrounds, which bend the bands apart, are far off.
         both = None if both is None else both.kept()
         inputs = replace(inputs, difference=None if both is None else both.difference)
-        survey = partial(neighbours.materials, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
         each(inputs, material)
         both = joint.solve(inputs, result, threads, material=material, before=both)

@@ -24,9 +24,14 @@ from dbthermal.separation._tiles import Estimate, Mask, Material
 if TYPE_CHECKING:
     from dbthermal import separation as one
 
-    _Compared: TypeAlias = one.NaiveSettings | one.RatioSettings | one.BcpSettings
-    _Known: TypeAlias = one.CalibratedSettings | one.DbvtSettings
-    Settings: TypeAlias = one.SubspaceSettings | _Known | _Compared
+    Settings: TypeAlias = (
+        one.SubspaceSettings
+        | one.CalibratedSettings
+        | one.DbvtSettings
+        | one.NaiveSettings
+        | one.RatioSettings
+        | one.BcpSettings
+    )
 
 _MODULES: Final = {
     "subspace": ("_subspace.method", "METHOD"),
@@ -222,11 +227,12 @@ def separated(
     if inputs.method.survey:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
-    pixels = result["status"].size * (1 + pooled)
+    # Cameras apart, and materials that are regrouped, take passes that are not known beforehand.
+    total = None if apart or regroup else result["status"].size * (1 + pooled)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
-        tqdm(total=pixels, unit="pixel", desc=inputs.name, disable=not progress) as bar,
+        tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
         each = partial(_separate_all, result, threads, bar)
         if alone is not None and apart:

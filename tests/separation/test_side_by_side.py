@@ -50,7 +50,7 @@ def test_object_of_the_second_place_is_told_from_a_result(plate: tuple[xr.Datase
     """What the second camera sees of the object is nearer to the truth than that of the first."""
     scene, capture, alone = plate
     inputs = pooled_inputs(capture, HALVES)
-    both = joint.beside(inputs, alone)
+    both = joint.from_result(inputs, alone)
     resample = displaced.check(field(SHIFT), capture, inputs.bands[0]).resample
     true = scene["object_temperature"].values.reshape(TIME.size, -1)
     inside = (np.abs(resample.sum(axis=1) - 1.0) < 1e-6) & (alone["status"].values.ravel() == 0)
