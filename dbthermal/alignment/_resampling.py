@@ -168,7 +168,8 @@ def align(
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
     rule = f"at offsets of {offsets.tolist()} s: are they in seconds, do the recordings overlap?"
-    gone = [name for name, number in zip(names, lost, strict=True) if number == times.size]
+    apart = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
+    gone = [name for name, away in zip(names, apart, strict=True) if away]
     result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
     result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
     if "pattern_std" in result:
