@@ -16,6 +16,9 @@ import numpy.typing as npt
 from dbthermal._arrays import Array, Mask, namespace
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
+# Functions that a change point costs as much as: to choose where the polynomial changes fits noise,
+# too (Ninomiya 2015, doi:10.1007/s10463-014-0481-x). Half of them on either side.
+CHANGE_POINT: Final = 3.0
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
@@ -30,7 +33,7 @@ class Subspace:
     steps: int  # columns of every order, beside the constant
     rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
     pieces: npt.NDArray[np.intp] | None = None  # frames with a column, if not all (column, 2)
-    of_pieces: Array | None = None  # leverage (time, 1) of pieces of one order
+    of_pieces: Array | None = None  # leverage (time, 1) of pieces of one order, see `piecewise`
 
     @property
     def orders(self) -> int:
@@ -94,7 +97,7 @@ def piecewise(
 
     So many in each piece, or as many as it has frames. The rising polynomials (time, degree) are
     those of `subspace`. A shutter event must not be the first frame of a piece: its step would
-    be the object's as well.
+    be the object's as well. The leverage is that of more functions, for pieces that were chosen.
     """
     time = np.asarray(time, dtype=np.float64)
     edges, parts = [*np.flatnonzero(first), time.size], []
@@ -110,11 +113,20 @@ def piecewise(
         together[column : column + basis.shape[1], start:stop] = basis.T
         column += basis.shape[1]
     plain, steps = together.T, camera_steps(segment)
+    chosen = np.concatenate([_of_choice(part, time.size) for part in parts])
     if not steps:  # of two pieces, orthonormal as they are
-        leverage = np.concatenate([part[3] for part in parts])
+        leverage = np.concatenate([part[3] for part in parts]) * chosen
         return Subspace(plain, plain, len(together) - 1, rising, spans, leverage)
     functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
-    return Subspace(functions, object_part, functions.shape[1] - 1, rising)
+    leverage = (object_part**2).sum(axis=1, keepdims=True) * chosen
+    return Subspace(functions, object_part, functions.shape[1] - 1, rising, of_pieces=leverage)
+
+
+def _of_choice(part: tuple[int, int, Array, Array], frames: int) -> Array:
+    """Leverage of a piece (frame, 1), its ends chosen from the data, over that of given ends."""
+    start, stop, basis, _ = part
+    ends = (start > 0) + (stop < frames)
+    return np.full((stop - start, 1), 1.0 + 0.5 * CHANGE_POINT * ends / basis.shape[1])
 
 
 @lru_cache(maxsize=4096)
