@@ -125,7 +125,7 @@ def piecewise(
 def _of_choice(part: tuple[int, int, Array, Array], frames: int) -> Array:
     """Leverage of a piece (frame, 1), its ends chosen from the data, over that of given ends."""
     start, stop, basis, _ = part
-    ends = (start > 0) + (stop < frames)
+    ends = int(start > 0) + int(stop < frames)
     return np.full((stop - start, 1), 1.0 + 0.5 * CHANGE_POINT * ends / basis.shape[1])
 
 

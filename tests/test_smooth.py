@@ -92,6 +92,27 @@ def test_steps_and_pieces_are_in_the_subspace() -> None:
     np.testing.assert_allclose(identity, np.eye(functions.steps + 1), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("events", [(), (30,)])
+def test_leverage_of_chosen_pieces(events: tuple[int, ...]) -> None:
+    """A change point adds as much leverage as three functions do, one piece alone has its own."""
+    time = np.arange(60.0)
+    segment = segmented(60, *events) if events else None
+    rising = smooth.subspace(time, 6, segment=segment).rising
+    whole, divided = (
+        smooth.piecewise(time, np.isin(np.arange(60), first), rising, segment=segment)
+        for first in ([0], [0, 20, 41])
+    )
+    own = [(functions.object_part**2).sum(axis=1) for functions in (whole, divided)]
+    np.testing.assert_allclose(whole.leverage[:, 0], own[0], rtol=1e-12, atol=0)
+    added = divided.leverage[:, 0] - own[1]
+    parts = [added[:20].sum(), added[20:41].sum(), added[41:].sum()]
+    if not events:
+        np.testing.assert_allclose(parts, [1.5, 3.0, 1.5], rtol=1e-9, atol=0)
+    # In each piece it is a share of what the piece has.
+    shares = np.repeat([0.3, 0.6, 0.3], [20, 21, 19])
+    np.testing.assert_allclose(added, shares * own[1], rtol=1e-9, atol=0)
+
+
 @given(
     st.floats(-50, 50),
     st.lists(st.integers(5, 55), min_size=1, max_size=3, unique=True).map(sorted),

@@ -24,7 +24,7 @@ import numpy as np
 from dbthermal import _smooth as smooth
 from dbthermal.separation._tiles import Array, Mask, Whole
 
-# Functions of a piece by which the division is chosen. Two more are fitted: what the choice leaves
+# Functions of a piece by which the division is chosen. One more is fitted: what the choice leaves
 # of the curve is too small to be significant, but it would bias ratio and curve.
 FUNCTIONS: Final = 4
 # Cost of a function in units of the energy of noise: 1 for none, log N for an information criterion
