@@ -141,6 +141,10 @@ def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
     """Smooth curves at a few times (time, y, x), over their mean and standard deviation."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
+    if present.size == 0:
+        raise ValueError(
+            f"Invalid view in band '{view['band'].item()}': all {len(frames)} frames are missing."
+        )
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
     frames = frames[present[chosen]].astype(np.float64)
     if not np.all(np.isfinite(frames)):

@@ -202,6 +202,8 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
 
     Raises
     ------
+    TypeError
+        If the files, or those of a band, are no mapping.
     ValueError
         If a constant is missing or not positive, the ranges do not overlap, or the form does not
         fit.
@@ -221,6 +223,11 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     """
     if not files:
         raise ValueError("Empty mapping of files. Must have the attributes of one band at least.")
+    given: Any = files
+    for part in (given, *(given.values() if isinstance(given, Mapping) else ())):
+        if not isinstance(part, Mapping):
+            rule = "Must be a mapping: attributes by band"
+            raise TypeError(f"Invalid files of type {type(part).__name__}. {rule}.")
     ranges = [
         [_constant(attrs, f"range_{end}", band) for end in ("min", "max")]
         for band, attrs in files.items()
@@ -377,7 +384,7 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
 
 def _constant(attrs: Any, key: str, band: str, *, positive: bool = True) -> float:
     """Constant of a file; ValueError by band if it is missing or not positive."""
-    if f"file_{key}" not in (attrs if isinstance(attrs, Mapping) else {}):
+    if f"file_{key}" not in attrs:
         rule = "Must be in the file, as in FLIR's: else fit a blackbody, by fit_response"
         raise ValueError(f"Missing {key} of band '{band}'. {rule}.")
     value = float(attrs[f"file_{key}"])

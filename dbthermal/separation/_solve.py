@@ -184,8 +184,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     >>> bool(abs(error).where(result["status"] == 0).median() < 0.3)  # K
     True
     """
-    if operator.index(workers) < 1:
-        raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
+    tiles.require_workers(workers)
     if operator.index(seed) < 0:
         raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
     inputs = check(

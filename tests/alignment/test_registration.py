@@ -146,6 +146,7 @@ def test_a_shift_by_whole_pixels_moves_samples() -> None:
         ({"model": "thin plate"}, "Unknown model 'thin plate'"),
         ({"noise": True}, "band '9.5'"),
         ({"blank": True}, "all pixels are alike"),
+        ({"missing": True}, r"Invalid view in band '9.5': all \d+ frames are missing"),
     ],
 )
 def test_views_that_do_not_match(change: dict[str, Any], what: str) -> None:
@@ -156,6 +157,8 @@ def test_views_that_do_not_match(change: dict[str, Any], what: str) -> None:
         capture["counts"].values[1] = rng.normal(0, 1, SHAPE)
     if "blank" in change:
         capture["counts"].values[1] = 5.0
+    if "missing" in change:
+        capture["counts"].values[1] = np.nan
     capture["counts"].values[1, 1:] += np.array([[[1.0]], [[2.0]]], dtype=np.float32)
     with pytest.raises(ValueError, match=what):
         alignment.register(capture, **{k: v for k, v in change.items() if k == "model"})

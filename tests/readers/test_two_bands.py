@@ -187,8 +187,9 @@ def test_maker_constants_are_checked(key: str, value: float | None, message: str
         attrs[f"file_{key}"] = value
     with pytest.raises(ValueError, match=message):
         calibration.maker_response({"8-14": attrs})
-    with pytest.raises(ValueError, match="Missing range_min of band 'file_"):  # of no band
-        calibration.maker_response(attrs)  # type: ignore[arg-type]
+    for kind, files in {"float": attrs, "list": [attrs]}.items():
+        with pytest.raises(TypeError, match=f"type {kind}. Must be a mapping: attributes by band"):
+            calibration.maker_response(files)  # type: ignore[arg-type]
 
 
 def test_from_two_files_to_temperatures(

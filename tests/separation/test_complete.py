@@ -250,6 +250,8 @@ def test_dead_pixels_stay_empty(half: Case) -> None:
         ({"prior": emissivity_of(1.2, 0.9)}, r"Invalid emissivities \[1.2, 0.9\] of the prior"),
         ({"prior": "glas"}, "Unknown prior 'glas'"),
         ({"surroundings": 22.0}, r"Invalid surroundings 22.0 K.* not in degrees Celsius"),
+        ({"surroundings": 2e4}, r"Invalid surroundings 20000.0 K. Must be from 150.0 to 3000.0 K"),
+        ({"workers": 0}, "Invalid number of workers 0. Must be a whole number, at least 1"),
         (
             {"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})},
             "Invalid units 'degC' of surroundings",

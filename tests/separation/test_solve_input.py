@@ -79,6 +79,10 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
         "Unordered 'time' of 'counts' of the corrected: 3.9 s is followed by 3.9 s",
     ),
     "workers": (lambda c, r: separation.solve(c, r, workers=0), "Invalid number of workers 0"),
+    "half a worker": (
+        lambda c, r: separation.separate(c, r, workers=1.5),  # type: ignore[arg-type]
+        r"Invalid number of workers 1.5. Must be a whole number",
+    ),
     "emissivity 1.2": (
         lambda c, r: separation.solve(c, r, "calibrated", emissivity=emissivity_of(0.8, 1.2)),
         r"Invalid emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",

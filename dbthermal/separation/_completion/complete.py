@@ -93,8 +93,9 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         If an argument is of the wrong type.
     ValueError
         If a dim, unit, band or coordinate is not as described, an emissivity of the prior lies
-        outside (0, 1), the surroundings are colder than 150 K, as in degrees Celsius, the result
-        is of another capture, or the bands are none of the libraries' and there is no prior.
+        outside (0, 1), the surroundings are not from 150 to 3000 K, as in degrees Celsius or in
+        counts, the result is of another capture, or the bands are none of the libraries' and there
+        is no prior.
 
     Notes
     -----
@@ -123,6 +124,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     >>> int(alone["object_temperature"].count()), bool(error.max() < 2.0)  # K
     (0, True)
     """
+    tiles.require_workers(workers)
     result = _checked(result, corrected)
     inputs = check(
         corrected,

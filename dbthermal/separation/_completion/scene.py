@@ -33,8 +33,8 @@ _LEAST: Final = (0.2, 0.1)
 _SAMPLE: Final = 400
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
-# Stated temperatures below are in degrees Celsius, or no room's [K].
-_COLDEST: Final = 150.0
+# Stated temperatures below are in degrees Celsius, or no room's; above, they are counts [K].
+_COLDEST, _HOTTEST = 150.0, 3000.0
 # Residual, in standard deviations of the noise, from which a result is of another capture.
 _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
@@ -162,11 +162,11 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
     given = laid_on(given, scene.inputs.capture, "surroundings", "the capture")
     values = given.values.astype(np.float64)
     values = values.ravel() if given.dims else values
-    bad = ~((values >= _COLDEST) & (values < np.inf))
+    bad = ~((values >= _COLDEST) & (values <= _HOTTEST))
     if np.any(bad):
         raise ValueError(
-            f"Invalid surroundings {values[bad].flat[0]} K. Must be at least {_COLDEST} K: in "
-            "kelvin, not in degrees Celsius."
+            f"Invalid surroundings {values[bad].flat[0]} K. Must be from {_COLDEST} to {_HOTTEST} "
+            "K: in kelvin, not in degrees Celsius or counts."
         )
     if not 0 < std < np.inf:
         raise ValueError(f"Invalid surroundings_std {std} K. Must be positive.")

@@ -17,6 +17,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
+from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
 from dbthermal.separation._streaming.kernels import APART
@@ -126,8 +127,9 @@ class Stream:
         workers: int = 2,
     ) -> None:
         numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
-        for name, value in {**numbers, "refresh [s]": refresh, "workers": workers}.items():
+        for name, value in {**numbers, "refresh [s]": refresh}.items():
             planck.require_positive(name, value)
+        tiles.require_workers(workers)
         known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
         known["method"] = replace(METHOD, minimum_frames=1, any_bands=False)
@@ -161,7 +163,7 @@ class Stream:
         self._blocks, self._filled, self._now, self._segment = 0, 0, -np.inf, 0
         self._glance: Planes = np.empty(0, np.float32)
         self.lost_frames = 0
-        self._threads = ThreadPoolExecutor(int(workers))
+        self._threads = ThreadPoolExecutor(workers)
         self._result = self._dataset([], [], self._history.status)
         self._warm()
 
