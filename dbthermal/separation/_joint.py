@@ -122,7 +122,11 @@ class Joint:
             squares = [np.tensordot(basis, one[:, part], 1) ** 2 for one in slopes]
             std[:, part] = np.sqrt(factor[part] * std[:, part] ** 2 + sum(squares))
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
-        status[unsettled] |= np.uint32(Status.NOT_CONVERGED)
+        grown = np.isnan(factor)  # without a solution, whatever stands there
+        status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
+        for name in self.result.data_vars:
+            if str(name).startswith(("object", "background", "emissivity")):
+                self.result[name].values[..., grown] = np.nan
 
 
 def solve(

@@ -45,6 +45,8 @@ _MODULES: Final = {
 _COVARIANCE: Final = "emissivity_covariance"
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
+# Deviations by which an emissivity lies outside (0, 1) where the signals are not the model's [1].
+_IMPOSSIBLE: Final = 2.0
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -184,7 +186,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     >>> bool(abs(error).where(result["status"] == 0).median() < 0.3)  # K
     True
     """
-    tiles.require_workers(workers)
+    require_workers(workers)
     if operator.index(seed) < 0:
         raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
     inputs = check(
@@ -243,6 +245,7 @@ def separated(
             each(*side_by_side.regrouped(inputs, survey, regroup))
         else:
             each(inputs, None)
+    _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
@@ -262,6 +265,25 @@ def separated(
         reference_band=str(capture["band"].values[inputs.bands[0]]),
         **({} if inputs.settings is None else {"settings": repr(inputs.settings)}),
     )
+
+
+def _withhold(result: xr.Dataset) -> None:
+    """Withhold objects whose emissivity lies far outside (0, 1), or whose model fails elsewhere."""
+    emissivity, std = result["emissivity"].values, result["emissivity_std"].values
+    outside = np.maximum(emissivity - 1.0, -emissivity) > _IMPOSSIBLE * std
+    status, bits = result["status"].values, schema.Status
+    broken = (status & np.uint32(bits.BANDS_APART | bits.BACKGROUND_NEVER_RESTS)) != 0
+    impossible = (status & np.uint32(bits.NONPHYSICAL_EMISSIVITY)) != 0
+    impossible &= np.any(outside, axis=0) | broken
+    for name in ("object_temperature", "object_temperature_std"):
+        result[name].values[:, impossible] = np.nan
+
+
+def require_workers(workers: Any) -> None:
+    """Refuse a number of threads that is not a whole number from 1 up."""
+    if type(workers) is bool or not isinstance(workers, int | np.integer) or workers < 1:
+        rule = "Must be a whole number, at least 1"
+        raise ValueError(f"Invalid number of workers {workers!r}. {rule}.")
 
 
 def get_method(name: str) -> Method:

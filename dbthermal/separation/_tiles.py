@@ -49,13 +49,6 @@ RANGE_SIGMAS: Final = 5.0
 USELESS: Final = 1e6
 
 
-def require_workers(workers: Any) -> None:
-    """Refuse a number of threads that is not a whole number from 1 up."""
-    if type(workers) is bool or not isinstance(workers, int | np.integer) or workers < 1:
-        rule = "Must be a whole number, at least 1"
-        raise ValueError(f"Invalid number of workers {workers!r}. {rule}.")
-
-
 @dataclass(frozen=True)
 class Pixels:
     """A record of arrays, optional ones among them, whose last axis is the pixel."""

@@ -18,7 +18,7 @@ from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
 from dbthermal.separation._inputs import Method, check
-from dbthermal.separation._solve import solve
+from dbthermal.separation._solve import require_workers, solve
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 _BITS: Final = {
@@ -124,7 +124,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     >>> int(alone["object_temperature"].count()), bool(error.max() < 2.0)  # K
     (0, True)
     """
-    tiles.require_workers(workers)
+    require_workers(workers)
     result = _checked(result, corrected)
     inputs = check(
         corrected,

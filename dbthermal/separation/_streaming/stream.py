@@ -17,7 +17,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
-from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._solve import require_workers
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
 from dbthermal.separation._streaming.kernels import APART
@@ -129,7 +129,7 @@ class Stream:
         numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
         for name, value in {**numbers, "refresh [s]": refresh}.items():
             planck.require_positive(name, value)
-        tiles.require_workers(workers)
+        require_workers(workers)
         known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
         known["method"] = replace(METHOD, minimum_frames=1, any_bands=False)

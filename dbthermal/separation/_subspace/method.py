@@ -97,6 +97,8 @@ _SUSPECT: Final = np.uint32(
 )
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
 _LIKELY: Final = 40.0
+# A step between two pieces is judged by what each tells, without the choice of where it ends [1].
+_AS_GIVEN: Final = (1.0 + smooth.CHANGE_POINT / smooth.PIECE_ORDER) ** -0.5
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
 _MOST_PIECES: Final = 10
 # Polynomials of a piece in a survey: those of a pixel alone, and two larger numbers.
@@ -332,7 +334,7 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
         cost[places] = one.cost[places]
         first[:, suspect[places]] = one.first[:, places]
     jumping = first[:, suspect].any(axis=0) & residuals.sudden(
-        best.object_temperature, best.object_temperature_std, tile.time
+        best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
     # A delay of the bands asks for a piece at each change of the background, which hide it.
