@@ -8,6 +8,7 @@ import xarray as xr
 from test_displaced import GLASS, RIG, SMALL, TIME, field, film
 
 from dbthermal import separation
+from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _joint as joint
 from dbthermal.separation._inputs import Inputs, Labels, check
@@ -97,3 +98,38 @@ def test_cameras_at_one_place_are_regrouped_too() -> None:
     one = separated(inputs, regroup=lambda _: np.zeros(HALVES.size, dtype=np.intp))
     whole = separation.solve(capture, RIG.response(), pool=xr.zeros_like(HALVES))
     xr.testing.assert_identical(one, whole)
+
+
+@pytest.mark.parametrize("wrong", [-1.0, 3.0])
+def test_nothing_stands_where_no_object_fits(plate: tuple[xr.Dataset, ...], wrong: float) -> None:
+    """By a wrong field no temperature is without a deviation, none of an impossible emissivity."""
+    _, capture, _ = plate
+    result = separation.solve(capture, RIG.response(), reflection_shift=field(wrong * SHIFT))
+    for name in ("object_temperature", "background_temperature"):
+        known = result[name].notnull()
+        assert bool((known == result[f"{name}_std"].notnull()).all())
+        print(f"{name}: {float(known.mean()):.3f} of the samples")
+    impossible = (result["status"] & int(Status.NONPHYSICAL_EMISSIVITY)) != 0
+    outside = np.maximum(result["emissivity"] - 1.0, -result["emissivity"])
+    impossible &= (outside > 2.0 * result["emissivity_std"]).any("band")
+    print(f"{int(impossible.sum())} pixels of an impossible emissivity")
+    assert int(impossible.sum()) > 0
+    assert not bool(result["object_temperature"].where(impossible).notnull().any())
+
+
+def test_a_pixel_without_a_solution_has_no_object(plate: tuple[xr.Dataset, ...]) -> None:
+    """Where the equations of both places grow nothing is told of the object, with a flag."""
+    _, capture, alone = plate
+    told = joint.from_result(pooled_inputs(capture, HALVES), alone)
+    factor = np.ones(alone["status"].size)
+    factor[333] = np.nan
+    result = alone.copy(deep=True)
+    replace(told, result=result, factor=factor).finish()
+    place = divmod(333, alone.sizes["x"])
+    assert alone["status"].values[place] == 0
+    assert result["status"].values[place] == int(Status.NOT_CONVERGED)
+    for name in ("object_temperature", "background_temperature", "emissivity"):
+        for one in (name, f"{name}_std"):
+            lost = alone[one].notnull() & result[one].isnull()
+            lost = lost.any([dim for dim in lost.dims if dim not in ("y", "x")])
+            assert np.argwhere(lost.values).tolist() == [list(place)]
