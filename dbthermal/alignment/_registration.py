@@ -143,7 +143,8 @@ def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
     present = np.flatnonzero(~clocks.missing(frames))
     if present.size == 0:
         raise ValueError(
-            f"Invalid view in band '{view['band'].item()}': all {len(frames)} frames are missing."
+            f"Invalid view in band '{view['band'].item()}': all {len(frames)} frames are missing. "
+            "Must have one."
         )
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
     frames = frames[present[chosen]].astype(np.float64)

@@ -20,7 +20,6 @@ from dbthermal.separation import _quality as quality
 from dbthermal.separation._solve import require_workers
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
-from dbthermal.separation._streaming.kernels import APART
 from dbthermal.separation._subspace.method import METHOD
 from dbthermal.separation._subspace.steps import FILMS
 
@@ -126,8 +125,8 @@ class Stream:
         response_kind: str = "exact",
         workers: int = 2,
     ) -> None:
-        numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
-        for name, value in {**numbers, "refresh [s]": refresh}.items():
+        seconds = {"latency [s]": latency, "memory [s]": memory, "refresh [s]": refresh}
+        for name, value in ({"frame_rate [Hz]": frame_rate} | seconds).items():
             planck.require_positive(name, value)
         require_workers(workers)
         known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
@@ -283,7 +282,7 @@ class Stream:
         since = (now - self._now) * self._rate
         if _LOST < since < np.inf:
             self.lost_frames += round(since) - 1
-        if since > APART * self._block:
+        if since > kernels.APART * self._block:
             self._filled = 0
         self._now = now
         step = max(1, min(self._shape) // _GLANCE)
