@@ -1,7 +1,7 @@
 r"""Smooth displacement field over an image: a grid of cubic B-splines with nodes c.
 
 Data with information A about it, the penalty of the second differences q of neighbouring nodes, and
-a wide prior make
+a wide prior of nodes and slopes, R, make
 
 .. math:: (A + \lambda Q^T W Q + R) c = A c_0 + b
 
@@ -28,6 +28,7 @@ _FREEDOM: Final = 3.0  # degrees of freedom of a bending's distribution
 # Penalties that are tried, over the mean information of a node; and over the last one.
 _PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)
 _STEPS: Final = np.array([0.4, 1.0, 2.5])
+_SLOPE: Final = 0.1  # deviation of a field's slope without data, where it goes on level [1]
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,31 @@ class Spline:
         return rows, columns
 
     @cached_property
+    def _differences(self) -> list[list[Array]]:
+        """Differences of order 0, 1 and 2 of the nodes along either side."""
+        return [
+            [np.diff(np.eye(count), order, axis=0) for order in (0, 1, 2)] for count in self.nodes
+        ]
+
+    @cached_property
     def bending(self) -> sparse.csr_array:
         """Second differences of the nodes: down, right, and twice the mixed one."""
-        (row, *rows), (column, *columns) = (
-            [np.diff(np.eye(n), order, axis=0) for order in (0, 1, 2)] for n in self.nodes
-        )
+        (row, *rows), (column, *columns) = self._differences
         mixed = np.sqrt(2.0) * np.kron(rows[0], columns[0])
         parts = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
         return sparse.csr_array(np.concatenate(parts))
+
+    @cached_property
+    def before(self) -> Array:
+        """Information (node, node) before there are data: on each node, and on a level field."""
+        (row, down, _), (column, right, _) = self._differences
+        height, width = (
+            (size - 1) / (count - 3) for size, count in zip(self.shape, self.nodes, strict=True)
+        )
+        level = (
+            np.kron(down.T @ down, column) / height**2 + np.kron(row, right.T @ right) / width**2
+        )
+        return np.eye(len(level)) / self.prior**2 + level / _SLOPE**2
 
     def values(self, centres: list[Array]) -> list[Array]:
         """Splines (place, node) at rows and at columns."""
@@ -83,11 +101,11 @@ class Spline:
         if around is not None:
             target += matrix @ around.nodes
             sharp, trials = around.sharpness, around.penalty * _STEPS
-        ridge, best = np.eye(bends.shape[1]) / self.prior**2, -np.inf
+        best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
-            before = trial * blocks + ridge
+            before = trial * blocks + self.before
             trial_factor = cho_factor(matrix + block_diag(*before))
             trial_nodes = cho_solve(trial_factor, target)
             roots = [np.diagonal(np.linalg.cholesky(before), 0, 1, 2), np.diag(trial_factor[0])]

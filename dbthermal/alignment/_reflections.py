@@ -32,15 +32,11 @@ _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations, and
-# a chi-square by the shorter one's data of no more than so many times what chance makes of it.
+# a chi-square by the shorter one's data of no more than so many times that of the shorter one's own
+# windows: of a field with rims it is 3 to 9, and objects that heat rapidly gave 30 to 8000.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _MORE: Final = 1.25
 _AGREE: Final = 2.25
-# The same for a period up to twice as long, where the shorter one's field is known no better than
-# so [pixel]: among changes of little more than noise it may itself go astray, while an object that
-# heats rapidly was seen to give 30 to 8000.
-_VAGUE: Final = 0.2
-_ASTRAY: Final = 25.0
 _CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
@@ -209,7 +205,7 @@ def _coarse(
     signals, valid = capture.binned(factor)
     reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, result = capture.frames.size, None
-    best, last, before = np.inf, np.inf, None  # of the field that was taken
+    best, before, limit = np.inf, None, np.inf  # of the field that was taken
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -220,13 +216,13 @@ def _coarse(
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        places, variance = level.centres(), _variances(field, data, level)
+        told, squares = _told(data, factor), _squares(data, factor)
+        variance = _variances(field, data, level)
         size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
         # A field of slower changes must fit the data of the more robust one.
-        apart = 0.0 if before is None else begin.disagreement(before, places, field)
-        limit = _ASTRAY if best > _VAGUE and period <= 2.0 * last else _AGREE
-        if _told(data, factor).any() and size < best / _MORE and apart < limit:
-            best, last, before = size, period, data
+        apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
+        if told.any() and size < best / _MORE and apart < limit:
+            best, before, limit = size, data, _AGREE * max(squares[:, told].mean(), 1.0)
             energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             # Those of the largest energy, no more than memory allows.
             most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
@@ -247,17 +243,22 @@ def _told(data: Information, factor: int = 1) -> Mask:
     return np.asarray(largest > 1.0 / _KNOWN**2)
 
 
+def _squares(data: Information, factor: int) -> Array:
+    """Squares (2, y, x) of the steps that windows ask for, over their variances [1]."""
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
+    inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
+    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
+    return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
+
+
 def _variances(field: Field, data: Information, level: Movies) -> Array:
     """
     Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    area, told = 4.0 * np.pi * (matching.WINDOW * level.factor) ** 2, _told(data, level.factor)
-    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
-    inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
-    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
-    squares = steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)
+    told, squares = _told(data, level.factor), _squares(data, level.factor)
     sums = [
         gaussian_filter(part * told, _WIDE / level.factor, axes=(-2, -1))
         for part in (squares, np.ones(told.shape))
