@@ -181,7 +181,7 @@ def _aligned(
             field = _shift(aligned, response)
     if field is None:
         return aligned, None
-    apart = seen_apart(field) and cameras_apart(aligned, response) > 0.0
+    apart = seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0
     return aligned, field if apart else None
 
 

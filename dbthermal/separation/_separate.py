@@ -58,9 +58,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
     Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
     reflections move, with the shift between the cameras' reflections (`alignment.reflection_shift`)
-    if fewer are apart with it; then with the pixels of each material pooled (`materials`), except,
-    of cameras apart, those that only alone have no flag or lie at its border; last, what is still
-    unknown is completed (`complete`).
+    if fewer are apart with it, or more have no flag; then with the pixels of each material pooled
+    (`materials`), except, of cameras apart, those that only alone have no flag or lie at its
+    border; last, what is still unknown is completed (`complete`).
 
     Parameters
     ----------
@@ -178,9 +178,9 @@ def _apart(
     known: xr.Dataset | None,
 ) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
     """First separation, the shift of the reflections if it needs one, and what is not explained."""
-    apart = 0.0
+    apart, good = 0.0, 0.0
     if min(corrected.sizes.get(name, 0) for name in ("y", "x")) >= _WIDE:  # solve refuses others
-        apart = cameras_apart(corrected, response, workers)
+        apart, good = cameras_apart(corrected, response, workers)
     if apart > 0.0:
         try:
             shift = alignment.reflection_shift(corrected, response)
@@ -188,24 +188,32 @@ def _apart(
             shift = None
         if shift is not None and seen_apart(shift):
             alone = one(reflection_shift=shift)
+            # An object that heats rapidly is apart in pixels that are paired by their reflections.
             left, moving = _pixels_apart(alone)
-            if left / moving < apart:
+            if left / moving < apart or _unflagged(alone) > good:
                 return alone, shift, []
     first = one() if known is None else known
     return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
 
 
-def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2) -> float:
-    """Share of some pixels with moving reflections whose bands are apart, 0 if that may be chance.
+def cameras_apart(
+    corrected: xr.Dataset, response: xr.Dataset, workers: int = 2
+) -> tuple[float, float]:
+    """Share of pixels with moving reflections whose bands are apart, 0 if that may be chance.
 
-    All pixels would take long.
+    Of some pixels, for all would take long; and the share of them without a flag.
     """
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
-    some = corrected.isel(y=every, x=every).load()
-    apart, moving = _pixels_apart(solve(some, response, workers=workers))
+    some = solve(corrected.isel(y=every, x=every).load(), response, workers=workers)
+    apart, moving = _pixels_apart(some)
     chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
-    return apart / moving if apart / moving > _APART + chance else 0.0
+    return apart / moving if apart / moving > _APART + chance else 0.0, _unflagged(some)
+
+
+def _unflagged(result: xr.Dataset) -> float:
+    """Share of the pixels without a flag."""
+    return float((result["status"].values == 0).mean())
 
 
 def _pixels_apart(result: xr.Dataset) -> tuple[int, int]:

@@ -161,8 +161,25 @@ def test_fields_of_the_posterior_disagree_as_chance_makes_them() -> None:
     assert far > 25.0
 
 
+def test_goes_on_level_beyond_the_data() -> None:
+    """A slope at the end of the data is not drawn on over the rest of the image."""
+    spline, centres = Spline((60, 80), 30.0), [np.arange(60.0), np.arange(80.0)]
+    right = np.arange(80.0)
+    sloped = 0.1 * np.clip(right - 25.0, 0.0, None)
+    told = 25.0 * (right < 40.0) * np.ones((60, 1))  # [1/pixel^2]
+    tensor = np.stack([told, 0.0 * told, told])
+    data = Information(tensor, tensor[[0, 2]] * sloped)
+    field = spline.fitted(data, centres)
+    found, std = field.on(centres)[1][30], np.sqrt(field.variances(centres)[1][30])
+    drawn_on = sloped[-1] - sloped[39]
+    print(f"{found[39]:.2f} pixel at the end of the data, {found[-1]:.2f} +- {std[-1]:.1f} beyond")
+    assert abs(found[39] - sloped[39]) < 0.1
+    assert abs(found[-1] - found[39]) < 0.5 * drawn_on
+    assert 10.0 * std[39] < std[-1] < 0.1 * right[-1]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [11, 17])
+@pytest.mark.parametrize("seed", [2, 11, 17])
 def test_reflections_that_mostly_change_slowly(seed: int) -> None:
     """In a simulated twin of the wineglass the fastest changes tell little, and lead nobody astray.
 

@@ -7,14 +7,14 @@ import pytest
 import xarray as xr
 from test_displaced import GLASS, RIG, SMALL, TIME, field, film
 
-from dbthermal import separation
+from dbthermal import separation, simulation
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _joint as joint
 from dbthermal.separation._inputs import Inputs, Labels, check
 from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._tiles import Material
-from reproduction.experiments.pictures import smooth_shift
+from reproduction.experiments.pictures import Picture, smooth_shift
 
 SHIFT = smooth_shift(SMALL.shape, 2.4, 1.2)
 HALVES = xr.DataArray(np.repeat([[0, 1]], 24, axis=1) + np.zeros((20, 1), int), dims=("y", "x"))
@@ -133,3 +133,21 @@ def test_a_pixel_without_a_solution_has_no_object(plate: tuple[xr.Dataset, ...])
             lost = alone[one].notnull() & result[one].isnull()
             lost = lost.any([dim for dim in lost.dims if dim not in ("y", "x")])
             assert np.argwhere(lost.values).tolist() == [list(place)]
+
+
+@pytest.mark.slow
+def test_a_rapid_object_does_not_hide_that_cameras_are_apart() -> None:
+    """Paired by their reflections, more pixels show the object apart, and yet more have no flag."""
+    rng, picture = np.random.default_rng(1), Picture((40, 56), 6, rise=(0.5, 2.0), still=0.5)
+    nearly_black = GLASS.copy(data=[0.95, 0.88])
+    true = smooth_shift(picture.shape, 4.2, 1.0)
+    scene = picture.draw(np.arange(200) / 10.0, nearly_black, rng, true)
+    result = separation.separate(simulation.observe(scene, RIG.response(), rng), RIG.response())
+    good = result["status"] == 0
+    error = abs(result["object_temperature"] - scene["object_temperature"]).where(good)
+    inside = (error < 1.96 * result["object_temperature_std"]).where(good)
+    print(f"{float(good.mean()):.2f} without a flag, median error {float(error.median()):.2f} K")
+    print(f"{float(inside.mean()):.3f} of the intervals hold")
+    assert result.attrs["reflection_shift"] == "found"
+    assert good.mean() > 0.3
+    assert inside.mean() > 0.9
