@@ -42,7 +42,7 @@ def test_the_table_says_what_was_measured() -> None:
         "| peak memory over `memory=1e+09` | 0.80 |",
         "| rate of 2 processes over one, the same capture | 1.80 |",
         "| rate of 2 processes over one, 2 times the rows | 1.80 |",
-        "| `calibrated` | 2000000 | 2 | 1.00 (512 to 2048) | 2.00 (100 to 1000) | 1.5 |",
+        "| 2000000 | 2 | 1.00 (512 to 2048), 1.00 (128 to 2048) | 2.00 (100 to 1000) | 1.5 |",
         "| tensors on GPU | 60 | 0.47 | 10 % |",
         "| a day at 60 Hz | 24 h | 2 h | 13.6 TB | 27.2 TB |",
     ):
