@@ -9,7 +9,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,8 +37,20 @@ _LOST_WEIGHT: Final = 0.25
 _AROUND: Final = 5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
+# Memory of samples that are kept, for a capture is read some twenty times [byte].
+_KEPT: Final = 2**29
 # Deviations of the blur beyond which it has no weight.
 TAIL: Final = 3.0
+
+
+class Paired(NamedTuple):
+    """Some rows as `read` and `quality.bridge` give them."""
+
+    counts: Array  # (band, time, pixel) [count]
+    usable: Mask  # valid samples, and those that are bridged (time, pixel)
+    valid: Mask
+    status: Bits  # (pixel)
+    gain: Array  # (2, pixel) [1]
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,7 @@ class Displacement:
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
     found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
+    read: dict[Hashable, "Paired"] = field(default_factory=dict)  # see `paired`
 
     def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
         """Return what was computed for a key before: a capture is read many times."""
@@ -180,6 +193,28 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
     ]
     index = first.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis]
     return np.clip(index, 0, size - 1), np.stack(weight)
+
+
+def paired(
+    block: xr.Dataset,
+    displacement: Displacement,
+    rows: slice,
+    source: slice,
+    fewest: int,
+    grains: list[samples.Grain],
+) -> Paired:
+    """Some rows as `read`, with their short gaps bridged; kept for the next time."""
+    key, films = (rows.start, rows.stop, displacement.blur), displacement.read
+    if key not in films:
+        time = block["time"].values.astype(np.float64)
+        counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, time)
+        found = Paired(counts, usable, valid, status, gain)
+        if sum(one.nbytes for film in (found, *films.values()) for one in film) > _KEPT:
+            return found
+        films[key] = found
+    kept = films[key]  # the tile is made of the counts, in place
+    return kept._replace(counts=kept.counts.copy(), status=kept.status.copy())
 
 
 def read(

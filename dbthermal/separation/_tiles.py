@@ -294,11 +294,11 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
             view = block.isel(y=local, x=window[1])
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
+            counts, usable = quality.bridge(counts, valid, time)
         else:
-            counts, valid, status, gain = displaced.read(
+            counts, usable, valid, status, gain = displaced.paired(
                 block, displacement, window[0], source, method.minimum_frames, grains
             )
-        counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
