@@ -45,8 +45,6 @@ _MODULES: Final = {
 _COVARIANCE: Final = "emissivity_covariance"
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
-# Deviations by which an emissivity lies outside (0, 1) where the signals are not the model's [1].
-_IMPOSSIBLE: Final = 2.0
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -245,7 +243,8 @@ def separated(
             each(*side_by_side.regrouped(inputs, survey, regroup))
         else:
             each(inputs, None)
-    _withhold(result)
+    if inputs.method.survey:
+        _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
@@ -268,13 +267,8 @@ def separated(
 
 
 def _withhold(result: xr.Dataset) -> None:
-    """Withhold objects whose emissivity lies far outside (0, 1), or whose model fails elsewhere."""
-    emissivity, std = result["emissivity"].values, result["emissivity_std"].values
-    outside = np.maximum(emissivity - 1.0, -emissivity) > _IMPOSSIBLE * std
-    status, bits = result["status"].values, schema.Status
-    broken = (status & np.uint32(bits.BANDS_APART | bits.BACKGROUND_NEVER_RESTS)) != 0
-    impossible = (status & np.uint32(bits.NONPHYSICAL_EMISSIVITY)) != 0
-    impossible &= np.any(outside, axis=0) | broken
+    """Withhold objects whose emissivity lies outside (0, 1): rapid changes were no reflection's."""
+    impossible = (result["status"].values & np.uint32(schema.Status.NONPHYSICAL_EMISSIVITY)) != 0
     for name in ("object_temperature", "object_temperature_std"):
         result[name].values[:, impossible] = np.nan
 

@@ -49,8 +49,9 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
 
     .. math:: p(x, e, c, f \mid z) \propto p(z \mid x, e, c, f) \, p(e) \, p(c) \, p(f)
 
-    The emissivities are those of the pixel, where measured; else those of its material elsewhere;
-    else of the `prior`. Near black, the result tends to the camera's own reading.
+    The emissivities are those of the pixel, where measured; else those of its material elsewhere,
+    if the pixel does not contradict them by three deviations; else of the `prior`. Near black, the
+    result tends to the camera's own reading.
 
     Parameters
     ----------
@@ -197,11 +198,18 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
         tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
         wanted = valid.any(axis=0) & lacking[local].ravel()
         sources = np.where(wanted, scene.source[places], -1)
-        for source in np.unique(sources[wanted]):
+        for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
             here = sources == source
+            if not here.any():
+                continue
             part = (tile.select_pixels(here), valid[:, here])
-            values, _ = scenes.solve(scene, *part, int(source), places[here])
-            _fill(scene, completed, places[here], values, int(source))
+            values, _ = scenes.solve(scene, *part, source, places[here])
+            if source == scenes.MATERIAL:
+                kept = ~scenes.contradicted(scene, values, places[here])
+                sources[here] = np.where(kept, source, scenes.PRIOR)
+                values = {name: value[..., kept] for name, value in values.items()}
+                here = sources == source
+            _fill(scene, completed, places[here], values, source)
 
 
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:

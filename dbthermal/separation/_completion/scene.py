@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from scipy.special import chdtri
 
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
@@ -35,6 +36,8 @@ _SAMPLE: Final = 400
 _FEWEST: Final = 4
 # Stated temperatures below are in degrees Celsius, or no room's; above, they are counts [K].
 _COLDEST, _HOTTEST = 150.0, 3000.0
+# Chance by which a pixel tells other emissivities than its material's: of three deviations.
+_CHANCE: Final = 0.0027
 # Residual, in standard deviations of the noise, from which a result is of another capture.
 _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
@@ -211,6 +214,15 @@ def solve(
             values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
     told = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
     return values, np.array(np.broadcast_arrays(*told))
+
+
+def contradicted(scene: Scene, values: Values, places: Whole) -> Mask:
+    """Completed pixels that tell other emissivities than their material has, by chi-square."""
+    off = (values["emissivity"] - scene.emissivity[:, places]).T[..., np.newaxis]
+    bands = off.shape[1]
+    covariance = np.moveaxis(scene.covariance[..., places], -1, 0) + _NOTHING * np.eye(bands)
+    square = (off * np.linalg.solve(covariance, off)).sum(axis=(1, 2))
+    return np.asarray(square > chdtri(bands, _CHANCE))
 
 
 def find_level(scene: Scene) -> Level:
