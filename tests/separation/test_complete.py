@@ -12,6 +12,9 @@ from test_displaced import field
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation
 from dbthermal.schema import Status
+from dbthermal.separation._completion.scene import contradicted, gather
+from dbthermal.separation._inputs import check
+from dbthermal.separation._solve import get_method
 from dbthermal.simulation import Rig, observe
 from reproduction.experiments.pictures import ROOM, Picture
 
@@ -73,6 +76,25 @@ def test_material_elsewhere_completes_within_noise(half: Case) -> None:
     assert cover > 0.9
     still = whole["status"].where(missing.any("time"), 0).astype(int)
     assert bool((((still & int(Status.COMPLETED_FROM_MATERIAL)) != 0) | (still == 0)).all())
+
+
+def test_pixels_that_are_not_of_their_material_contradict_it(half: Case) -> None:
+    """By chance 0.3 % do; and those whose ratio of emissivities is off, each within a deviation."""
+    _, capture, alone = half
+    inputs = check(capture, RESPONSE, get_method("subspace"), "subspace")
+    rng, places = np.random.default_rng(5), np.arange(480)
+    covariance = np.array([[9.0, 8.5], [8.5, 10.0]]) * 1e-4
+    scene = replace(
+        gather(inputs, alone, alone, None),
+        emissivity=np.full((2, places.size), [[0.86], [0.72]]),
+        covariance=np.repeat(covariance[..., np.newaxis], places.size, axis=-1),
+    )
+    drawn = rng.multivariate_normal([0.86, 0.72], covariance, (100, places.size))
+    chance = [contradicted(scene, {"emissivity": one.T}, places).mean() for one in drawn]
+    other = {"emissivity": scene.emissivity + np.array([[0.03], [-0.03]])}
+    print(f"{100.0 * np.mean(chance):.2f} % by chance")
+    assert np.mean(chance) == pytest.approx(0.0027, rel=0.3)
+    assert contradicted(scene, other, places).all()
 
 
 def test_few_pixels_tell_no_material(half: Case) -> None:
