@@ -103,7 +103,7 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
         field, data = matching.refine(level, field)
         if factor == 1:
             # The delay is seen in slower changes, too, in which there is more than noise.
-            spread = _variances(field, data, level)
+            spread = _variances(field, level, _told(data), _squares(data))
             period = max(period, _PERIODS[2])
             freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
             pictures = capture.rapid(period, used)
@@ -217,7 +217,7 @@ def _coarse(
             continue
         field, data = matching.refine(level, begin)
         told, squares = _told(data, factor), _squares(data, factor)
-        variance = _variances(field, data, level)
+        variance = _variances(field, level, told, squares)
         size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
         # A field of slower changes must fit the data of the more robust one.
         apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
@@ -243,7 +243,7 @@ def _told(data: Information, factor: int = 1) -> Mask:
     return np.asarray(largest > 1.0 / _KNOWN**2)
 
 
-def _squares(data: Information, factor: int) -> Array:
+def _squares(data: Information, factor: int = 1) -> Array:
     """Squares (2, y, x) of the steps that windows ask for, over their variances [1]."""
     area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
     tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
@@ -252,13 +252,12 @@ def _squares(data: Information, factor: int) -> Array:
     return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
 
 
-def _variances(field: Field, data: Information, level: Movies) -> Array:
+def _variances(field: Field, level: Movies, told: Mask, squares: Array) -> Array:
     """
     Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    told, squares = _told(data, level.factor), _squares(data, level.factor)
     sums = [
         gaussian_filter(part * told, _WIDE / level.factor, axes=(-2, -1))
         for part in (squares, np.ones(told.shape))
