@@ -116,7 +116,9 @@ def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
     known = field["known"].values
     size = np.array(shift.shape[1:])
     finite = np.all(schema.measured(shift), axis=0)
-    if np.any(known & ~finite) or not np.any(finite):
+    if not np.any(finite):
+        raise ValueError(f"Invalid {label[4:]} without a number. Must be finite somewhere.")
+    if np.any(known & ~finite):
         raise ValueError(f"Invalid {label[4:]}: no number where it is known. Must be finite there.")
     if np.any(~(std[:, finite] >= 0) | ~schema.measured(std[:, finite])):
         raise ValueError(f"Invalid shift_std of {label}. Must be zero or positive, and finite.")

@@ -250,7 +250,10 @@ def _mean(
     variant: Mapping[str, Any],
     shift: xr.Dataset | None,
 ) -> xr.DataArray:
-    """Object temperature (time) [K] of one method, mean over the bead's pixels."""
+    """Object temperature (time) [K] of one method, mean over the bead's pixels.
+
+    It is NaN where the shift of the reflections is known nowhere around the bead.
+    """
     options = arguments(variant)
     if shift is not None and variant["method"] in SHIFTED:
         options["reflection_shift"] = shift
@@ -263,7 +266,9 @@ def _mean(
         }
         seen = corrected.isel(around)
         if reach:
-            options["reflection_shift"] = options["reflection_shift"].isel(around)
+            nearby = options["reflection_shift"] = options["reflection_shift"].isel(around)
+            if not bool(nearby["shift"].notnull().any()):
+                return corrected["time"].astype(np.float64) * np.nan
     estimates = separation.solve(seen, response, **options)["object_temperature"]
     bead = {dim: corrected[dim][part] for dim, part in square.items()}
     return estimates.sel(bead).mean(("y", "x"), skipna=False)
