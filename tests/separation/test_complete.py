@@ -368,28 +368,22 @@ def test_bands_of_no_library_are_refused_before_the_work() -> None:
     assert bool(separation.separate(other, response, prior=prior)["object_temperature"].any())
 
 
-FIVE: dict[str, tuple[Picture, tuple[float, ...]]] = {
+FOUR: dict[str, tuple[Picture, tuple[float, ...]]] = {
     "glass, half still": (Picture(shape=(36, 48), still=0.5), (0.86, 0.72)),
     "0.95/0.85, people 3 K above": (Picture(shape=(36, 48), warmer=(3.0, 3.0)), (0.95, 0.85)),
     "0.98/0.95": (Picture(shape=(36, 48)), (0.98, 0.95)),
     "glass, nobody": (replace(NOBODY, shape=(24, 32)), (0.86, 0.72)),
-    "of the libraries, nobody": (replace(NOBODY, shape=(12, 16)), ()),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FIVE)
+@pytest.mark.parametrize("name", FOUR)
 def test_whole_pictures_hold(name: str) -> None:
     """One call: 99 % finite, intervals hold, measured and completed, no worse than the reading."""
-    picture, emissivity = FIVE[name]
-    table = emissivity_module.embedded_table()["emissivity"].sel(band=list(RIG.bands))
+    picture, emissivity = FOUR[name]
     covers: dict[str, list[float]] = {"measured": [], "completed": []}
-    worse = []
-    seeds = range(3) if emissivity else range(10)
-    for seed in seeds:
-        rng = np.random.default_rng(100 + seed)
-        material = table.isel(material=int(rng.integers(table.sizes["material"]))).values
-        scene, capture, _ = draw(picture, 100 + seed, *(emissivity or material))
+    for seed in range(3):
+        scene, capture, _ = draw(picture, 100 + seed, *emissivity)
         whole = separation.separate(capture, RESPONSE)
         error = abs(whole["object_temperature"] - scene["object_temperature"])
         within = error < 1.96 * whole["object_temperature_std"]
@@ -401,7 +395,7 @@ def test_whole_pictures_hold(name: str) -> None:
             if bool(part.any()):
                 covers[label].append(float(within.where(part).mean()))
         medians = [float(one.where(completed).median()) for one in (error, apart)]
-        worse.append(medians[0] > medians[1])
+        assert not medians[0] > medians[1]
         print(
             f"{name}, seed {seed}: {float(error.median()):.3f} K, reading "
             f"{float(apart.median()):.3f} K; completed {float(completed.mean()):.2f}: "
@@ -412,5 +406,40 @@ def test_whole_pictures_hold(name: str) -> None:
         assert 0.9 <= np.mean(covers["measured"]) <= 0.98
     if covers["completed"]:
         assert np.mean(covers["completed"]) >= 0.9
+
+
+@pytest.mark.slow
+def test_unknown_materials_hold() -> None:
+    """Nobody walks before materials of the libraries: intervals hold over these, of each or none.
+
+    What completes the pixels of one material, of which nothing is measured, is one prior: its error
+    is that of all of them.
+    """
+    mixture, rng = emissivity_module.library_mixture(list(RIG.bands)), np.random.default_rng(31)
+    parts = mixture["weight"].values, mixture["mean"].values, mixture["covariance"].values
+    covers, errors = [], []
+    while len(covers) < 200:
+        part = rng.choice(parts[0].size, p=parts[0])
+        material = rng.multivariate_normal(parts[1][part], parts[2][part])
+        if not np.all((material > 0.02) & (material < 0.999)):
+            continue
+        scene, capture, alone = draw(replace(NOBODY, shape=(4, 6)), len(covers), *material)
+        whole = separation.complete(alone, capture, RESPONSE)
+        reading = separation.solve(capture, RESPONSE, "apparent")
+        off = [
+            abs(one["object_temperature"] - scene["object_temperature"]) for one in (whole, reading)
+        ]
+        assert bool(off[0].notnull().all())
+        covers.append(float((off[0] < 1.96 * whole["object_temperature_std"]).mean()))
+        errors.append([float(one.median()) for one in off])
+    worse = np.array([completed > read for completed, read in errors])
+    median = np.median(errors, axis=0)
+    more = max(completed / read for completed, read in errors)
+    print(
+        f"{len(covers)} materials: intervals hold {np.mean(covers):.3f}; {median[0]:.3f} K, reading "
+        f"{median[1]:.3f} K; farther off than that in {worse.mean():.3f}, at most {more:.2f} times"
+    )
+    assert 0.9 <= np.mean(covers) <= 0.99
     # A prior is wrong of one material in twenty.
-    assert np.mean(worse) <= (0.0 if emissivity else 0.2)
+    assert worse.mean() <= 0.1
+    assert median[0] < 0.6 * median[1]
