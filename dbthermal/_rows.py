@@ -13,6 +13,8 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from dbthermal._films import empty, made_on_disk, release
+
 Values = npt.NDArray[Any]
 
 _BLOCK: Final = 2**24  # samples of a block that is computed at once
@@ -40,9 +42,19 @@ class _Rows(BackendArray):
             if wanted.size:
                 first, last = rows[wanted].min(), rows[wanted].max()
                 values = self._compute(slice(int(first), int(last) + 1))
-                result[..., wanted, :] = values[np.ix_(*others, rows[wanted] - first, columns)]
+                for axis, one in enumerate((*others, rows[wanted] - first, columns)):
+                    values = values[(slice(None),) * axis + (_even(one),)]
+                result[..., _even(wanted), :] = values
         whole = (slice(None) if place.ndim else 0 for place in places)
         return np.asarray(result[tuple(whole)])
+
+
+def _even(places: Values) -> Any:
+    """Slice of rising places of one step, which copies nothing; others as they are."""
+    steps = np.unique(np.diff(places))
+    if places.size == 0 or steps.size > 1 or np.any(steps < 1):
+        return places
+    return slice(int(places[0]), int(places[-1]) + 1, int(steps[0]) if steps.size else 1)
 
 
 def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
@@ -54,7 +66,25 @@ def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
 
 
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
-    """Array (..., y, x) as another, with its coordinates and attributes, computed by rows."""
-    array = _Rows(compute, like.shape)
+    """Array (..., y, x) as another, with its coordinates and attributes, computed by rows.
+
+    Where films are made on disk it is computed once, and read from there.
+    """
+    array = _Rows(_once(compute, like.shape) if made_on_disk() else compute, like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)
+
+
+def _once(compute: Callable[[slice], Values], shape: tuple[int, ...]) -> Callable[[slice], Values]:
+    """Return the function of rows that reads what another one has computed."""
+    film = empty(shape, _Rows.dtype)
+    for rows in blocks(shape):
+        film[..., rows, :] = compute(rows)
+        release()
+
+    def read(rows: slice) -> Values:
+        values = film[..., rows, :].copy()
+        release()
+        return values
+
+    return read

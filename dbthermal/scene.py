@@ -1,7 +1,7 @@
 """A scene as two cameras record it: from raw counts to temperatures in one call.
 
 `separate_capture` does in their order what `correction`, `alignment` and `separation` do step by
-step. With a target on disk it works by rows, in the memory of some of them.
+step. With a target on disk its films are there, too, and it works in the memory of some rows.
 """
 
 from collections.abc import Mapping
@@ -14,14 +14,14 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import _rows, schema, store
+from dbthermal._films import made_on_disk, on_disk, release
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
-from dbthermal.separation._inputs import check
 from dbthermal.separation._separate import cameras_apart
-from dbthermal.separation._solve import get_method
+from dbthermal.store._results import check_place
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
@@ -34,11 +34,6 @@ _REGISTERED: Final = 200
 # Times that clock and shift of the reflections are estimated in turn, at most, the step of the
 # clock at which that ends [frame], and the least share of a delay that is taken to be seen [1].
 _ROUNDS, _LATE, _FLAT = 6, 0.02, 0.125
-# Memory of the rows that are separated together [byte], and fewest rows; rows around them, in
-# multiples of the shift.
-_MEMORY, _FEWEST, _SHIFTS = 2_500_000_000, 4, 4.0
-SAMPLE: Final = 220
-"""Memory that a sample of a pixel takes at most while it is separated [byte]."""
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
@@ -80,9 +75,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         Options by name of `correction.correct_capture`, `alignment.align` and
         `separation.separate`, such as ``{"offset": 0.0}`` [s] for cameras with one clock.
     target : str or Path, optional
-        Folder ``*.zarr`` for the result. It is then separated and written by blocks of rows, in
-        some 3 GB beside the raw counts; materials are found, and pooled, within a block, of 6 rows
-        for 2100 frames of 640 columns.
+        Folder ``*.zarr`` for the result. What is computed on the way is then in files beside it,
+        which vanish with the process: some 64 bytes for each pixel and frame.
     provenance : mapping, optional
         For the `target`, see `store.save`.
 
@@ -114,41 +108,50 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> bool(abs(error).median() < 0.3)  # K
     True
     """
-    lazy = target is not None
+    if target is None:
+        return _whole(capture, correction, response, registration, correcting, aligning, separating)
+    check_place(target, ".zarr")
+    place = Path(target).absolute().parent
+    place.mkdir(parents=True, exist_ok=True)
+    with on_disk(place):
+        result = _whole(
+            capture, correction, response, registration, correcting, aligning, separating
+        )
+        blocks = _rows.blocks(result["object_temperature"].shape)
+        parts = (_let_go(result.isel(y=rows)) for rows in blocks)
+        store.save_rows(parts, target, provenance or store.provenance({}))
+    return store.open_dataset(target)
+
+
+def _let_go(part: xr.Dataset) -> xr.Dataset:
+    """Rows of a result, when those before need no more memory."""
+    release()
+    return part
+
+
+def _whole(
+    capture: xr.Dataset,
+    correction: xr.Dataset,
+    response: xr.Dataset,
+    registration: Literal["translation", "affine", "homography"] | None,
+    correcting: Mapping[str, Any],
+    aligning: Mapping[str, Any],
+    separating: Mapping[str, Any],
+) -> xr.Dataset:
+    """All steps, see `separate_capture`; films are where films are made."""
+    lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
         some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
         transform = register(corrected.isel(time=some), model=registration)
         aligning = {**aligning, "transform": transform}
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
-    if lazy:  # one noise for all blocks of rows
-        response = check(aligned, response, get_method("subspace"), "subspace").response
+    del corrected
+    result = separate(aligned, response, **{"reflection_shift": field, **separating})
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
-    halo = 1  # rows around others from which their object is told
-    if field is not None:
-        halo += int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))
-
-    def separated(rows: slice) -> xr.Dataset:
-        """Some rows of the result."""
-        around = slice(max(0, rows.start - halo), rows.stop + halo)
-        own = slice(rows.start - around.start, rows.stop - around.start)
-        shift = None if field is None else field.isel(y=around)
-        part = aligned.isel(y=around).load()
-        result = separate(part, response, **{"reflection_shift": shift, **separating})
-        if target is not None:  # known of these rows alone
-            del result.attrs["frames_missing"], result.attrs["frames_bridged"]
-        maps = {} if shift is None else {"reflection_shift": shift["shift"]}
-        return result.assign(maps).isel(y=own).assign_attrs(attrs)
-
-    if target is None:
-        return separated(slice(0, aligned.sizes["y"]))
-    counts = aligned["counts"]
-    rows = _MEMORY // (SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]) - 2 * halo
-    samples = max(_FEWEST, rows) * counts.size // aligned.sizes["y"]
-    blocks = _rows.blocks(counts.shape, samples)
-    store.save_rows(map(separated, blocks), target, provenance or store.provenance({}))
-    return store.open_dataset(target)
+    maps = {} if field is None else {"reflection_shift": field["shift"]}
+    return result.assign(maps).assign_attrs(attrs)
 
 
 def _aligned(

@@ -1,5 +1,6 @@
 """Equations of the object of all pixels, of which each camera sees another place, see `_joint`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -9,7 +10,11 @@ import xarray as xr
 from numpy.polynomial import Polynomial
 from scipy.sparse import csr_array, diags_array
 
+from dbthermal import _smooth as smooth
+from dbthermal import schema
+from dbthermal._arrays import Array as Signal
 from dbthermal.response import Curve
+from dbthermal.separation import _quality as quality
 from dbthermal.separation._displaced import without
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
@@ -28,6 +33,10 @@ _LARGEST: Final = 0.95
 _MARGIN: Final = 0.02
 # Degree of the polynomial that the bend between two responses is.
 _DEGREE: Final = 4
+# Rows of the capture that are read at once.
+_ROWS: Final = 32
+# Smooth functions of the change beside a pixel that is not solved.
+_ORDER: Final = 14
 
 
 @dataclass(frozen=True)
@@ -178,3 +187,72 @@ def _bends(curves: list[Curve]) -> list[Polynomial]:
     own = first.signal(temperature)
     place = own - first.reference
     return [Polynomial.fit(place, one.signal(temperature) - own, _DEGREE) for one in curves[1:]]
+
+
+def bridge(film: Array, solved: Mask) -> Array:
+    """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
+    frames = np.arange(len(film))
+    for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
+        known = np.isfinite(film[:, pixel])
+        if known.any():
+            film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
+    return film
+
+
+def first_band(
+    inputs: Inputs, loose: Whole, frames: Whole
+) -> tuple[Signal, Signal, Callable[[slice | Whole], Array], Array]:
+    """
+    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
+
+    Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
+    frame) [K], of any frames, and its variance (loose): smoothed over time, it is that of
+    e_1 u_1(x) and holds little of that of the reflection. Bad pixels have no part in it.
+    """
+    displacement, capture = inputs.displacement, inputs.capture
+    assert displacement is not None
+    (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
+    segment = capture["segment"].values if "segment" in capture else None
+    time = capture["time"].values
+    functions = smooth.subspace(time, min(_ORDER, time.size // 4), segment=segment)
+    basis, own = functions.functions, functions.object_part
+    first, steps = np.empty((2, frames.size, height * width))
+    change, unknown = np.zeros((loose.size, basis.shape[1])), np.zeros(loose.size, dtype=bool)
+    (energy, lagged), largest = np.zeros((2, loose.size)), 0.0
+    for top in range(0, height, _ROWS):
+        rows = slice(top, min(top + _ROWS, height))
+        source, chosen = displacement.source(rows), (loose // width >= top)
+        chosen &= loose // width < rows.stop
+        counts = capture["counts"].isel(band=displacement.reference, y=source).values
+        counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
+        signal = curve.linearise(counts) - curve.reference
+        inside = slice((top - source.start) * width, (rows.stop - source.start) * width)
+        here = slice(top * width, rows.stop * width)
+        first[:, here] = signal[frames, inside]
+        both = np.nan_to_num(bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
+        steps[:, here] = (basis - own)[frames] @ (both[inside] @ basis).T
+        at = displacement.weights(rows, source)[loose[chosen] - top * width]
+        *_, flags = quality.read(capture.isel(band=[displacement.reference], y=source))
+        bad = quality.unusable(flags)
+        at = without(at, bad, width)
+        unknown[chosen] = abs(at) @ bad > 0.0
+        moved = at @ both - both[loose[chosen] - source.start * width]
+        moved[unknown[chosen]] = 0.0
+        fitted = moved @ basis
+        error = moved - fitted @ basis.T
+        energy[chosen] = (error**2).sum(axis=1)
+        lagged[chosen] = (error[:, 1:] * error[:, :-1]).sum(axis=1)
+        change[chosen] = fitted
+        largest = max(largest, np.max((fitted @ own.T) ** 2, initial=0.0))
+    # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
+    lagged = np.clip(lagged / energy, 0.0, 0.98)
+    variance = energy * basis.shape[1] / time.size**2 * (1.0 + lagged) / (1.0 - lagged)
+    # One that is not known, beside bad pixels, may be as large as any other.
+    variance[unknown] = np.max(first**2, initial=0.0) if unknown.all() else largest
+    # A sample that is no measurement is an outlier of the regression.
+    return (
+        np.nan_to_num(first),
+        steps,
+        lambda some: change @ own[some].T,
+        np.nan_to_num(variance),
+    )

@@ -29,14 +29,12 @@ from numpy.polynomial import Polynomial
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal import schema
 from dbthermal._arrays import Array as Signal
+from dbthermal._films import copied, empty, release
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _equations as system
 from dbthermal.separation import _neighbours as neighbours
-from dbthermal.separation import _quality as quality
-from dbthermal.separation._displaced import without
 from dbthermal.separation._equations import Array, Mask, Whole
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
@@ -90,8 +88,11 @@ class Joint:
 
     def kept(self) -> "Joint":
         """Return it with films of its own: those of the result may be written anew."""
-        films = self.result[["object_temperature", "background_temperature"]]
-        return replace(self, result=films.copy(deep=True))
+        own = {
+            name: (("time", "y", "x"), copied(self.result[name].values))
+            for name in ("object_temperature", "background_temperature")
+        }
+        return replace(self, result=xr.Dataset(own))
 
     def finish(self) -> None:
         """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
@@ -101,8 +102,11 @@ class Joint:
         background = self.result["background_temperature"].values
         basis = smooth.subspace(time, min(_ORDER, time.size // 4)).functions
         parts = [slice(top, top + _ROWS) for top in range(0, len(status), _ROWS)]
-        films = (background[:, part].reshape(time.size, -1).astype(np.float64) for part in parts)
-        every = [basis.T @ _bridge(film, np.ones(film.shape[1], dtype=bool)) for film in films]
+        every = []
+        for part in parts:
+            film = background[:, part].reshape(time.size, -1).astype(np.float64)
+            every.append(basis.T @ system.bridge(film, np.ones(film.shape[1], dtype=bool)))
+            release()
         curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
         # Beside a pixel without a background it is taken to go on.
         lost = np.isnan(curves[0])
@@ -121,12 +125,14 @@ class Joint:
         for part in parts:
             squares = [np.tensordot(basis, one[:, part], 1) ** 2 for one in slopes]
             std[:, part] = np.sqrt(factor[part] * std[:, part] ** 2 + sum(squares))
+            release()
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
         status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
         for name in self.result.data_vars:
             if str(name).startswith(("object", "background", "emissivity")):
                 self.result[name].values[..., grown] = np.nan
+            release()
 
 
 def solve(
@@ -153,9 +159,10 @@ def solve(
         )
         raw = system.first_emissivity(inputs, result)
         solved = np.all(np.isfinite(raw), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
+        release()
         equations = system.equations(inputs, system.inside(raw), solved)
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
-        first, steps, change, variance = _first_band(inputs, equations.loose, some)
+        first, steps, change, variance = system.first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
         weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
         weights = np.where(solved, weights, 0.0)
@@ -166,7 +173,7 @@ def solve(
             return np.asarray(np.sum(weights.T[:, np.newaxis] * apart, axis=2))
 
         both = partial(_both, curve, solved, system.coefficients(inputs, raw, solved))
-        looked_at = partial(both, _bridge(film[some], solved), moved(some), change[:, some])
+        looked_at = partial(both, system.bridge(film[some], solved), moved(some), change(some))
         here, beside, _ = looked_at(equations)
         # In units of the deviation or, of a method without one, of the noise.
         std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
@@ -183,17 +190,19 @@ def solve(
                 inputs, result, raw, solved, equations, looked_at, (first, steps)
             )
             here, beside, _ = looked_at(equations)
-        _bridge(film, solved)
+        system.bridge(film, solved)
+        release()
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
         results = threads.map(
-            lambda part: both(film[part], moved(part), change[:, part], equations), parts
+            lambda part: both(film[part], moved(part), change(part), equations), parts
         )
         for part, (*pair, step) in zip(parts, results, strict=True):
             film[part], there[part] = (
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * system.CONVERGED
+            release()
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
@@ -206,18 +215,19 @@ def solve(
 def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     """Object of both places of a result that is solved already."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = result["object_temperature"].values.reshape(result.sizes["time"], -1).copy()
+        film = copied(result["object_temperature"].values).reshape(result.sizes["time"], -1)
         emissivity = system.inside(system.first_emissivity(inputs, result))
         solved = np.all(np.isfinite(emissivity), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
         equations = system.equations(inputs, emissivity, solved)
-        change = _first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
-        curve, there = inputs.curves[inputs.bands[0]], np.empty_like(film)
-        _bridge(film, solved)
+        change = system.first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
+        curve, there = inputs.curves[inputs.bands[0]], empty(film.shape, film.dtype)
+        system.bridge(film, solved)
         for at in range(0, len(film), _FRAMES):
             part = slice(at, at + _FRAMES)
             signal = np.where(solved, curve.signal(film[part]) - curve.reference, 0.0).T
-            other = equations.beside(signal, change[:, part]).T + curve.reference
+            other = equations.beside(signal, change(part)).T + curve.reference
             there[part] = np.where(solved, curve.temperature(other), np.nan)
+            release()
     shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
     films = {
         name: (("time", "y", "x"), part.reshape(shape))
@@ -299,67 +309,6 @@ def _slope(abscissa: Array, ordinate: Array) -> Array:
     abscissa = abscissa - abscissa.mean(axis=1, keepdims=True)
     slope = (abscissa * ordinate).sum(axis=1) / (abscissa**2).sum(axis=1)
     return np.where(np.isfinite(slope), slope, 1.0)
-
-
-def _bridge(film: Array, solved: Mask) -> Array:
-    """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
-    frames = np.arange(len(film))
-    for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
-        known = np.isfinite(film[:, pixel])
-        if known.any():
-            film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
-    return film
-
-
-def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Signal, Array, Array]:
-    """
-    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
-
-    Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
-    time) [K] and its variance (loose): smoothed over time, it is that of e_1 u_1(x) and holds
-    little of that of the reflection. Bad pixels have no part in it.
-    """
-    displacement, capture = inputs.displacement, inputs.capture
-    assert displacement is not None
-    (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
-    change, unknown = (
-        np.zeros((loose.size, capture.sizes["time"])),
-        np.zeros(loose.size, dtype=bool),
-    )
-    segment = capture["segment"].values if "segment" in capture else None
-    order = min(_ORDER, change.shape[1] // 4)
-    functions = smooth.subspace(capture["time"].values, order, segment=segment)
-    basis, own = functions.functions, functions.object_part
-    first, steps = np.empty((2, frames.size, height * width))
-    for top in range(0, height, _ROWS):
-        rows = slice(top, min(top + _ROWS, height))
-        source, chosen = displacement.source(rows), (loose // width >= top)
-        chosen &= loose // width < rows.stop
-        counts = capture["counts"].isel(band=displacement.reference, y=source).values
-        counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
-        signal = curve.linearise(counts) - curve.reference
-        inside = slice((top - source.start) * width, (rows.stop - source.start) * width)
-        here = slice(top * width, rows.stop * width)
-        first[:, here] = signal[frames, inside]
-        both = np.nan_to_num(_bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
-        steps[:, here] = (basis - own)[frames] @ (both[inside] @ basis).T
-        at = displacement.weights(rows, source)[loose[chosen] - top * width]
-        *_, flags = quality.read(capture.isel(band=[displacement.reference], y=source))
-        bad = quality.unusable(flags)
-        at = without(at, bad, width)
-        unknown[chosen] = abs(at) @ bad > 0.0
-        change[chosen] = at @ both - both[loose[chosen] - source.start * width]
-    change[unknown] = 0.0
-    smoothed = (change @ basis) @ own.T
-    # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
-    error = change - (change @ basis) @ basis.T
-    energy = (error**2).sum(axis=1)
-    lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
-    variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
-    # One that is not known, beside bad pixels, may be as large as any other.
-    variance[unknown] = np.max((first.T if unknown.all() else smoothed[~unknown]) ** 2, initial=0)
-    # A sample that is no measurement is an outlier of the regression.
-    return np.nan_to_num(first), steps, smoothed, np.nan_to_num(variance)
 
 
 def _factor(

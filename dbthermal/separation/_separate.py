@@ -15,7 +15,7 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
-from dbthermal.separation._completion.complete import complete
+from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import alone as single
@@ -120,6 +120,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
                 f"{made['settings']}."
             )
         alone = laid_on(alone, corrected, "the result alone", "the capture")
+    given = alone
     if reflection_shift is None:
         alone, reflection_shift, doubts = _apart(one, corrected, response, workers, alone)
         source = "none" if reflection_shift is None else "found"
@@ -137,17 +138,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result, materials = _over_found_materials(again, known, corrected, alone)
     if materials is not None and reflection_shift is not None:
         single.hold(alone, result, materials)
-    result = complete(
-        result,
-        corrected,
-        response,
-        materials,
-        surroundings,
-        prior,
-        surroundings_std=surroundings_std,
-        reflection_shift=reflection_shift,
-        workers=workers,
-    )
+    if result is given:
+        result = result.copy(deep=True)
+    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
+    result = filled(result, corrected, response, beside, workers)
     if materials is not None:
         result["material"] = materials
     return warned(result.assign_attrs(reflection_shift=source), *doubts)

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
+from dbthermal._films import empty, release
 from dbthermal.separation import _side_by_side as side_by_side
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Method, check
@@ -270,7 +271,9 @@ def _withhold(result: xr.Dataset) -> None:
     """Withhold objects whose emissivity lies outside (0, 1): rapid changes were no reflection's."""
     impossible = (result["status"].values & np.uint32(schema.Status.NONPHYSICAL_EMISSIVITY)) != 0
     for name in ("object_temperature", "object_temperature_std"):
-        result[name].values[:, impossible] = np.nan
+        for frame in result[name].values:
+            frame[impossible] = np.nan
+        release()
 
 
 def require_workers(workers: Any) -> None:
@@ -336,6 +339,7 @@ def _separate(
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
         _write(result, inputs.bands, cut, estimates)
+        release()
         bar.update(cut.status.size)
 
 
@@ -346,8 +350,8 @@ def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -
     arrays = {}
     for name, variable in variables.items():
         attrs = schema.status_attrs() if name == "status" else variable.attrs
-        empty = np.empty([sizes[dim] for dim in variable.dims], dtype=variable.dtype)
-        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
+        array = empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
+        arrays[name] = xr.DataArray(array, dims=variable.dims, attrs={**attrs, **kept})
     names = ("band", "time", "y", "x")
     coordinates = {name: corrected[name] for name in names if name in corrected.coords}
     if any("other_band" in variable.dims for variable in variables.values()):

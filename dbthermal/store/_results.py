@@ -295,6 +295,17 @@ def save_video(
         film.mux(stream.encode())
 
 
+def check_place(path: str | Path, suffix: str) -> Path:
+    """Refuse the path of a file or folder of another end than this, or inside a store."""
+    path = Path(path)
+    if path.suffix != suffix:
+        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    for folder in path.resolve().parents:
+        if (folder / SUMS).is_file():
+            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
+    return path
+
+
 @contextmanager
 def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """Yield a place beside `path` to write to, which becomes `path` unless an error is raised.
@@ -307,12 +318,7 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     suffix : str
         End of its name; ValueError for another one.
     """
-    path = Path(path)
-    if path.suffix != suffix:
-        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
-    for folder in path.resolve().parents:
-        if (folder / SUMS).is_file():
-            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
+    path = check_place(path, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as beside:
         part = Path(beside) / path.name

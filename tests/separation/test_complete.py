@@ -437,7 +437,8 @@ def test_unknown_materials_hold() -> None:
     more = max(completed / read for completed, read in errors)
     print(
         f"{len(covers)} materials: intervals hold {np.mean(covers):.3f}; {median[0]:.3f} K, "
-        f"reading {median[1]:.3f} K; farther off than that in {worse.mean():.3f}, at most {more:.2f} times"
+        f"reading {median[1]:.3f} K; farther off than that in {worse.mean():.3f}, "
+        f"at most {more:.2f} times"
     )
     assert 0.9 <= np.mean(covers) <= 0.99
     # A prior is wrong of one material in twenty.

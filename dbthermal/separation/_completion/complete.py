@@ -1,7 +1,7 @@
 """Completion of a result: a temperature with its deviation at every pixel that both cameras see."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
+from dbthermal._films import release
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
@@ -126,45 +127,55 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     (0, True)
     """
     require_workers(workers)
-    result = _checked(result, corrected)
-    inputs = check(
-        corrected,
-        response,
-        _METHOD,
-        "complete",
-        pool=materials,
-        reflection_shift=reflection_shift,
-        response_kind=str(result.attrs.get("response_kind", "exact")),
-    )
+    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
+    return filled(_checked(result, corrected).copy(deep=True), corrected, response, beside, workers)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """All that is known beside the capture, see `complete`."""
+
+    materials: xr.DataArray | None
+    surroundings: float | xr.DataArray | None
+    prior: str | xr.DataArray | xr.Dataset | None
+    surroundings_std: float
+    reflection_shift: xr.Dataset | None
+
+
+def filled(
+    result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, beside: Beside, workers: int
+) -> xr.Dataset:
+    """Complete a result in place, see `complete`."""
+    shared = {"pool": beside.materials, "reflection_shift": beside.reflection_shift}
+    kind = str(result.attrs.get("response_kind", "exact"))
+    inputs = check(corrected, response, _METHOD, "complete", response_kind=kind, **shared)
     told = result
-    if materials is not None and not result.attrs.get("pooled"):
-        told = solve(corrected, response, pool=materials, reflection_shift=reflection_shift)
-    scene = scenes.gather(inputs, result, told, prior)
+    if beside.materials is not None and not result.attrs.get("pooled"):
+        told = solve(corrected, response, **shared)
+    scene = scenes.gather(inputs, result, told, beside.prior)
     if not scene.apart:  # else the result's reflections are those of two places
         scenes.require_same_capture(scene, result)
-    if surroundings is None:
+    if beside.surroundings is None:
         level = scenes.find_level(scene)
     else:
-        level = scenes.stated(scene, surroundings, surroundings_std)
+        level = scenes.stated(scene, beside.surroundings, beside.surroundings_std)
         fluctuation = scenes.find_level(replace(scene, level=level)).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
-    completed = result.copy(deep=True)
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
-        list(threads.map(partial(_complete_rows, scene, completed), inputs.blocks))
-        film = completed[FILMS[0]].values
-        given = [np.isfinite(film[:, rows]).any(axis=(1, 2)) for rows in inputs.blocks]
-        frames = np.any(given, axis=0)
-        parts = threads.map(partial(_bridge_rows, completed, frames), inputs.blocks)
+        list(threads.map(partial(_complete_rows, scene, result), inputs.blocks))
+        film = result[FILMS[0]].values
+        frames = np.array([np.isfinite(frame).any() for frame in film])
+        parts = threads.map(partial(_bridge_rows, result, frames), inputs.blocks)
         bridged = np.concatenate(list(parts))
-    completed["status"].attrs.update(schema.status_attrs())
+    result["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
-    return completed.assign_attrs(
+    return result.assign_attrs(
         frames_missing=int(np.count_nonzero(~frames)),
         frames_bridged=float(bridged.sum() / max(1, np.count_nonzero(bridged))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
-        surroundings_source="capture" if surroundings is None else "stated",
+        surroundings_source="capture" if beside.surroundings is None else "stated",
     )
 
 
@@ -210,6 +221,7 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
                 values = {name: value[..., kept] for name, value in values.items()}
                 here = sources == source
             _fill(scene, completed, places[here], values, source)
+        release()
 
 
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
@@ -250,6 +262,7 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
             films[0][place], films[1][place] = curve, std
         completed["status"].values[rows] |= bridged * np.uint32(Status.COMPLETED_FRAMES)
         number = np.maximum(number, bridged * gaps.sum(axis=0))
+        release()
     return number
 
 

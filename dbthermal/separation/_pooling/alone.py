@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 
+from dbthermal._films import release
 from dbthermal.separation._tiles import Array, Mask
 
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
@@ -46,6 +47,7 @@ def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
         value, other, std = (film[:, row, here].astype(np.float64) for film in (*films, single))
         square[row, here] = np.nanmean(((value - other) / std) ** 2, axis=0)
         variance[row, here] = np.nanmean(std**2, axis=0)
+        release()
     local = np.where(both, _around(square, both), 0.0)
     more = both & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * stay)
@@ -53,9 +55,10 @@ def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
     for row, (factor, offset) in enumerate(zip(square * both, constant, strict=True)):
         film = pooled["object_temperature_std"].values[:, row]
         film[...] = np.sqrt(film**2 + factor * np.nan_to_num(single[:, row]) ** 2 + offset)
-    for name, part in alone.data_vars.items():
-        if part.dims[-2:] == ("y", "x"):
-            pooled[name].values[..., stay] = part.values[..., stay]
+        for name, part in alone.data_vars.items():
+            if part.dims[-2:] == ("y", "x"):
+                pooled[name].values[..., row, stay[row]] = part.values[..., row, stay[row]]
+        release()
 
 
 def _outer(labels: Array) -> Mask:

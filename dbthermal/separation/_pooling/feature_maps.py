@@ -16,6 +16,7 @@ from scipy import ndimage
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
+from dbthermal._films import release
 from dbthermal.noise import MAD
 from dbthermal.separation._pooling.region_merging import Labels
 
@@ -66,14 +67,17 @@ def mean_signals(
 def signal_change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
     """Mean signal (y, x) [K] of a band in the last third of the frames, less that in the first."""
     counts = corrected["counts"].isel(band=band)
-    counts = counts.where(schema.measured(counts))
     curve = responses.curve(response, str(corrected["band"].values[band]))
-    third = max(counts.sizes["time"] // 3, 1)
-    first, last = (
-        counts.isel(time=part).mean("time", dtype=np.float64).values
-        for part in (slice(third), slice(-third, None))
-    )
-    return np.asarray((last - first) / curve.reference_slope)
+    third, changes = max(counts.sizes["time"] // 3, 1), []
+    for top in range(0, counts.sizes["y"], _ROWS):
+        part = counts.isel(y=slice(top, top + _ROWS)).load()
+        part = part.where(schema.measured(part))
+        first, last = (
+            part.isel(time=frames).mean("time", dtype=np.float64).values
+            for frames in (slice(third), slice(-third, None))
+        )
+        changes.append((last - first) / curve.reference_slope)
+    return np.concatenate(changes)
 
 
 def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, Array]:
@@ -95,6 +99,7 @@ def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, A
         background = result["background_temperature"].isel(y=rows).values
         excess[rows] = background.mean(axis=0) - np.median(background, axis=0)
         deviation[rows] = result["background_temperature_std"].isel(y=rows).values.mean(axis=0)
+        release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames
     known = np.isfinite(share * excess * variance)
