@@ -100,6 +100,8 @@ def piecewise(
     be the object's as well. The leverage is that of more functions, for pieces that were chosen.
     """
     time = np.asarray(time, dtype=np.float64)
+    if segment is not None and segment[0] == segment[-1]:  # it only rises
+        segment = None
     edges, parts = [*np.flatnonzero(first), time.size], []
     for start, stop in pairwise(edges):
         events = len(camera_steps(None if segment is None else segment[start:stop]))
@@ -113,20 +115,21 @@ def piecewise(
         together[column : column + basis.shape[1], start:stop] = basis.T
         column += basis.shape[1]
     plain, steps = together.T, camera_steps(segment)
-    chosen = np.concatenate([_of_choice(part, time.size) for part in parts])
     if not steps:  # of two pieces, orthonormal as they are
-        leverage = np.concatenate([part[3] for part in parts]) * chosen
-        return Subspace(plain, plain, len(together) - 1, rising, spans, leverage)
+        each = [part[3] * _of_choice(part, time.size) for part in parts]
+        return Subspace(plain, plain, len(together) - 1, rising, spans, np.concatenate(each))
     functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
-    leverage = (object_part**2).sum(axis=1, keepdims=True) * chosen
+    leverage = (object_part**2).sum(axis=1, keepdims=True)
+    for part in parts:
+        leverage[part[0] : part[1]] *= _of_choice(part, time.size)
     return Subspace(functions, object_part, functions.shape[1] - 1, rising, of_pieces=leverage)
 
 
-def _of_choice(part: tuple[int, int, Array, Array], frames: int) -> Array:
-    """Leverage of a piece (frame, 1), its ends chosen from the data, over that of given ends."""
+def _of_choice(part: tuple[int, int, Array, Array], frames: int) -> float:
+    """Leverage of a piece, its ends chosen from the data, over that of given ends."""
     start, stop, basis, _ = part
     ends = int(start > 0) + int(stop < frames)
-    return np.full((stop - start, 1), 1.0 + 0.5 * CHANGE_POINT * ends / basis.shape[1])
+    return 1.0 + 0.5 * CHANGE_POINT * ends / basis.shape[1]
 
 
 @lru_cache(maxsize=4096)

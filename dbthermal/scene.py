@@ -32,8 +32,9 @@ _PIXELS: Final = 20_000
 _FRAMES: Final = 400
 _REGISTERED: Final = 200
 # Times that clock and shift of the reflections are estimated in turn, at most, the step of the
-# clock at which that ends [frame], and the least share of a delay that is taken to be seen [1].
-_ROUNDS, _LATE, _FLAT = 6, 0.02, 0.125
+# clock at which that ends [frame], the least share of a delay that is taken to be seen [1], and
+# trials in a row, at most, that are no better than one before.
+_ROUNDS, _LATE, _FLAT, _VAIN = 6, 0.02, 0.125, 2
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
@@ -158,19 +159,27 @@ def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Capture on one clock, and the shift of its reflections; None where they are not apart."""
-    names = corrected["band"].values
+    names, tried = corrected["band"].values, list[tuple[float, xr.DataArray, xr.Dataset]]()
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
-    aligned = align(corrected, **{"offset": together, **options})
-    field = _shift(aligned, response)
+
+    def at(**how: Any) -> tuple[xr.Dataset, xr.Dataset | None]:
+        aligned = align(corrected, **{**options, **how})
+        field = _shift(aligned, response)
+        if field is not None and np.isfinite(field.attrs["delay"]):
+            offset = together.copy(data=aligned.attrs["time_offset"])
+            tried.append((abs(field.attrs["delay"]), offset, field))
+        return aligned, field
+
+    aligned, field = at(**({} if "offset" in options else {"offset": together}))
     if "offset" not in options:
         # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
-        aligned = align(corrected, reflection_shift=field, **options)
-        field = _shift(aligned, response)
+        aligned, field = at(reflection_shift=field)
         # Newton's steps are short beside noise: from the second on they are a secant's.
         frame, slope, step, last = np.median(np.diff(aligned["time"].values)), 1.0, 0.0, 0.0
         for _ in range(_ROUNDS):
-            if field is None:
+            vain = len(tried) - int(np.argmin([one[0] for one in tried])) if tried else 0
+            if field is None or vain > _VAIN:
                 break
             late = field.attrs["delay"]
             if step:
@@ -179,9 +188,14 @@ def _aligned(
             if not abs(step) >= _LATE * frame:  # or not known
                 break
             behind = step * (names != field.attrs["reference_band"])
-            together.values[:] = aligned.attrs["time_offset"] + behind - behind[0]
-            aligned = align(corrected, **{**options, "offset": together})
-            field = _shift(aligned, response)
+            offset = aligned.attrs["time_offset"] + behind - behind[0]
+            aligned, field = at(offset=together.copy(data=offset))
+        # Interpolation has a part in the delay that is seen: beside whole frames it may jump.
+        near = [
+            one for one in tried if field is not None and np.all(abs(one[1] - tried[-1][1]) < frame)
+        ]
+        if near and (best := min(near, key=lambda one: one[0])) is not tried[-1]:
+            aligned, field = align(corrected, **{**options, "offset": best[1]}), best[2]
     if field is None:
         return aligned, None
     apart = seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -51,6 +52,33 @@ class Equations:
     backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
     bends: list[Polynomial]  # u_m(x) - u_1(x) of u_1(x), for all bands but the first
+
+    @cached_property
+    def solved(self) -> Whole:
+        """Pixels that are solved."""
+        return np.sort(np.concatenate([self.forward, self.backward, self.loose]))
+
+    @cached_property
+    def packed(self) -> "Equations":
+        """Return the equations of the solved pixels alone, numbered anew."""
+        places, number = self.solved, np.zeros(self.first.size, dtype=np.intp)
+        number[places] = np.arange(places.size)
+        return Equations(
+            first=self.first[places],
+            shares=self.shares[:, places],
+            there=self.there[places][:, places],
+            onward=self.onward[:, places],
+            forward=number[self.forward],
+            backward=number[self.backward],
+            loose=number[self.loose],
+            bends=self.bends,
+        )
+
+    def spread(self, values: Array) -> Array:
+        """Values (solved pixel, ...) over all pixels, 0 elsewhere."""
+        result = np.zeros((self.first.size, *values.shape[1:]), dtype=values.dtype)
+        result[self.solved] = values
+        return result
 
     def beside(self, signal: Array, change: Array) -> Array:
         """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""

@@ -72,18 +72,20 @@ class Joint:
     factor: Array  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, rows: slice, frames: slice | Whole = slice(None)) -> Array:
-        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of rows; 0 where not known."""
+    def difference(
+        self, rows: slice, frames: slice | Whole = slice(None), some: slice | Whole = slice(None)
+    ) -> Array:
+        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some of rows; 0 if not known."""
         here, beside = (
             self.result[f"{one}_temperature"].values[frames, rows].astype(np.float64)
             for one in ("object", "background")
         )
-        here, beside = (one.reshape(len(one), -1) for one in (here, beside))
+        here, beside = (one.reshape(len(one), -1)[:, some] for one in (here, beside))
         pixels = slice(rows.start * self.result.sizes["x"], rows.stop * self.result.sizes["x"])
         parts = []
         for one, place in zip(self.emissivity[1:], self.inputs.bands[1:], strict=True):
             curve = self.inputs.curves[place]
-            parts.append(one[pixels] * (curve.signal(beside) - curve.signal(here)))
+            parts.append(one[pixels][some] * (curve.signal(beside) - curve.signal(here)))
         return np.asarray(np.nan_to_num(parts, nan=0.0))
 
     def kept(self) -> "Joint":
@@ -168,13 +170,19 @@ def solve(
         weights = np.where(solved, weights, 0.0)
 
         def moved(frames: slice | Whole) -> Array:
-            """Part (pixel, frame) [K] of q that the inputs of the result were without."""
-            apart = 0.0 if before is None else before.difference(every, frames).T
-            return np.asarray(np.sum(weights.T[:, np.newaxis] * apart, axis=2))
+            """Part (solved, frame) [K] of q that the inputs of the result were without."""
+            apart = 0.0 if before is None else before.difference(every, frames, places).T
+            return np.asarray(np.sum(weights.T[places, np.newaxis] * apart, axis=2))
 
-        both = partial(_both, curve, solved, system.coefficients(inputs, raw, solved))
-        looked_at = partial(both, system.bridge(film[some], solved), moved(some), change(some))
-        here, beside, _ = looked_at(equations)
+        shares, places = system.coefficients(inputs, raw, solved), equations.solved
+        both = partial(_both, curve, shares[:, places])
+        few = system.bridge(film[some], solved)[:, places], moved(some), change(some)
+
+        def looked_at(equations: system.Equations) -> list[Array]:
+            """Object's signals (pixel, some frame) [K] at both places."""
+            return [equations.spread(one) for one in both(*few, equations)[:2]]
+
+        here, beside = looked_at(equations)
         # In units of the deviation or, of a method without one, of the noise.
         std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
@@ -189,19 +197,19 @@ def solve(
             equations, emissivity, of_slope = _emissivities(
                 inputs, result, raw, solved, equations, looked_at, (first, steps)
             )
-            here, beside, _ = looked_at(equations)
+            here, beside = looked_at(equations)
         system.bridge(film, solved)
         release()
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
         results = threads.map(
-            lambda part: both(film[part], moved(part), change(part), equations), parts
+            lambda part: both(film[part, places], moved(part), change(part), equations), parts
         )
         for part, (*pair, step) in zip(parts, results, strict=True):
-            film[part], there[part] = (
-                np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
-            )
-            unsettled |= step > 10.0 * system.CONVERGED
+            for whole, one in zip((film, there), pair, strict=True):
+                whole[part] = np.nan
+                whole[part, places] = curve.temperature(one.T + curve.reference)
+            unsettled[places] |= step > 10.0 * system.CONVERGED
             release()
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
@@ -221,12 +229,14 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
         equations = system.equations(inputs, emissivity, solved)
         change = system.first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
         curve, there = inputs.curves[inputs.bands[0]], empty(film.shape, film.dtype)
+        places = equations.solved
         system.bridge(film, solved)
         for at in range(0, len(film), _FRAMES):
             part = slice(at, at + _FRAMES)
-            signal = np.where(solved, curve.signal(film[part]) - curve.reference, 0.0).T
-            other = equations.beside(signal, change(part)).T + curve.reference
-            there[part] = np.where(solved, curve.temperature(other), np.nan)
+            signal = curve.signal(film[part, places]).T - curve.reference
+            other = equations.packed.beside(signal, change(part)).T + curve.reference
+            there[part] = np.nan
+            there[part, places] = curve.temperature(other)
             release()
     shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
     films = {
@@ -238,20 +248,20 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
 
 def _both(
     curve: Curve,
-    solved: Mask,
     shares: Array,
     alone: Array,
     moved: Array,
     change: Array,
     equations: system.Equations,
 ) -> tuple[Array, Array, Array]:
-    """Object's signals at both places and the last step, of films (frame, pixel) by some shares."""
+    """Object's signals at both places and the last step, of films (frame, solved) by some shares."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread it runs in
-        signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
+        signal = curve.signal(alone) - curve.reference
         signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-        target = shares[0][:, np.newaxis] * signal + equations.other_bands(shares[1:], signal)
+        packed = equations.packed
+        target = shares[0][:, np.newaxis] * signal + packed.other_bands(shares[1:], signal)
         target += moved
-        return equations.solve(target, signal, change)
+        return packed.solve(target, signal, change)
 
 
 def _emissivities(
@@ -260,14 +270,14 @@ def _emissivities(
     raw: Array,
     solved: Mask,
     equations: system.Equations,
-    looked_at: Callable[[system.Equations], tuple[Array, Array, Array]],
+    looked_at: Callable[[system.Equations], list[Array]],
     band: tuple[Signal, Signal],
 ) -> tuple[system.Equations, Array, Array]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     for _ in range(_ROUNDS):
-        here, beside, _ = looked_at(equations)
+        here, beside = looked_at(equations)
         slope, variance, known = _emission((here, beside), band, emissivity[0], noise)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
@@ -336,8 +346,9 @@ def _factor(
     target = alone + off * common
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
-    signal, _, _ = linear.solve(target, alone, change)
-    own, power = size[:, 0] > 0, (signal.astype(np.float64) ** 2).mean(axis=1)
+    places = linear.solved
+    signal, _, _ = linear.packed.solve(target[places], alone[places], change)
+    own, power = size[:, 0] > 0, linear.spread((signal.astype(np.float64) ** 2).mean(axis=1))
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
