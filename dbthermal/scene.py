@@ -35,6 +35,8 @@ _REGISTERED: Final = 200
 # clock at which that ends [frame], the least share of a delay that is taken to be seen [1], and
 # trials in a row, at most, that are no better than one before.
 _ROUNDS, _LATE, _FLAT, _VAIN = 6, 0.02, 0.125, 2
+SAMPLE: Final = 220
+"""Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 

@@ -1,6 +1,7 @@
 """Equations of the object of all pixels, of which each camera sees another place, see `_joint`."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -18,6 +19,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._displaced import without
 from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._subspace.kernels import entered
 from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
 from dbthermal.separation._tiles import Material
 
@@ -38,6 +40,27 @@ _DEGREE: Final = 4
 _ROWS: Final = 32
 # Smooth functions of the change beside a pixel that is not solved.
 _ORDER: Final = 14
+
+
+@entered
+def _other_bands(shares: Array, bends: Array, signal: Array, result: Array) -> None:
+    """Shares (band, pixel) times signals and their bends by Horner's rule (pixel, frame), in place.
+
+    In one pass, for the arrays are larger than the cache.
+    """
+    for p in range(signal.shape[0]):
+        for t in range(signal.shape[1]):
+            value, total = np.float64(signal[p, t]), 0.0
+            for band in range(shares.shape[0]):
+                bend = 0.0
+                for degree in range(bends.shape[1] - 1, -1, -1):
+                    bend = bend * value + bends[band, degree]
+                total += shares[band, p] * (value + bend)
+            result[p, t] = total
+
+
+with suppress(RuntimeError):  # without a folder that may be written each process compiles
+    _other_bands.enable_caching()
 
 
 @dataclass(frozen=True)
@@ -88,8 +111,10 @@ class Equations:
 
     def other_bands(self, shares: Array, signal: Array) -> Array:
         """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
-        parts = zip(shares, self.bends, strict=True)
-        return np.asarray(sum(one[:, np.newaxis] * (signal + bend(signal)) for one, bend in parts))
+        result, bends = np.empty(signal.shape), [bend.convert().coef for bend in self.bends]
+        padded = [np.pad(one, (0, _DEGREE + 1 - one.size)) for one in bends]
+        _other_bands(np.ascontiguousarray(shares), np.array(padded), signal, result)
+        return result
 
     def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
         """

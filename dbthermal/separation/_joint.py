@@ -75,7 +75,7 @@ class Joint:
     def difference(
         self, rows: slice, frames: slice | Whole = slice(None), some: slice | Whole = slice(None)
     ) -> Array:
-        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some of rows; 0 if not known."""
+        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
         here, beside = (
             self.result[f"{one}_temperature"].values[frames, rows].astype(np.float64)
             for one in ("object", "background")
@@ -254,7 +254,7 @@ def _both(
     change: Array,
     equations: system.Equations,
 ) -> tuple[Array, Array, Array]:
-    """Object's signals at both places and the last step, of films (frame, solved) by some shares."""
+    """Object at both places and the last step [K], of a film (frame, pixel) by its shares."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread it runs in
         signal = curve.signal(alone) - curve.reference
         signal = np.ascontiguousarray(signal.T, dtype=np.float32)

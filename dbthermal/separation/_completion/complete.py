@@ -3,7 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -146,7 +146,7 @@ def filled(
     result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, beside: Beside, workers: int
 ) -> xr.Dataset:
     """Complete a result in place, see `complete`."""
-    shared = {"pool": beside.materials, "reflection_shift": beside.reflection_shift}
+    shared: dict[str, Any] = {"pool": beside.materials, "reflection_shift": beside.reflection_shift}
     kind = str(result.attrs.get("response_kind", "exact"))
     inputs = check(corrected, response, _METHOD, "complete", response_kind=kind, **shared)
     told = result
