@@ -39,8 +39,9 @@ outgrow the cache that the cores share, which takes 1.3 times as long at 30,000 
 # Times as many pixels in a tile whose steps are compiled, which keep to the cache by themselves, or
 # on a device: the pixels that need more are then enough together.
 _COMPILED: Final = 8
-# Tiles whose pixels are read together where they are then sorted by their noise.
-_TOGETHER: Final = 12
+# Samples of a band that are read together where pixels are then sorted by their noise: of few rows,
+# those around them, which they are made of, would be most of what is read.
+_TOGETHER: Final = 2**23
 # Resampled samples whose noise differs by less are separated together [1].
 _NOISE_STEP: Final = 0.05
 # A temperature leaves the calibrated range if it is so many standard deviations outside.
@@ -280,7 +281,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
     most = largest(method, inputs.settings, block)
-    size = most if displacement is None else max(width, _TOGETHER * min(most, PIXELS))
+    size = most if displacement is None else max(width, _TOGETHER // block.sizes["time"])
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
