@@ -30,7 +30,12 @@ _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _NAN, _SIGMAS, _LARGEST = np.float32(np.nan), np.float32(RANGE_SIGMAS), np.float32(LARGEST)
 _NEWTON: Final = 3  # steps towards the object, at most
 _NEAR: Final = 1e-5  # one after which no further step is worth while [K]
-_UNDEFINED: Final = int(Status.NO_BACKGROUND_MOTION | Status.GRAY | Status.INVALID_SAMPLES)
+_UNDEFINED: Final = int(
+    Status.NO_BACKGROUND_MOTION
+    | Status.GRAY
+    | Status.INVALID_SAMPLES
+    | Status.NONPHYSICAL_EMISSIVITY
+)
 _BEYOND: Final = np.uint32(Status.OUTSIDE_RESPONSE)
 _AMBIGUOUS: Final = int(Status.CONSTANT_OBJECT | Status.ROLES_MAY_BE_SWAPPED)
 
