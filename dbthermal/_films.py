@@ -5,6 +5,7 @@ the process's memory, too, until they are `released`.
 """
 
 import mmap
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -39,12 +40,14 @@ def made_on_disk() -> bool:
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> Values:
-    """Make an array without values."""
+    """Make an array without values; OSError if the disk has no room for it."""
     folder, size = _FOLDER.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
     if folder is None or size < _LEAST:
         return np.empty(shape, dtype)
     with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
         file.truncate(size)
+        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
+            os.posix_fallocate(file.fileno(), 0, size)
         pages = mmap.mmap(file.fileno(), size)
     _MAPS.add(pages)
     return np.frombuffer(pages, dtype).reshape(shape)

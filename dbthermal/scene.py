@@ -111,37 +111,23 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> bool(abs(error).median() < 0.3)  # K
     True
     """
-    if target is None:
-        return _whole(capture, correction, response, registration, correcting, aligning, separating)
-    check_place(target, ".zarr")
-    place = Path(target).absolute().parent
-    place.mkdir(parents=True, exist_ok=True)
-    with on_disk(place):
-        result = _whole(
-            capture, correction, response, registration, correcting, aligning, separating
-        )
-        blocks = _rows.blocks(result["object_temperature"].shape)
-        parts = (_let_go(result.isel(y=rows)) for rows in blocks)
-        store.save_rows(parts, target, provenance or store.provenance({}))
-    return store.open_dataset(target)
-
-
-def _let_go(part: xr.Dataset) -> xr.Dataset:
-    """Rows of a result, when those before need no more memory."""
-    release()
-    return part
-
-
-def _whole(
-    capture: xr.Dataset,
-    correction: xr.Dataset,
-    response: xr.Dataset,
-    registration: Literal["translation", "affine", "homography"] | None,
-    correcting: Mapping[str, Any],
-    aligning: Mapping[str, Any],
-    separating: Mapping[str, Any],
-) -> xr.Dataset:
-    """All steps, see `separate_capture`; films are where films are made."""
+    if target is not None:
+        place = check_place(target, ".zarr").absolute().parent
+        place.mkdir(parents=True, exist_ok=True)
+        with on_disk(place):
+            result = separate_capture(
+                capture,
+                correction,
+                response,
+                registration=registration,
+                correcting=correcting,
+                aligning=aligning,
+                separating=separating,
+            )
+            blocks = _rows.blocks(result["object_temperature"].shape)
+            parts = (_let_go(result.isel(y=rows)) for rows in blocks)
+            store.save_rows(parts, target, provenance or store.provenance({}))
+        return store.open_dataset(target)
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
@@ -155,6 +141,12 @@ def _whole(
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
     maps = {} if field is None else {"reflection_shift": field["shift"]}
     return result.assign(maps).assign_attrs(attrs)
+
+
+def _let_go(part: xr.Dataset) -> xr.Dataset:
+    """Rows of a result, when those before need no more memory."""
+    release()
+    return part
 
 
 def _aligned(

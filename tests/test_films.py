@@ -4,6 +4,7 @@ import resource
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from dbthermal import _films as films
 
@@ -25,6 +26,12 @@ def test_a_film_on_disk_is_an_array_without_a_name(tmp_path: Path) -> None:
     assert before.base is None
     assert small.base is None
     assert film.base is not None
+
+
+def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
+    """A film for which there is no room is refused, and does not end the process when written."""
+    with films.on_disk(tmp_path), pytest.raises(OSError):  # noqa: PT011 - the system's own words
+        films.empty((2**44,), np.float64)
 
 
 def test_pages_are_given_back(tmp_path: Path) -> None:
