@@ -2,16 +2,32 @@
 
 An array is one of NumPy; where a function asks for its `namespace`, a tensor of torch will do, on
 any device. Only names that both have, with the same meaning, are then used.
+
+Films that a separation fills are in memory, or in files that vanish with the process, and are
+written and read as arrays all the same. The pages of a file count as the process's memory, too,
+until they are released (`release`).
 """
 
+import mmap
+import os
 import sys
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, Final
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+
+_LEAST: Final = 2**20  # bytes of an array that is worth a file
+_FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
+_MAPS: WeakSet[mmap.mmap] = WeakSet()
 
 
 def namespace(values: Any) -> Any:
@@ -50,3 +66,47 @@ def select(values: Any, selected: Any, axis: int = -1) -> Any:
         return values.movedim(axis, -1)[..., selected].movedim(-1, axis)
     selected = np.flatnonzero(selected) if selected.dtype == bool else selected
     return values.take(selected, axis=axis)
+
+
+@contextmanager
+def on_disk(folder: Path) -> Iterator[None]:
+    """Make the films of this thread in files of a folder."""
+    before = _FOLDER.set(folder)
+    try:
+        yield
+    finally:
+        _FOLDER.reset(before)
+
+
+def made_on_disk() -> bool:
+    """Say that films are made in files here."""
+    return _FOLDER.get() is not None
+
+
+def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Make an array without values; OSError if the disk has no room for it."""
+    folder, size = _FOLDER.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if folder is None or size < _LEAST:
+        return np.empty(shape, dtype)
+    with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
+        file.truncate(size)
+        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
+            os.posix_fallocate(file.fileno(), 0, size)
+        pages = mmap.mmap(file.fileno(), size)
+    _MAPS.add(pages)
+    return np.frombuffer(pages, dtype).reshape(shape)
+
+
+def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Copy an array."""
+    result = empty(values.shape, values.dtype)
+    for part, own in zip(result, values, strict=True):
+        part[...] = own
+        release()
+    return result
+
+
+def release() -> None:
+    """Give the pages of all films on disk back, which are read anew when they are used."""
+    for pages in list(_MAPS) if hasattr(mmap, "MADV_DONTNEED") else []:
+        pages.madvise(mmap.MADV_DONTNEED)

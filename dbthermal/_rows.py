@@ -13,7 +13,7 @@ import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from dbthermal._films import empty, made_on_disk, release
+from dbthermal._arrays import empty, made_on_disk, release
 
 Values = npt.NDArray[Any]
 

@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import _rows, schema, store
-from dbthermal._films import made_on_disk, on_disk, release
+from dbthermal._arrays import made_on_disk, on_disk, release
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dbthermal import _films as films
+from dbthermal import _arrays as films
 
 
 def test_a_film_on_disk_is_an_array_without_a_name(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _films, _rows, simulation, store
+from dbthermal import _arrays, _rows, simulation, store
 from dbthermal.scene import separate_capture
 from dbthermal.simulation import Rig
 from reproduction.experiments import whole
@@ -54,7 +54,7 @@ def test_cameras_apart_have_the_same_result_on_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Films on disk, of which each camera sees another place, are those of one call in memory."""
-    monkeypatch.setattr(_films, "_LEAST", 0)
+    monkeypatch.setattr(_arrays, "_LEAST", 0)
     shape, rng = (40, 64), np.random.default_rng(5)
     glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
     picture = Picture(shape=shape, walkers=8)

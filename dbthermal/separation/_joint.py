@@ -30,7 +30,7 @@ from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gau
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array as Signal
-from dbthermal._films import copied, empty, release
+from dbthermal._arrays import copied, empty, release
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _equations as system

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
-from dbthermal._films import empty, release
+from dbthermal._arrays import empty, release
 from dbthermal.separation import _side_by_side as side_by_side
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Method, check

@@ -10,8 +10,8 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
+from dbthermal._arrays import release
 from dbthermal._coordinates import laid_on
-from dbthermal._films import release
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles

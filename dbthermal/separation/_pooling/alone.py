@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 
-from dbthermal._films import release
+from dbthermal._arrays import release
 from dbthermal.separation._tiles import Array, Mask
 
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.

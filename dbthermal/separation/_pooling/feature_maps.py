@@ -15,8 +15,7 @@ from scipy import ndimage
 
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
-from dbthermal._films import release
+from dbthermal._arrays import Array, Mask, release
 from dbthermal.noise import MAD
 from dbthermal.separation._pooling.region_merging import Labels
 
