@@ -167,7 +167,6 @@ def solve(
         first, steps, change, variance = system.first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
         weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
-        weights = np.where(solved, weights, 0.0)
 
         def moved(frames: slice | Whole) -> Array:
             """Part (solved, frame) [K] of q that the inputs of the result were without."""
@@ -188,8 +187,7 @@ def solve(
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
-        emissivity, of_slope = system.inside(raw), np.zeros(solved.size)
-        of_ratio = np.zeros(solved.size)
+        emissivity, (of_slope, of_ratio) = system.inside(raw), np.zeros((2, solved.size))
         if material is not None:
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
@@ -199,16 +197,14 @@ def solve(
             )
             here, beside = looked_at(equations)
         system.bridge(film, solved)
-        release()
         unsettled = np.zeros(solved.size, dtype=bool)
-        parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
+        parts = _parts(film)
         results = threads.map(
             lambda part: both(film[part, places], moved(part), change(part), equations), parts
         )
         for part, (*pair, step) in zip(parts, results, strict=True):
             for whole, one in zip((film, there), pair, strict=True):
-                whole[part] = np.nan
-                whole[part, places] = curve.temperature(one.T + curve.reference)
+                _write(whole, part, places, curve, one)
             unsettled[places] |= step > 10.0 * system.CONVERGED
             release()
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
@@ -231,12 +227,9 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
         curve, there = inputs.curves[inputs.bands[0]], empty(film.shape, film.dtype)
         places = equations.solved
         system.bridge(film, solved)
-        for at in range(0, len(film), _FRAMES):
-            part = slice(at, at + _FRAMES)
+        for part in _parts(film):
             signal = curve.signal(film[part, places]).T - curve.reference
-            other = equations.packed.beside(signal, change(part)).T + curve.reference
-            there[part] = np.nan
-            there[part, places] = curve.temperature(other)
+            _write(there, part, places, curve, equations.packed.beside(signal, change(part)))
             release()
     shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
     films = {
@@ -244,6 +237,17 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
         for name, part in (("object_temperature", film), ("background_temperature", there))
     }
     return Joint(inputs, xr.Dataset(films), emissivity, np.ones(solved.size), unsettled)
+
+
+def _parts(film: Array) -> list[slice]:
+    """Frames of a film that are solved together."""
+    return [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
+
+
+def _write(film: Array, part: slice, places: Whole, curve: Curve, signal: Array) -> None:
+    """Write some frames of a film of temperatures, of signals (solved pixel, frame), in place."""
+    film[part] = np.nan
+    film[part, places] = curve.temperature(signal.T + curve.reference)
 
 
 def _both(

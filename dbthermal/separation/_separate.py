@@ -138,7 +138,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result, materials = _over_found_materials(again, known, corrected, alone)
     if materials is not None and reflection_shift is not None:
         single.hold(alone, result, materials)
-    if result is given:
+    if result is given:  # which is the caller's
         result = result.copy(deep=True)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     result = filled(result, corrected, response, beside, workers)

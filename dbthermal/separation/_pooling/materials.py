@@ -141,10 +141,8 @@ def materials(
     """
     result = _checked(result, corrected, error_rate, resolution)
     if "segment" in corrected:  # means across a shutter event would show the pattern's step
-        # A segment's frames follow one another.
-        _, firsts, counts = np.unique(corrected["segment"], return_index=True, return_counts=True)
-        longest = np.argmax(counts)
-        frames = slice(firsts[longest], firsts[longest] + counts[longest])
+        _, first, count = np.unique(corrected["segment"], return_index=True, return_counts=True)
+        frames = slice(first[count.argmax()], (first + count)[count.argmax()])  # it only rises
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _bands(result, response)
     means, variances = feature_maps.mean_signals(corrected, response, bands, noise)
