@@ -39,7 +39,7 @@ _DEGREE: Final = 4
 # Rows of the capture that are read at once.
 _ROWS: Final = 32
 # Smooth functions of the change beside a pixel that is not solved.
-_ORDER: Final = 14
+ORDER: Final = 14
 
 
 @entered
@@ -74,7 +74,7 @@ class Equations:
     forward: Whole  # pixels solved for x(r)
     backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
-    bends: list[Polynomial]  # u_m(x) - u_1(x) of u_1(x), for all bands but the first
+    bends: Array  # coefficients of u_m(x) - u_1(x) of u_1(x) (band - 1, degree + 1), rising
 
     @cached_property
     def solved(self) -> Whole:
@@ -111,9 +111,8 @@ class Equations:
 
     def other_bands(self, shares: Array, signal: Array) -> Array:
         """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
-        result, bends = np.empty(signal.shape), [bend.convert().coef for bend in self.bends]
-        padded = [np.pad(one, (0, _DEGREE + 1 - one.size)) for one in bends]
-        _other_bands(np.ascontiguousarray(shares), np.array(padded), signal, result)
+        result = np.empty(signal.shape)
+        _other_bands(np.ascontiguousarray(shares), self.bends, signal, result)
         return result
 
     def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
@@ -233,13 +232,17 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def _bends(curves: list[Curve]) -> list[Polynomial]:
+def _bends(curves: list[Curve]) -> Array:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)
     own = first.signal(temperature)
     place = own - first.reference
-    return [Polynomial.fit(place, one.signal(temperature) - own, _DEGREE) for one in curves[1:]]
+    bends = np.zeros((len(curves) - 1, _DEGREE + 1))
+    for bend, one in zip(bends, curves[1:], strict=True):
+        fit = Polynomial.fit(place, one.signal(temperature) - own, _DEGREE).convert()
+        bend[: fit.coef.size] = fit.coef  # without the last ones that are zero
+    return bends
 
 
 def bridge(film: Array, solved: Mask) -> Array:
@@ -267,7 +270,7 @@ def first_band(
     (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
     segment = capture["segment"].values if "segment" in capture else None
     time = capture["time"].values
-    functions = smooth.subspace(time, min(_ORDER, time.size // 4), segment=segment)
+    functions = smooth.subspace(time, min(ORDER, time.size // 4), segment=segment)
     basis, own = functions.functions, functions.object_part
     first, steps = np.empty((2, frames.size, height * width))
     change, unknown = np.zeros((loose.size, basis.shape[1])), np.zeros(loose.size, dtype=bool)

@@ -25,7 +25,6 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from numpy.polynomial import Polynomial
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
@@ -58,8 +57,6 @@ _DRAWS: Final = 64
 _GROWN: Final = 1e3
 # Rows of the capture that are read at once.
 _ROWS: Final = 32
-# Smooth functions of the change beside a pixel that is not solved.
-_ORDER: Final = 14
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, self.result["object_temperature_std"].values
         background = self.result["background_temperature"].values
-        basis = smooth.subspace(time, min(_ORDER, time.size // 4)).functions
+        basis = smooth.subspace(time, min(system.ORDER, time.size // 4)).functions
         parts = [slice(top, top + _ROWS) for top in range(0, len(status), _ROWS)]
         every = []
         for part in parts:
@@ -349,7 +346,7 @@ def _factor(
     common = rng.standard_normal((len(size), _DRAWS), dtype=np.float32)[labels]
     target = alone + off * common
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
-    linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
+    linear = replace(equations, bends=np.zeros_like(equations.bends))
     places = linear.solved
     signal, _, _ = linear.packed.solve(target[places], alone[places], change)
     own, power = size[:, 0] > 0, linear.spread((signal.astype(np.float64) ** 2).mean(axis=1))

@@ -131,7 +131,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
-    again = partial(separated, alone=alone, workers=workers, progress=progress)
+    # At one place a result of each pixel alone tells the materials, and has then had its use.
+    over = alone if given is None and reflection_shift is None else None
+    again = partial(separated, alone=alone, over=over, workers=workers, progress=progress)
     if materials is not None:
         result = again(replace(known, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:

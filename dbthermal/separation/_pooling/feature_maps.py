@@ -46,10 +46,12 @@ def mean_signals(
         curve = responses.curve(response, str(counts["band"].values[band]))
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
-            part = counts.isel(band=band, y=rows).astype(np.float64)
-            part = part.where(schema.measured(part))
-            means[index, rows] = curve.linearise(part.mean("time").values)
-            frames[index, rows] = part.count("time").values
+            part = counts.isel(band=band, y=rows).values
+            known = schema.measured(part)
+            frames[index, rows] = known.sum(axis=0)
+            total = np.where(known, part, 0.0).sum(axis=0, dtype=np.float64)
+            with np.errstate(invalid="ignore"):  # without a sample
+                means[index, rows] = curve.linearise(total / frames[index, rows])
     # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
     inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
     variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
