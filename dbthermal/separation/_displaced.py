@@ -9,7 +9,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,9 @@ _UNSOLVED: Final = 1e-2
 _OUTSIDE: Final = 0.1
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
+# Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
+# an image is high leaves most of them without a weight [1].
+_FEW: Final = 0.5
 # Pixels of which the noise of a resampled sample is measured, along either side.
 _AROUND: Final = 5
 # Weight below which a pixel's flags do not count [1].
@@ -242,13 +245,15 @@ def read(
     first = block.isel(
         band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
     )
-    second = block.isel(band=others, y=slice(own.start - source.start, own.stop - source.start))
+    weights = displacement.weights(rows, own)
+    used, place = _used(weights, slice(own.start - source.start, own.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
+    second = block.isel(band=others, **place)
     seen, measured, flags = quality.read(second, fewest, [grains[band] for band in others])
     seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
-    weights = without(
-        displacement.weights(rows, own), quality.unusable(flags), displacement.shape[1]
-    )
+    bad = np.zeros(weights.shape[1], dtype=bool)
+    bad[used] = quality.unusable(flags)
+    weights = without(weights, bad, displacement.shape[1])[:, used]
     counts = np.stack([counts[0]] * (len(others) + 1))
     for band, one in zip(others, seen, strict=True):
         counts[band] = (weights @ one.T).T
@@ -277,6 +282,16 @@ def read(
             key, lambda: _shared(seen[:, :, good], counts[others], gain, displacement.shape[1])
         )
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
+
+
+def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
+    """Pixels of some rows that have a weight, if few; and the places of those that are read."""
+    used, pixels = np.unique(weights.indices), weights.shape[1]
+    if used.size > _FEW * pixels:
+        return slice(None), {"y": rows}
+    y, x = np.divmod(used, pixels // (rows.stop - rows.start))
+    places = {"y": y + rows.start, "x": x}
+    return used, {name: xr.DataArray(one, dims="pixel") for name, one in places.items()}
 
 
 def _shared(seen: Array, resampled: Array, gain: Array, width: int) -> Array:
