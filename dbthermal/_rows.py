@@ -76,7 +76,7 @@ def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray
 
 
 def _once(compute: Callable[[slice], Values], shape: tuple[int, ...]) -> Callable[[slice], Values]:
-    """Return the function of rows that reads what another one has computed."""
+    """Compute all rows once, into a film; return the function that reads rows of it."""
     film = empty(shape, _Rows.dtype)
     for rows in blocks(shape):
         film[..., rows, :] = compute(rows)

@@ -189,7 +189,7 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
 
 def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None, None)) -> Mask:
     """
-    Pixels (pixel) of counts (time, pixel) of which the highest or lowest value is a heap.
+    Pixels (pixel) of counts (time, pixel) that are clipped: many samples have their end value.
 
     The lowest and highest values (2, pixel) of all samples, valid or not, may be known.
     """

@@ -27,17 +27,15 @@ __all__ = ["separate_capture"]
 __dir__ = __all__.copy
 
 # Pixels and frames, at most, of the reduced capture, from which all is found that is of the whole
-# image; and frames whose mean is registered.
+# image.
 _PIXELS: Final = 20_000
 _FRAMES: Final = 400
-_REGISTERED: Final = 200
 # Times that clock and shift of the reflections are estimated in turn, at most, the step of the
 # clock at which that ends [frame], the least share of a delay that is taken to be seen [1], and
 # trials in a row, at most, that are no better than one before.
 _ROUNDS, _LATE, _FLAT, _VAIN = 6, 0.02, 0.125, 2
 SAMPLE: Final = 220
 """Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
-_BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name
@@ -131,9 +129,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
-        some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
-        transform = register(corrected.isel(time=some), model=registration)
-        aligning = {**aligning, "transform": transform}
+        aligning = {**aligning, "transform": register(corrected, model=registration)}
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     del corrected
     result = separate(aligned, response, **{"reflection_shift": field, **separating})
@@ -213,7 +209,7 @@ def _reduced(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.
     maps = aligned.drop_vars(["y", "x"], errors="ignore")
     counts, squares = maps["counts"], dict[str, Any](y=side, x=side, boundary="trim")
     none = {dim: xr.zeros_like(maps[dim], dtype=np.int32) for dim in ("time", "y", "x")}
-    bad = (maps.get("status", none["y"] + none["x"]) & _BAD) != 0
+    bad = (maps.get("status", none["y"] + none["x"]) & int(schema.UNMEASURED)) != 0
     segment = maps.get("segment", none["time"])
     first = segment.values[np.arange(segment.size) // length * length]
     rows = []

@@ -125,6 +125,9 @@ class Status(Flags):
     NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
+UNMEASURED: Final = Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES
+"""Bits of a pixel whose samples are no measurement, before it is separated."""
+
 COMPLETED: Final = Status(sum(bit for bit in Status if bit.label.startswith("completed")))
 """Bits of a pixel of which something is completed, not measured."""
 

@@ -30,10 +30,8 @@ from dbthermal._cli.files import (
     staged,
 )
 from dbthermal._warnings import warned
-from dbthermal.separation._plausibility import against_response, hardly_measured
+from dbthermal.separation._doubts import against_response, hardly_measured
 from dbthermal.separation._run import BASE
-
-_REGISTERED = 200  # frames whose mean is registered
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, Any]:
@@ -113,8 +111,7 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     (corrected,), transform = staged(options, capture="corrected"), None
     options.register = options.register or "homography"
     if options.register != "none":
-        some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
-        transform = alignment.register(corrected.isel(time=some).load(), model=options.register)
+        transform = alignment.register(corrected, model=options.register)
     chosen = {"offset": options.offset, "search": options.search, "clock": options.reference}
     aligned = alignment.align(corrected, transform=transform, lazy=True, **chosen)
     return saved(aligned, options)

@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._resampling import interpolation
+from dbthermal.alignment._resampling import TAPS, interpolation
 from dbthermal.noise import MAD
 
 Movie = npt.NDArray[np.float32]
@@ -30,7 +30,6 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
-_TAPS: Final = 6  # neighbours a side, of which the blurred movies are interpolated
 _BORDER: Final = 4  # pixels by which they are mirrored at the border for it
 _AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
 _ROUNDS: Final = 12
@@ -149,8 +148,8 @@ def _resamplers(places: Array) -> list[sparse.csr_array]:
     border = (_BORDER, _BORDER)
     places = np.pad(places + _BORDER, ((0, 0), border, border), mode="edge")
     halves = 0.5 * np.eye(2)[:, :, np.newaxis, np.newaxis]
-    slopes = [interpolation(places + h, _TAPS) - interpolation(places - h, _TAPS) for h in halves]
-    return [interpolation(places, _TAPS), *slopes]
+    slopes = [interpolation(places + h, TAPS) - interpolation(places - h, TAPS) for h in halves]
+    return [interpolation(places, TAPS), *slopes]
 
 
 def _moments(
@@ -310,7 +309,7 @@ def delay(movies: Movies, shift: Array, times: Array) -> float:
     """
     places, (_, width, count) = np.indices(movies.shape) + shift, movies.first.shape
     steps = 0.5 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[..., np.newaxis, np.newaxis]
-    weights = [interpolation(places + step, _TAPS) for step in steps]
+    weights = [interpolation(places + step, TAPS) for step in steps]
     used = inside(places, movies.valid) & movies.valid
     for part in weights:  # none near the border
         used &= (np.diff(part.indptr) > 0).reshape(used.shape)

@@ -28,7 +28,6 @@ from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.schema import Status
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
@@ -47,7 +46,6 @@ _SIGNIFICANCE: Final = 6.0
 # Largest standard deviation of an offset [frame].
 _PRECISION: Final = 0.1
 _ORDER: Final = 8
-_UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,7 @@ def sample(corrected: xr.Dataset) -> Array:
     counts = counts.reshape(*counts.shape[:2], -1)
     usable = np.ones(counts.shape[2], dtype=bool)
     if "status" in part:
-        usable &= (part["status"].values.reshape(-1) & _UNUSABLE) == 0
+        usable &= (part["status"].values.reshape(-1) & int(schema.UNMEASURED)) == 0
     for movie in counts:
         absent = clocks.missing(movie)
         movie[absent], here = np.nan, movie[~absent]

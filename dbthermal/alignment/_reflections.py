@@ -21,10 +21,8 @@ from dbthermal.alignment import _matching as matching
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._offset import sample
-from dbthermal.schema import Status
 
-_UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
-_SMALLEST: Final = 24  # rows and columns of an image, at least
+SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _ROWS: Final = 32  # that are read at a time
 _SAMPLES: Final = 2**26  # of a band that are matched, at most: of a large image fewer frames
@@ -114,7 +112,7 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
 
 
 def seen_apart(field: xr.Dataset) -> bool:
-    """Say that a shift is more than its deviation; that of cameras at one place is not."""
+    """Say that the cameras stand apart: their shift is more than its deviation."""
     known = field["known"].values
     if not known.any():
         return False
@@ -141,17 +139,17 @@ class _Capture:
         names = [str(name) for name in counts["band"].values]
         if len(names) < 2:
             raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
-        if min(counts.shape[2:]) < _SMALLEST:
+        if min(counts.shape[2:]) < SMALLEST:
             raise ValueError(
                 f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
-                f"at least {_SMALLEST} of each to match reflections."
+                f"at least {SMALLEST} of each to match reflections."
             )
         slopes = np.array([responses.curve(response, name).reference_slope for name in names])
         noise = _noise(corrected, response, names, slopes)
         order = np.argsort(noise, kind="stable")
         valid = np.ones(counts.shape[2:], dtype=bool)
         if "status" in corrected:
-            valid &= (corrected["status"].values & _UNUSABLE) == 0
+            valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
         frames = _frames(counts)
         times, segment = corrected["time"].values[frames], clocks.segments(corrected)[frames]
         steps = np.diff(times)

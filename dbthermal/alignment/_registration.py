@@ -22,6 +22,8 @@ _FINEST: Final = 0.7
 _SMALLEST: Final = 16
 # A pixel that differs from the median around it by more than so many standard deviations is bad.
 _MEDIAN_WINDOW, _OUTLYING = 3, 6.0
+# Frames that are read, about, of a longer capture.
+_READ: Final = 200
 # Of smooth curves: most frames that they are fitted to, functions, steps of the weights, Tukey's
 # constant in standard deviations, and the least weight, which keeps a fit to few frames solvable.
 _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
@@ -118,6 +120,7 @@ def register(
         numbers, frames = np.unique(corrected["segment"], return_counts=True)
         longest = corrected["segment"].values == numbers[np.argmax(frames)]
         counts = counts.isel(time=longest)
+    counts = counts.isel(time=slice(None, None, max(1, counts.sizes["time"] // _READ)))
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         raise ValueError(
             f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "

@@ -30,7 +30,7 @@ MAP: Final = schema.Variable(
 )
 """Transform of a curved surface: for each band where each pixel of the first view lies in it."""
 
-_TAPS: Final = 6  # pixels a side that a sample between pixels is made of
+TAPS: Final = 6  # pixels a side that a sample between pixels is made of
 _ROUNDING: Final = 1e-7  # a weight that is none [1]
 _BEYOND: Final = 0.1  # so far outside the centre of the last pixel its line still holds [pixel]
 
@@ -215,7 +215,7 @@ def _weights(places: Array, bad: Mask) -> csr_array:
     """Weights as `interpolation`, of lines near the border and near bad pixels."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
-    fine = interpolation(places, _TAPS)
+    fine = interpolation(places, TAPS)
     near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
     coarse = interpolation(places, 2)
     keep, swap = (diags_array(part.astype(np.float32)) for part in (~near, near))

@@ -295,7 +295,7 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
 
 
 def _alone(change: Single, seen: Single, limit: Array, reach: int) -> Mask:
-    """Pixels (y, x) that rise by more than their limit in a frame, and none is seen to nearby."""
+    """Pixels (y, x) that jump by more than their limit in a frame in which no neighbour does."""
     shape = limit.shape
     nearby = maximum_filter1d(seen, 2 * reach + 1, axis=0, mode="constant")
     nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))

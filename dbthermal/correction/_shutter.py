@@ -228,7 +228,7 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
 
 
 def _changes(first: Integers, after: Integers) -> Integers:
-    """Fewest positions such that each event has one between its first and its next real frame."""
+    """Fewest frames that mark all events, each between its first and its next real frame."""
     chosen: list[int] = []
     for place in np.argsort(after, kind="stable"):
         if not chosen or first[place] > chosen[-1]:

@@ -19,7 +19,7 @@ from dbthermal.figures import drawing
 from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
 from dbthermal.reporting._page import Section, image_tag, save_page, table
 from dbthermal.schema import Status
-from dbthermal.separation._plausibility import against_response, hardly_measured
+from dbthermal.separation._doubts import against_response, hardly_measured
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
@@ -234,7 +234,7 @@ def _validity(view: View) -> dict[str, float]:
 
 
 def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
-    """Yield what speaks against all of it, the map of the status, and a table of the flags."""
+    """Yield the warnings, the map of the status, and the table of the flags."""
     doubts = [*view.data.attrs.get("warnings", []), *hardly_measured(view.data)]
     if view.capture is not None and view.response is not None:
         doubts += against_response(view.capture, view.response)

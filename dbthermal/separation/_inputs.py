@@ -18,9 +18,9 @@ from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.response import Curve
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
-from dbthermal.separation._displaced import Displacement
+from dbthermal.separation._apart import displaced
+from dbthermal.separation._apart.displaced import Displacement
 
 Labels = npt.NDArray[np.intp]
 
@@ -74,7 +74,7 @@ class Inputs:
     emissivity_covariance: Array | None  # (band, band, y, x) [1]
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
-    difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
+    difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `joint.Joint`
 
     @property
     def blocks(self) -> list[slice]:

@@ -12,13 +12,13 @@ import xarray as xr
 from dbthermal import alignment
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
-from dbthermal.alignment._reflections import seen_apart
+from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
+from dbthermal.separation._apart import displaced
+from dbthermal.separation._apart.side_by_side import hold
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
-from dbthermal.separation._pooling import alone as single
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._solve import get_method, separated, solve
 from dbthermal.separation._tiles import Material
@@ -36,8 +36,6 @@ _UNEXPLAINED: Final = (
     "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
     "clocks differ, the intervals of the other pixels are too small."
 )
-# Rows and columns, at least, in which a shift can be found.
-_WIDE: Final = 24
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
@@ -139,7 +137,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(again, known, corrected, alone)
     if materials is not None and reflection_shift is not None:
-        single.hold(alone, result, materials)
+        hold(alone, result, materials)
     if result is given:  # which is the caller's
         result = result.copy(deep=True)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
@@ -175,7 +173,7 @@ def _apart(
 ) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
     """First separation, the shift of the reflections if it needs one, and what is not explained."""
     apart, good = 0.0, 0.0
-    if min(corrected.sizes.get(name, 0) for name in ("y", "x")) >= _WIDE:  # solve refuses others
+    if min(corrected.sizes.get(name, 0) for name in ("y", "x")) >= SMALLEST:  # solve refuses others
         apart, good = cameras_apart(corrected, response, workers)
     if apart > 0.0:
         try:

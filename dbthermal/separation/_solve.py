@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from dbthermal import schema
 from dbthermal._arrays import empty, release
-from dbthermal.separation import _side_by_side as side_by_side
 from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._apart import side_by_side
+from dbthermal.separation._apart.side_by_side import Regroup
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._side_by_side import Regroup
 from dbthermal.separation._tiles import Estimate, Mask, Material
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ _MODULES: Final = {
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
 _COVARIANCE: Final = "emissivity_covariance"
-_KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -349,7 +348,7 @@ def _allocate(
 ) -> xr.Dataset:
     """Make an empty result of some variables with the coordinates of a capture."""
     sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
-    kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
+    kept = {name: value for name, value in corrected.attrs.items() if name in tiles.KEPT_ATTRS}
     arrays = {}
     for name, variable in variables.items():
         attrs = schema.status_attrs() if name == "status" else variable.attrs

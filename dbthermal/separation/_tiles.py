@@ -18,8 +18,8 @@ from dbthermal import mixing
 from dbthermal._arrays import namespace, select
 from dbthermal.response import Curve
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
+from dbthermal.separation._apart import displaced
 from dbthermal.separation._inputs import Inputs, Method
 from dbthermal.separation._quality import Bits, status_bits
 
@@ -28,6 +28,9 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
+
+KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
+"""Attributes of a capture that its result has, too."""
 
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""

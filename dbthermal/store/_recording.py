@@ -306,8 +306,8 @@ class DurableStore(SummedStore):
     New files are brought to the disk by `tree_to_disk`, for many at once take the time of one.
     """
 
-    def __init__(self, root: Path, *, read_only: bool = False) -> None:
-        super().__init__(root, read_only=read_only)
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
         self._written: set[str] = set()
 
     def set_sync(self, key: str, value: Buffer) -> None:

@@ -8,8 +8,8 @@ import xarray as xr
 
 from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
+from dbthermal.separation._apart import displaced
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 
 RIG = simulation.Rig()

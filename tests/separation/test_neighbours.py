@@ -8,10 +8,9 @@ import xarray as xr
 from test_displaced import RIG, TIME, field
 
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _inputs as inputs
-from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation import _quality as quality
+from dbthermal.separation._apart import displaced, neighbours
 from dbthermal.separation._solve import get_method
 from reproduction.experiments.pictures import smooth_shift
 

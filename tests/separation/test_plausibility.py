@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import calibration, schema, simulation
-from dbthermal.separation._plausibility import against_response, hardly_measured
+from dbthermal.separation._doubts import against_response, hardly_measured
 
 RIG = simulation.Rig()
 

@@ -9,8 +9,7 @@ from test_displaced import GLASS, RIG, SMALL, TIME, field, film
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
-from dbthermal.separation import _joint as joint
+from dbthermal.separation._apart import displaced, joint
 from dbthermal.separation._inputs import Inputs, Labels, check
 from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._tiles import Material

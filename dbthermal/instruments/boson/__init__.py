@@ -10,12 +10,12 @@ import threading
 import time as system_time
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import Reading, Setting
+from dbthermal.instruments.boson.commands import EnumT, Reading, Setting, T
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, Identity, over_v4l2
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
@@ -29,9 +29,6 @@ __all__ = [
     "commands",
 ]
 __dir__ = __all__.copy
-
-T = TypeVar("T")
-EnumT = TypeVar("EnumT", bound=IntEnum)
 
 BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
 REPLY_TIMEOUT: Final = 1.0  # longest wait for a reply [s], as in the vendor's own software

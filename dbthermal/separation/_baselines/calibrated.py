@@ -3,9 +3,10 @@ r"""Separation with known emissivities: as many equations as bands, in two tempe
 .. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y) \qquad (1)
 
 is solved for x and y by Newton's method from the linear closed form of Narayanan et al. (2026),
-equation 12, doi:10.48550/arXiv.2509.11334, all bands weighted by their noise (`_frames`). Each
-frame stands alone; then the object is smoothed over as many frames as its own curve allows. Errors
-of the emissivities are not lessened by that. For two bands and slopes 1, the noise of a frame is
+equation 12, doi:10.48550/arXiv.2509.11334, all bands weighted by their noise, see
+`_known_emissivity`. Each frame stands alone; then the object is smoothed over as many frames as its
+own curve allows. Errors of the emissivities are not lessened by that. For two bands and slopes 1,
+the noise of a frame is
 
 .. math:: \mathrm{var}(x) = [(1-e_2)^2 s_1^2 + (1-e_1)^2 s_2^2] / (e_1-e_2)^2, \quad
           \mathrm{var}(y) = [e_2^2 s_1^2 + e_1^2 s_2^2] / (e_1-e_2)^2 \qquad (2)
@@ -17,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal.schema import Status
-from dbthermal.separation import _frames as frames
+from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
@@ -54,14 +55,14 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
         covariance = np.zeros((len(e), *e.shape))
     level = np.zeros(e.shape[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        found = frames.solve(tile, e, level, np.full_like(level, _ANY))
+        found = known_emissivity.solve(tile, e, level, np.full_like(level, _ANY))
         solved = np.all(np.abs(found.step) < _CONVERGED, axis=0)
         signal, left = found.signal, found.white
         if settings.smooth and len(signal) > 1:
-            signal, left = frames.smooth(signal, left, solved, tile.time)
-        left = left + found.shared + frames.through(found.sensitivity[:-1], covariance)
+            signal, left = known_emissivity.smooth(signal, left, solved, tile.time)
+        left = left + found.shared + known_emissivity.through(found.sensitivity[:-1], covariance)
         behind = found.background_variance
-        behind = behind + frames.through(found.background_sensitivity[:-1], covariance)
+        behind = behind + known_emissivity.through(found.background_sensitivity[:-1], covariance)
         curve, values = tile.curves[0], list[Array]()
         for mean, variance in ((signal, left), (found.background, behind)):
             temperature = np.where(solved, tile.temperature(0, mean), np.nan)

@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtr
 
-from dbthermal.separation import _frames as frames
+from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
@@ -218,9 +218,12 @@ def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Arra
     parts = []
     for m in range(1, len(tile.noise)):
         one, information = e[m - 1], data.information[m - 1]
-        level, above = frames.other_band(tile, m, c), frames.other_band(tile, m, c + step)
-        by_e = frames.other_band(tile, m, c + (nodes - c) / grid) - level
-        raised = frames.other_band(tile, m, c + step + (nodes - c - step) / grid) - above
+        level, above = (
+            known_emissivity.other_band(tile, m, c),
+            known_emissivity.other_band(tile, m, c + step),
+        )
+        by_e = known_emissivity.other_band(tile, m, c + (nodes - c) / grid) - level
+        raised = known_emissivity.other_band(tile, m, c + step + (nodes - c - step) / grid) - above
         by_c = (above - level + one * (raised - by_e)) / step
         model = np.stack([level + one * by_e, by_e, by_c])  # (3, node, grid, pixel)
         weighted = np.einsum("ijp,ajgp->aigp", information, model)
@@ -286,7 +289,7 @@ def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected:
     Weighed against what is expected, as uncertain as it is large.
     """
     vague = np.full_like(static.level, _VAGUE)
-    free = frames.solve(tile, static.point, static.level, vague)
+    free = known_emissivity.solve(tile, static.point, static.level, vague)
     observed = means.mean(free.background, valid)
     noise = means.mean(free.background_variance, valid) / np.maximum(means.frames, 1.0)
     used = means.frames > 0

@@ -11,7 +11,7 @@ from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-from dbthermal.separation import _frames as frames
+from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
@@ -196,10 +196,12 @@ def solve(
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
         variance = np.maximum(variance, _LEAST[1] ** 2)
-        found = frames.solve(tile, static.point, static.level, variance, apart=scene.apart)
-        signal, left = frames.smooth(found.signal, found.white, valid, tile.time)
-        left = left + found.shared + frames.through(found.sensitivity, static.covariance)
-        around = frames.through(found.background_sensitivity, static.covariance)
+        found = known_emissivity.solve(
+            tile, static.point, static.level, variance, apart=scene.apart
+        )
+        signal, left = known_emissivity.smooth(found.signal, found.white, valid, tile.time)
+        left = left + found.shared + known_emissivity.through(found.sensitivity, static.covariance)
+        around = known_emissivity.through(found.background_sensitivity, static.covariance)
         around = found.background_variance + around
         values: Values = {}
         films = (signal, left), (found.background, around)

@@ -129,7 +129,9 @@ def spreads(fits: list[Gradient]) -> list[float]:
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
-    """Say that values (map, pixel) with variances go on from one region into a `second` (pixel,).
+    """Say that a quantity has no step at the border of two regions.
+
+    Of values (map, pixel) with variances on both sides, and the pixels of the `second` (pixel,).
 
     Of polynomials of the place, with a step at the border and without, the lowest Bayesian
     information criterion decides. It must leave no more than noise, and the least step (map,) must

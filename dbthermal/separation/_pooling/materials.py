@@ -44,6 +44,7 @@ _SPACINGS: Final = (8, 4, 2)
 _STEP_RATE: Final = 0.1
 # Probability that two cells without a border are said to hold one [1].
 _BORDER_RATE: Final = 0.01
+_ERROR_RATE, _RESOLUTION = 0.01, 0.1  # of `materials`, unless others are given
 # Step at a border, relative to the change of the reference band's signal, that must be visible
 # before its absence counts [1].
 _LEAST_STEP: Final = 0.05
@@ -74,8 +75,8 @@ def materials(
     corrected: xr.Dataset,
     response: xr.Dataset,
     *,
-    error_rate: float = 0.01,
-    resolution: float = 0.1,
+    error_rate: float = _ERROR_RATE,
+    resolution: float = _RESOLUTION,
     borders: bool = False,
 ) -> xr.DataArray:
     r"""Label the pixels by material, for `solve(..., pool=labels)`.
@@ -175,7 +176,8 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     ratios, _ = _features(result, _bands(result, response)[0])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     every = np.arange(cells.max() + 1)[np.newaxis]
-    means, variances, known = (part[:, 0] for part in Regions(cells, ratios, 0.01).pooled(every))
+    pooled = Regions(cells, ratios, _ERROR_RATE).pooled(every)
+    means, variances, known = (part[:, 0] for part in pooled)
 
     def distance(others: Labels) -> Array:
         """Squares of deviations (y, x) by which the own ratios differ from those of cells."""
@@ -207,8 +209,6 @@ def joined(
     alone: xr.Dataset,
     pooled: Material | None,
     response: xr.Dataset,
-    *,
-    resolution: float = 0.1,
 ) -> xr.DataArray:
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
@@ -224,9 +224,9 @@ def joined(
     emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
     parts = pooled.ratio[1:], variance[1:], *emissivity
     features = _both(*(part.reshape(-1, *cells.shape) for part in parts))
-    found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
+    found = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
-    found.join_alike(pairs, resolution)
+    found.join_alike(pairs, _RESOLUTION)
     own, boxes, grown = _features(alone, bands)[1], find_objects(cells), True
     while grown:
         grown = False
@@ -242,7 +242,7 @@ def joined(
                 for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
             )
             here = found.roots()[cells[window]]
-            if _continuous(here == one, here == other, own.window(window), resolution):
+            if _continuous(here == one, here == other, own.window(window), _RESOLUTION):
                 found.join(one, other)
                 grown = True
     return _labelled(cells, found, alone)

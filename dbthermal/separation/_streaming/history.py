@@ -1,4 +1,4 @@
-"""Memory of a stream: means of frames, of more and more of them, and what they tell of a pixel."""
+"""Means over time of the frames of a stream, and the maps of each pixel found from them."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -14,6 +14,7 @@ from numba import njit
 
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._known_emissivity import AGREE
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import Table, allocating
@@ -24,8 +25,6 @@ Planes = npt.NDArray[np.float32]
 # Latencies before and after a frame that its object is smoothed over, and the degree of the fit.
 WINDOWS: Final = ((0.0, 0.0, 1), (0.5, 0.5, 1), (2.0, 1.0, 2), (4.0, 1.0, 2))
 APART: Final = 2.0  # lengths of a mean, from which two are not neighbours
-# Deviations within which narrower fits agree with a wider one; see `_frames`.
-_AGREE: Final = 1.5
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _NAN, _SIGMAS, _LARGEST = np.float32(np.nan), np.float32(RANGE_SIGMAS), np.float32(LARGEST)
 _NEWTON: Final = 3  # steps towards the object, at most
@@ -197,7 +196,7 @@ def _fitted(
     """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower ones, in place.
 
     Of means less the reference (band, mean) [count]. The variance of the null combination's value;
-    see `_frames`.
+    see `_known_emissivity`.
     """
     low, high, variance = -np.inf, np.inf, np.nan
     for j in range(fit.variance.size):
@@ -209,7 +208,7 @@ def _fitted(
             two0 += value * means[1, i]
             two1 += slope * means[1, i]
         combined = w[0] / slopes[0] * one0 + w[1] / slopes[1] * two0
-        within = _AGREE * sqrt(null * fit.variance[j])
+        within = AGREE * sqrt(null * fit.variance[j])
         low, high = max(low, combined - within), min(high, combined + within)
         if j > 0 and low > high:
             break

@@ -14,14 +14,15 @@ import xarray as xr
 from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal.schema import Status
-from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
+from dbthermal.separation._apart import displaced
 from dbthermal.separation._solve import require_workers
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
 from dbthermal.separation._subspace.method import METHOD
 from dbthermal.separation._subspace.steps import FILMS
+from dbthermal.separation._tiles import KEPT_ATTRS
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -33,7 +34,6 @@ _PARTS: Final = 5  # means over the latency
 _LOST: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
 _ROWS: Final = 16  # that a thread takes at once
-_KEPT: Final = ("origin", "radiometric", "source", "twin")
 
 
 class Stream:
@@ -363,7 +363,7 @@ class Stream:
         if len(films) != 1:
             films = [np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)]
         maps |= zip(FILMS, films[0], strict=True)
-        attrs = {name: v for name, v in self._template.attrs.items() if name in _KEPT}
+        attrs = {name: v for name, v in self._template.attrs.items() if name in KEPT_ATTRS}
         stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
         variables = {
             name: (stage[name].dims, v, stage[name].attrs | attrs) for name, v in maps.items()
@@ -390,7 +390,7 @@ class Stream:
         list(self._threads.map(function, parts))
 
     def _pair(self, displacement: displaced.Displacement) -> None:
-        """Resample the second camera by the shift of what is reflected; see `_displaced`."""
+        """Resample the second camera by the shift of what is reflected; see `_apart.displaced`."""
         dead, width = quality.unusable(self._status), self._shape[1]
         weights = displaced.without(displacement.resample, dead.ravel(), width).astype(np.float32)
         self._gain[:] = np.sqrt((weights**2).sum(axis=1)).reshape(self._shape)

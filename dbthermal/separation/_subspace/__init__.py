@@ -1,1 +1,1 @@
-"""The subspace separator: kernels of its five steps."""
+"""The default method, "subspace": its five steps, as arrays and compiled."""

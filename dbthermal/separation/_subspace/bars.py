@@ -12,8 +12,7 @@ from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, regression, residuals
 from dbthermal.separation._subspace.kernels import inlined
-from dbthermal.separation._subspace.pixel import Line, Ratio, weights
-from dbthermal.separation._subspace.shared import Model, Work
+from dbthermal.separation._subspace.pixel import Line, Model, Ratio, Work, weights
 
 
 class Bars(NamedTuple):

@@ -1,4 +1,4 @@
-"""Are the times those of exposure? The slow changes of a capture, over its times and frames."""
+"""Refusal of times that are not those of exposure: slow changes are smooth over the frames then."""
 
 from typing import Final
 

@@ -19,8 +19,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.kernels import inlined
-from dbthermal.separation._subspace.pixel import Ratio
-from dbthermal.separation._subspace.shared import Model, Work
+from dbthermal.separation._subspace.pixel import Model, Ratio, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile, Whole
 

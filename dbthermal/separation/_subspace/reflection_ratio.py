@@ -177,10 +177,19 @@ def inverse_energy(energy: Array, length: Array, freedom: Array | float) -> Arra
 
 def ratio_variance(ratio: Array, inverse: Array, noise: Array) -> Array:
     r"""Variance :math:`\sigma^2 (s_m^2 + \kappa_m^2 s_1^2)` of ratios (band, pixel) (eq. 4)."""
-    squares = (noise**2)[:, np.newaxis]
-    result = inverse * (squares + ratio**2 * squares[0])
+    result = inverse * _ratio_error(ratio, noise)
     result[0] = 0.0
     return result
+
+
+def energy_of_variance(ratio: Array, variance: Array, noise: Array) -> Array:
+    r"""Inverse energies :math:`\sigma^2` (band - 1, pixel) of ratios and variances (eq. 4)."""
+    return variance[1:] / _ratio_error(ratio, noise)[1:]
+
+
+def _ratio_error(ratio: Array, noise: Array) -> Array:
+    squares = (noise**2)[:, np.newaxis]
+    return squares + ratio**2 * squares[0]
 
 
 def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:

@@ -1,4 +1,4 @@
-r"""Reflection ratios and emissivities as neighbouring pixels tell them, of cameras side by side.
+r"""Reflection ratios and emissivities steadied by neighbouring pixels, of cameras side by side.
 
 Paired by the shift of the reflections, the bands differ by what a shift cannot undo: the blur of
 lenses and of resampling, which a curved mirror stretches in each camera by another amount, a shift
@@ -18,10 +18,11 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 from scipy.special import chdtri
 
 from dbthermal.schema import Status
-from dbthermal.separation._displaced import TAIL
-from dbthermal.separation._equations import Array, Mask
+from dbthermal.separation._apart.displaced import TAIL
+from dbthermal.separation._apart.equations import Floats, Mask
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
+from dbthermal.separation._subspace.reflection_ratio import energy_of_variance
 from dbthermal.separation._tiles import Material
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
@@ -50,7 +51,7 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
     Their variance is times the reduced chi-square about the mean of those around. A pixel that
     shows its bands apart takes that mean, with the variance of the ratios around beside their mean.
     """
-    noise, status = inputs.noise[inputs.bands][:, np.newaxis], result["status"].values
+    noise, status = inputs.noise[inputs.bands], result["status"].values
     shape = (len(inputs.bands), *status.shape)
     ratio, std = (
         result[name].values[inputs.bands].astype(np.float64)
@@ -68,12 +69,11 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
         apart, _mean((ratio - mean) ** 2, weight, _WIDE), std**2 * np.maximum(chi, 1)
     )
     ratio = np.where(apart, mean, np.where(known, ratio, np.nan)).reshape(len(noise), -1)
-    # Eq. 4, solved for sigma^2.
-    error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
+    inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
     none = np.full(status.size, np.nan)
     return Material(
         ratio=ratio,
-        inverse_energy=(variance[1:].reshape(error.shape) / error).mean(axis=0),
+        inverse_energy=inverse.mean(axis=0),
         emissivity=none,
         noise_variance=none,
         drift_variance=none,
@@ -109,22 +109,21 @@ def materials(inputs: Inputs, threads: Executor, bar: Any) -> Material | None:
 
 def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
     """Materials with the ratios at more blur, and what it changes as a variance of them."""
-    noise, known = inputs.noise[inputs.bands][:, np.newaxis], np.isfinite(more.ratio[-1])
+    known = np.isfinite(more.ratio[-1])
     both = known & np.isfinite(less.ratio[-1])
-    change = (more.ratio / less.ratio - 1.0)[1:]
+    change = more.ratio / less.ratio - 1.0
     usual = np.median(np.abs(change[:, both]), axis=1, keepdims=True) if both.any() else 0.0
     ratio = np.where(known, more.ratio, less.ratio)
-    # Eq. 4, solved for sigma^2.
-    error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
-    off = (np.where(both, change, usual) * ratio[1:]) ** 2 / error
+    variance = (np.where(both, change, usual) * ratio) ** 2
+    off = energy_of_variance(ratio, variance, inputs.noise[inputs.bands])
     inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
     spread = np.where(known, more.spread, less.spread)
     return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)
 
 
 def shared(
-    value: Array, variance: Array, known: Mask, shape: tuple[int, ...]
-) -> tuple[Array, Array]:
+    value: Floats, variance: Floats, known: Mask, shape: tuple[int, ...]
+) -> tuple[Floats, Floats]:
     """
     Values (pixel) [1] that lean on those around, the more the less they are known; and variances.
 
@@ -146,13 +145,13 @@ def shared(
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
-def _median(part: Array, weight: Array) -> Array:
+def _median(part: Floats, weight: Floats) -> Floats:
     """Median (y, x) of the pixels around; one without weight counts as their mean."""
     filled = np.where(weight > 0, part, np.nan_to_num(_mean(part, weight, _WIDE)))
     return np.asarray(median_filter(filled, 1 + 2 * round(_WIDE), mode="nearest"))
 
 
-def _mean(part: Array, weight: Array, deviation: float) -> Array:
+def _mean(part: Floats, weight: Floats, deviation: float) -> Floats:
     """Weighted mean (..., y, x) of the pixels around; NaN without any."""
     sums = [
         gaussian_filter(one, deviation, mode="constant", axes=(-2, -1))

@@ -27,7 +27,7 @@ _STEPS: Final = 5
 _STEP: Final = 0.05
 # Half-widths grow by this factor; deviations within which estimates agree.
 _GROWTH: Final = 1.5
-_AGREE: Final = 1.5
+AGREE: Final = 1.5
 # Variance that is stated over that of the noise: the rest is what a window bends [1].
 _BENT: Final = 1.6
 # Half-width from which the polynomial is a parabola, and a line below [frame].
@@ -139,8 +139,8 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     while half < len(values) and np.any(going):
         estimate, share = _fit(sums, values_sums, position, half)
         deviation = np.sqrt(share * noise)
-        lower = np.fmax(lower, estimate - _AGREE * deviation)
-        upper = np.fmin(upper, estimate + _AGREE * deviation)
+        lower = np.fmax(lower, estimate - AGREE * deviation)
+        upper = np.fmin(upper, estimate + AGREE * deviation)
         going = going & (lower <= upper)
         # One window narrower than the widest that agrees: its bias is small beside its noise.
         better = going & (narrower[1] <= left)

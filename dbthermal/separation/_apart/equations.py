@@ -1,4 +1,4 @@
-"""Equations of the object of all pixels, of which each camera sees another place, see `_joint`."""
+"""Equations that couple the object signals at both cameras' places, of all pixels; see `joint`."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,16 +14,20 @@ from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array as Signal
+from dbthermal._arrays import Array
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
-from dbthermal.separation._displaced import without
-from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._apart.displaced import without
+from dbthermal.separation._inputs import BLOCK_ROWS, Inputs
 from dbthermal.separation._subspace.kernels import entered
-from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
+from dbthermal.separation._subspace.reflection_ratio import (
+    HIGHEST_ORDER,
+    null_combination,
+    ratio_variance,
+)
 from dbthermal.separation._tiles import Material
 
-Array = npt.NDArray[np.floating[Any]]
+Floats = npt.NDArray[np.floating[Any]]
 Mask = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.intp]
 
@@ -36,14 +40,10 @@ _LARGEST: Final = 0.95
 _MARGIN: Final = 0.02
 # Degree of the polynomial that the bend between two responses is.
 _DEGREE: Final = 4
-# Rows of the capture that are read at once.
-_ROWS: Final = 32
-# Smooth functions of the change beside a pixel that is not solved.
-ORDER: Final = 14
 
 
 @entered
-def _other_bands(shares: Array, bends: Array, signal: Array, result: Array) -> None:
+def _other_bands(shares: Floats, bends: Floats, signal: Floats, result: Floats) -> None:
     """Shares (band, pixel) times signals and their bends by Horner's rule (pixel, frame), in place.
 
     In one pass, for the arrays are larger than the cache.
@@ -67,14 +67,14 @@ with suppress(RuntimeError):  # without a folder that may be written each proces
 class Equations:
     """Equations of all pixels, and by which way each is solved."""
 
-    first: Array  # e_1 (pixel) [1]
-    shares: Array  # c of eq. 6 (band, pixel) [1]
+    first: Floats  # e_1 (pixel) [1]
+    shares: Floats  # c of eq. 6 (band, pixel) [1]
     there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
     onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
     forward: Whole  # pixels solved for x(r)
     backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
-    bends: Array  # coefficients of u_m(x) - u_1(x) of u_1(x) (band - 1, degree + 1), rising
+    bends: Floats  # coefficients of u_m(x) - u_1(x) of u_1(x) (band - 1, degree + 1), rising
 
     @cached_property
     def solved(self) -> Whole:
@@ -97,25 +97,25 @@ class Equations:
             bends=self.bends,
         )
 
-    def spread(self, values: Array) -> Array:
+    def spread(self, values: Floats) -> Floats:
         """Values (solved pixel, ...) over all pixels, 0 elsewhere."""
         result = np.zeros((self.first.size, *values.shape[1:]), dtype=values.dtype)
         result[self.solved] = values
         return result
 
-    def beside(self, signal: Array, change: Array) -> Array:
-        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
+    def beside(self, signal: Floats, change: Floats) -> Floats:
+        """Array u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
         result = np.asarray(self.there @ signal)
         result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
         return result
 
-    def other_bands(self, shares: Array, signal: Array) -> Array:
+    def other_bands(self, shares: Floats, signal: Floats) -> Floats:
         """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
         result = np.empty(signal.shape)
         _other_bands(np.ascontiguousarray(shares), self.bends, signal, result)
         return result
 
-    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
+    def solve(self, target: Floats, alone: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
         """
         Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
@@ -149,7 +149,7 @@ class Equations:
         return signal, there, step.max(axis=1)
 
 
-def first_emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
+def first_emissivity(inputs: Inputs, result: xr.Dataset) -> Floats:
     """Emissivities (band, pixel) [1] by which a pixel is solved, the quietest band first."""
     emissivity, ratio = (
         result[name].values[inputs.bands].reshape(len(inputs.bands), -1).astype(np.float64)
@@ -161,12 +161,12 @@ def first_emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
     return np.where(np.isfinite(emissivity), emissivity, middle)
 
 
-def ratio_of(emissivity: Array) -> Array:
+def ratio_of(emissivity: Floats) -> Floats:
     """Reflection ratios (band, pixel) [1] of emissivities."""
     return np.asarray((1.0 - emissivity) / (1.0 - emissivity[0]))
 
 
-def inside(emissivity: Array) -> Array:
+def inside(emissivity: Floats) -> Floats:
     """Emissivities of the same ratios, none of them outside or at the end of (0, 1)."""
     ratio = ratio_of(emissivity)
     # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
@@ -175,13 +175,13 @@ def inside(emissivity: Array) -> Array:
     return np.asarray(1.0 - ratio * most * place)
 
 
-def weights(inputs: Inputs, emissivity: Array) -> Array:
+def weights(inputs: Inputs, emissivity: Floats) -> Floats:
     """Weights w of eq. 5 (band, pixel) [1], of the bands without background."""
     noise = inputs.noise[inputs.bands]
     return null_combination(ratio_of(emissivity).astype(np.float64), noise)[0]
 
 
-def of_ratio(inputs: Inputs, material: Material) -> Array:
+def of_ratio(inputs: Inputs, material: Material) -> Floats:
     """Variance (pixel) [1] of the first weight by that of a material's ratios, 0 without one."""
     noise = inputs.noise[inputs.bands]
     std = np.sqrt(ratio_variance(material.ratio, material.inverse_energy, noise))
@@ -191,14 +191,14 @@ def of_ratio(inputs: Inputs, material: Material) -> Array:
     return np.asarray(np.nan_to_num((change[1] - change[0]) ** 2))
 
 
-def coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> Array:
+def coefficients(inputs: Inputs, emissivity: Floats, solved: Mask) -> Floats:
     """Coefficients c of eq. 6 (band, pixel) [1], of sum 1."""
     shares = np.where(solved, weights(inputs, emissivity) * emissivity, 0.0)
     shares[0, ~solved] = 1.0
     return shares.astype(np.float32)
 
 
-def equations(inputs: Inputs, emissivity: Array, solved: Mask) -> Equations:
+def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
     """Equations of the solved pixels: each for the place with the larger coefficient."""
     displacement = inputs.displacement
     assert displacement is not None
@@ -232,7 +232,7 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def _bends(curves: list[Curve]) -> Array:
+def _bends(curves: list[Curve]) -> Floats:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)
@@ -245,7 +245,7 @@ def _bends(curves: list[Curve]) -> Array:
     return bends
 
 
-def bridge(film: Array, solved: Mask) -> Array:
+def bridge(film: Floats, solved: Mask) -> Floats:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
     frames = np.arange(len(film))
     for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
@@ -257,9 +257,9 @@ def bridge(film: Array, solved: Mask) -> Array:
 
 def first_band(
     inputs: Inputs, loose: Whole, frames: Whole
-) -> tuple[Signal, Signal, Callable[[slice | Whole], Array], Array]:
+) -> tuple[Array, Array, Callable[[slice | Whole], Floats], Floats]:
     """
-    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
+    Array (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
 
     Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
     frame) [K], of any frames, and its variance (loose): smoothed over time, it is that of
@@ -270,13 +270,13 @@ def first_band(
     (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
     segment = capture["segment"].values if "segment" in capture else None
     time = capture["time"].values
-    functions = smooth.subspace(time, min(ORDER, time.size // 4), segment=segment)
+    functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4), segment=segment)
     basis, own = functions.functions, functions.object_part
     first, steps = np.empty((2, frames.size, height * width))
     change, unknown = np.zeros((loose.size, basis.shape[1])), np.zeros(loose.size, dtype=bool)
     (energy, lagged), largest = np.zeros((2, loose.size)), 0.0
-    for top in range(0, height, _ROWS):
-        rows = slice(top, min(top + _ROWS, height))
+    for top in range(0, height, BLOCK_ROWS):
+        rows = slice(top, min(top + BLOCK_ROWS, height))
         source, chosen = displacement.source(rows), (loose // width >= top)
         chosen &= loose // width < rows.stop
         counts = capture["counts"].isel(band=displacement.reference, y=source).values

@@ -1,8 +1,8 @@
-r"""Samples of two cameras that stand side by side, paired by what is reflected.
+r"""The second camera resampled so that all bands show the same reflection at each pixel.
 
 The second camera shows at p the reflection that the reference band shows at :math:`r = p + d(p)`.
 Its bands are resampled at the p of each pixel r: then all bands hold the reflection of r, and only
-the object's own signal is that of another place (`_joint`). The resampling is one sparse matrix W,
+the object's own signal is that of another place (`joint`). The resampling is one sparse matrix W,
 cubic convolution by Keys (1981), doi:10.1109/TASSP.1981.1163711, so that the noise of a resampled
 sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 """
@@ -186,7 +186,7 @@ def _interpolation(place: Array, used: Mask) -> csr_array:
 
 
 def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
-    """Indices and weights (4, place) of cubic convolution along a line, held at its ends."""
+    """Indices and weights (4, place) of cubic convolution (Keys) along a line, held at its ends."""
     place = np.clip(place, 0.0, size - 1.0)
     first = np.floor(place)
     t = place - first

@@ -1,6 +1,6 @@
-r"""The object of two cameras that stand side by side, where each sees another place of it.
+r"""Object temperature where two cameras see each reflection at different places of the surface.
 
-Paired by what is reflected (`_displaced`), the bands hold the object of two places, r of the
+Paired by what is reflected (`displaced`), the bands hold the object of two places, r of the
 reference band and p of the second camera. The combination without background (eq. 5 and 6 of
 `_subspace.method`) is
 
@@ -28,15 +28,15 @@ import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array as Signal
-from dbthermal._arrays import copied, empty, release
+from dbthermal._arrays import Array, copied, empty, release
 from dbthermal.response import Curve
 from dbthermal.schema import Status
-from dbthermal.separation import _equations as system
-from dbthermal.separation import _neighbours as neighbours
-from dbthermal.separation._equations import Array, Mask, Whole
-from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._apart import equations as system
+from dbthermal.separation._apart import neighbours
+from dbthermal.separation._apart.equations import Floats, Mask, Whole
+from dbthermal.separation._inputs import BLOCK_ROWS, Inputs
 from dbthermal.separation._subspace import residuals
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
@@ -55,8 +55,6 @@ _MOST: Final = 0.99
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
 _GROWN: Final = 1e3
-# Rows of the capture that are read at once.
-_ROWS: Final = 32
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,13 @@ class Joint:
 
     inputs: Inputs
     result: xr.Dataset  # its object temperature is x(r), its background temperature x(p)
-    emissivity: Array  # of which it is made (band, pixel) [1]
-    factor: Array  # variance of the object over that of a pixel alone (pixel) [1]
+    emissivity: Floats  # of which it is made (band, pixel) [1]
+    factor: Floats  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
     def difference(
         self, rows: slice, frames: slice | Whole = slice(None), some: slice | Whole = slice(None)
-    ) -> Array:
+    ) -> Floats:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
         here, beside = (
             self.result[f"{one}_temperature"].values[frames, rows].astype(np.float64)
@@ -99,8 +97,8 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, self.result["object_temperature_std"].values
         background = self.result["background_temperature"].values
-        basis = smooth.subspace(time, min(system.ORDER, time.size // 4)).functions
-        parts = [slice(top, top + _ROWS) for top in range(0, len(status), _ROWS)]
+        basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        parts = [slice(top, top + BLOCK_ROWS) for top in range(0, len(status), BLOCK_ROWS)]
         every = []
         for part in parts:
             film = background[:, part].reshape(time.size, -1).astype(np.float64)
@@ -165,7 +163,7 @@ def solve(
         curve = inputs.curves[inputs.bands[0]]
         weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
 
-        def moved(frames: slice | Whole) -> Array:
+        def moved(frames: slice | Whole) -> Floats:
             """Part (solved, frame) [K] of q that the inputs of the result were without."""
             apart = 0.0 if before is None else before.difference(every, frames, places).T
             return np.asarray(np.sum(weights.T[places, np.newaxis] * apart, axis=2))
@@ -174,7 +172,7 @@ def solve(
         both = partial(_both, curve, shares[:, places])
         few = system.bridge(film[some], solved)[:, places], moved(some), change(some)
 
-        def looked_at(equations: system.Equations) -> list[Array]:
+        def looked_at(equations: system.Equations) -> list[Floats]:
             """Object's signals (pixel, some frame) [K] at both places."""
             return [equations.spread(one) for one in both(*few, equations)[:2]]
 
@@ -236,12 +234,12 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     return Joint(inputs, xr.Dataset(films), emissivity, np.ones(solved.size), unsettled)
 
 
-def _parts(film: Array) -> list[slice]:
+def _parts(film: Floats) -> list[slice]:
     """Frames of a film that are solved together."""
     return [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
 
 
-def _write(film: Array, part: slice, places: Whole, curve: Curve, signal: Array) -> None:
+def _write(film: Floats, part: slice, places: Whole, curve: Curve, signal: Floats) -> None:
     """Write some frames of a film of temperatures, of signals (solved pixel, frame), in place."""
     film[part] = np.nan
     film[part, places] = curve.temperature(signal.T + curve.reference)
@@ -249,12 +247,12 @@ def _write(film: Array, part: slice, places: Whole, curve: Curve, signal: Array)
 
 def _both(
     curve: Curve,
-    shares: Array,
-    alone: Array,
-    moved: Array,
-    change: Array,
+    shares: Floats,
+    alone: Floats,
+    moved: Floats,
+    change: Floats,
     equations: system.Equations,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Object at both places and the last step [K], of a film (frame, pixel) by its shares."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread it runs in
         signal = curve.signal(alone) - curve.reference
@@ -268,12 +266,12 @@ def _both(
 def _emissivities(
     inputs: Inputs,
     result: xr.Dataset,
-    raw: Array,
+    raw: Floats,
     solved: Mask,
     equations: system.Equations,
-    looked_at: Callable[[system.Equations], list[Array]],
-    band: tuple[Signal, Signal],
-) -> tuple[system.Equations, Array, Array]:
+    looked_at: Callable[[system.Equations], list[Floats]],
+    band: tuple[Array, Array],
+) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
@@ -296,8 +294,8 @@ def _emissivities(
 
 
 def _emission(
-    places: tuple[Array, Array], band: tuple[Signal, Signal], emissivity: Array, noise: float
-) -> tuple[Array, Array, Mask]:
+    places: tuple[Floats, Floats], band: tuple[Array, Array], emissivity: Floats, noise: float
+) -> tuple[Floats, Floats, Mask]:
     """
     Emissivity of the first band as its slope over the object, its variance, and where it is told.
 
@@ -315,7 +313,7 @@ def _emission(
     return emissivity + (line.slope - emissivity) / steep, variance, known
 
 
-def _slope(abscissa: Array, ordinate: Array) -> Array:
+def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
     """Slope (pixel) of signals (pixel, frame) over others."""
     abscissa = abscissa - abscissa.mean(axis=1, keepdims=True)
     slope = (abscissa * ordinate).sum(axis=1) / (abscissa**2).sum(axis=1)
@@ -323,8 +321,8 @@ def _slope(abscissa: Array, ordinate: Array) -> Array:
 
 
 def _factor(
-    inputs: Inputs, equations: system.Equations, std: Array, variance: Array, blur: float
-) -> Array:
+    inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
+) -> Floats:
     """
     Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 

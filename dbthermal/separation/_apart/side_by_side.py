@@ -1,0 +1,146 @@
+"""Separation of cameras side by side: each pixel alone, and all together for the object, in turns.
+
+The pixels alone take the object of the second camera's place for that of the first one's, or know
+by how much the two differ from all pixels together (`joint`); these need the emissivities.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
+
+from dbthermal._arrays import release
+from dbthermal.separation._apart import joint, neighbours
+from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._tiles import Array, Mask, Material
+
+Each: TypeAlias = Callable[[Inputs, Material | None], object]
+"""Separates each pixel alone, into the result."""
+Regroup: TypeAlias = Callable[[Material | None], Labels]
+"""Labels (pixel) of materials, of what is told of those before."""
+
+# Pixels on either side of which a resampled one is made; single ones in a material are no border.
+_REACH: Final = 2
+_SINGLE: Final = 3
+# Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
+_HARDLY: Final = 0.5
+# Square of the difference in deviations that is no chance, of a pixel and of those around [1].
+_MORE: Final = 4.0
+_MORE_AROUND: Final = 1.5
+# Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
+_AROUND: Final = 1.5
+_SOME: Final = 1e-3
+# Turns of the materials and the object of each camera's own place.
+_TURNS: Final = 3
+
+
+def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
+    """Separate without materials, by the ratios of bands that are blurred alike."""
+    material, blur = None, 0.0
+    alike = None if inputs.method.survey is None else neighbours.blurred(inputs)
+    if alike is not None:
+        each(alike, None)
+        material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
+    each(inputs, material)
+    both = joint.solve(inputs, result, threads, blur=blur)
+    if both is not None:
+        each(replace(inputs, difference=both.difference), material)
+        both.finish()
+
+
+def pooled(
+    inputs: Inputs,
+    before: xr.Dataset,
+    result: xr.Dataset,
+    each: Each,
+    threads: Executor,
+    bar: Any,
+    regroup: Regroup | None = None,
+) -> None:
+    """Separate with materials, from a result of each pixel alone before.
+
+    The first are told with the object of pixels alone, and may be off as these are; the second,
+    which may regroup them, with that of the first; and the last with that of what they are then.
+    """
+    survey = partial(neighbours.materials, threads=threads, bar=bar)
+    both: joint.Joint | None = joint.from_result(inputs, before)
+    for turn in range(_TURNS):
+        # Without the difference the backgrounds, which bend the bands apart, are far off.
+        both = None if both is None else both.kept()
+        inputs = replace(inputs, difference=None if both is None else both.difference)
+        inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
+        each(inputs, material)
+        both = joint.solve(inputs, result, threads, material=material, before=both)
+        if both is None and turn > 0:  # the object hardly differs between the places
+            return
+    if both is not None:
+        each(replace(inputs, difference=both.difference), material)
+        both.finish()
+
+
+def regrouped(
+    inputs: Inputs, survey: Callable[[Inputs], Material | None], regroup: Regroup | None
+) -> tuple[Inputs, Material | None]:
+    """Inputs and a survey of their materials; of other ones, if that regroups them."""
+    material = survey(inputs)
+    labels = None if regroup is None else regroup(material)
+    if labels is None or np.all(labels == inputs.labels):
+        return inputs, material
+    inputs = replace(inputs, labels=labels)
+    return inputs, survey(inputs)
+
+
+def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
+    """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
+
+    A pixel alone has the ratio that its own changes show, with errors of how the cameras are
+    paired, or of what is mixed at an edge, in it; at the ratio of its material they are left in the
+    object. Where pooling is right, the two differ by no more than the deviation of the pixel alone.
+
+    One stays alone without a label, at the border of its material, where only alone it has no flag,
+    and where pooling hardly makes its ratio more certain. With D the mean square of the difference
+    of the objects in deviations of a pixel alone, its own or that around, the pooled variance is
+    larger by D times that of the pixel alone, if that is no chance; of one that tells nothing
+    alone, by as much as around.
+    """
+    sound, told = (one["status"].values == 0 for one in (alone, pooled))
+    stay = sound & (~told | _outer(labels.values))
+    ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
+    stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
+    both, single = sound & told & ~stay, alone["object_temperature_std"].values
+    films = [one["object_temperature"].values for one in (pooled, alone)]
+    square, variance = np.zeros((2, *both.shape))
+    for row, here in enumerate(sound & told):
+        value, other, std = (film[:, row, here].astype(np.float64) for film in (*films, single))
+        square[row, here] = np.nanmean(((value - other) / std) ** 2, axis=0)
+        variance[row, here] = np.nanmean(std**2, axis=0)
+        release()
+    local = np.where(both, _around(square, both), 0.0)
+    more = both & ((square > _MORE) | (local > _MORE_AROUND))
+    square = np.where(more, np.maximum(square, local), 1.0 * stay)
+    constant = np.where(told & ~sound, _around(square * variance, both | stay), 0.0)
+    for row, (factor, offset) in enumerate(zip(square * both, constant, strict=True)):
+        film = pooled["object_temperature_std"].values[:, row]
+        film[...] = np.sqrt(film**2 + factor * np.nan_to_num(single[:, row]) ** 2 + offset)
+        for name, part in alone.data_vars.items():
+            if part.dims[-2:] == ("y", "x"):
+                pooled[name].values[..., row, stay[row]] = part.values[..., row, stay[row]]
+        release()
+
+
+def _outer(labels: Array) -> Mask:
+    """Pixels (y, x) without a material, or at its border."""
+    whole, size = median_filter(labels, _SINGLE, mode="nearest"), 1 + 2 * _REACH
+    border = minimum_filter(whole, size) < maximum_filter(whole, size)
+    return np.asarray(border | (labels < 0))
+
+
+def _around(values: Array, known: Mask) -> Array:
+    """Mean (y, x) of the known pixels around."""
+    sums = [gaussian_filter(part, _AROUND) for part in (np.where(known, values, 0.0), known * 1.0)]
+    return np.asarray(sums[0] / np.maximum(sums[1], _SOME))
