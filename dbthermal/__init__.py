@@ -9,7 +9,7 @@ functions exchange an `xarray.Dataset` in kelvin and SI units, whose variables `
 import importlib
 from typing import Any, Final
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "alignment",

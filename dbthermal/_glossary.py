@@ -149,7 +149,10 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "separated": {
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
-            )
+            ),
+            "noise": _of("band", "count", "noise, as used"),
+            "material": _of("y x", "1", "material, -1 for none", "int32"),
+            "reflection_shift": _of("axis y x", "pixel", "shift of what is reflected", "float32"),
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {

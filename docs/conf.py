@@ -77,11 +77,17 @@ def follow_links(app: Any, exception: Exception | None) -> None:
             raise SphinxError("\n".join(sorted(faults)))
 
 
+def lead_to_pages(_: Any, __: str, source: list[str]) -> None:
+    """Lead links to notebooks, which a reader of the files finds beside `docs`, to their pages."""
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/")
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Connect the steps above with those of Sphinx."""
     app.add_html_math_renderer("mathml", (write_formula, None), (write_formula, None))
     app.add_lexer("layers", TextLexer)
     app.connect("config-inited", lambda *_: pages.write())
+    app.connect("source-read", lead_to_pages)
     app.connect("autodoc-process-docstring", document_constant, priority=100)
     # A constant's type has a signature, the constant has none.
     app.connect(

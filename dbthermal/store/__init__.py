@@ -4,7 +4,7 @@
 `join_parts` one whose rows several processes make;
 `save_numbers`, `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
 record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
-`HeldFolder` is found wherever it is moved. No other package opens or writes zarr.
+`HeldFolder` is found wherever it is moved. No other package writes zarr.
 """
 
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows

@@ -1,6 +1,6 @@
 """Datasets on disk as zarr: saved whole, or by rows, and opened; recordings opened too.
 
-No other package opens or writes zarr.
+No other package writes zarr; `readers` opens stores of others.
 """
 
 import json
