@@ -181,6 +181,8 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     """Curve of one band, by its name, of a response (stage `response` of `schema`).
 
+    Its methods take temperatures [K] to counts [count] and back, see `Curve`.
+
     Parameters
     ----------
     response : Dataset

@@ -100,7 +100,10 @@ class Flags(IntFlag):
 
 
 class Status(Flags):
-    """Validity of a pixel, bits of `status`; 0 is good."""
+    """Validity of a pixel, bits of `status` that are combined by OR; 0 is good.
+
+    What to do about each is in docs/status.md; `has_flag` asks for some by name.
+    """
 
     NO_BACKGROUND_MOTION = 1 << 0, "no rapid change: no reflection ratio, so nothing is estimated"
     CONSTANT_OBJECT = 1 << 1, "a constant object: its temperature holds, nothing else is estimated"

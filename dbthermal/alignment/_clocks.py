@@ -125,7 +125,7 @@ def exposure_times(corrected: xr.Dataset) -> Array:
         schema.check_variable(corrected["exposure_time"], schema.EXPOSURE_TIME, "'exposure_time'")
         stamps = corrected["exposure_time"].values.astype(np.float64)
     for band, row in zip(counts["band"].values, stamps, strict=True):
-        _check_stamps(row[~np.isnan(row)], str(band))
+        _check_stamps(row[~np.isnan(row)], f"band '{band}'")
     return stamps
 
 
@@ -137,7 +137,13 @@ def fill_times(stamps: Array) -> Array:
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
         frame period each.
+
+    Raises
+    ------
+    ValueError
+        If fewer than two frames have a time, or the times do not increase.
     """
+    _check_stamps(stamps[~np.isnan(stamps)], "the camera")
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
     inside = np.interp(slots, recorded, stamps[recorded])
@@ -145,17 +151,17 @@ def fill_times(stamps: Array) -> Array:
     return np.asarray(inside + step * (early + late))
 
 
-def _check_stamps(stamps: Array, band: str) -> None:
+def _check_stamps(stamps: Array, label: str) -> None:
     if stamps.size < _MINIMUM_FRAMES or not np.all(np.isfinite(stamps)):
         raise ValueError(
-            f"Invalid exposure times of band '{band}': {stamps.size} stamps. Must be finite, "
+            f"Invalid exposure times of {label}: {stamps.size} stamps. Must be finite, "
             f"{_MINIMUM_FRAMES} at least, or NaN where there is no frame."
         )
     steps = np.diff(stamps)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0))
         raise ValueError(
-            f"Unordered exposure times of band '{band}': {stamps[place]} s is followed by "
+            f"Unordered exposure times of {label}: {stamps[place]} s is followed by "
             f"{stamps[place + 1]} s. Must increase strictly."
         )
 

@@ -98,6 +98,11 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If the difference is not a positive number, or a band is unknown or named twice.
+
     Examples
     --------
     >>> filter_noise(0.04, ["8-14", "9.5", "10.6"]).values.round(3).tolist()  # [K]

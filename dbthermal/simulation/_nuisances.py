@@ -96,6 +96,11 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
         Share of frames that are lost, in [0, 1).
     rng : Generator
         Source of the losses.
+
+    Raises
+    ------
+    ValueError
+        If the share is outside, or the dataset is not of the stage.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= share < 1:
