@@ -33,8 +33,10 @@ _COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCode
 _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
-# Attributes by which other numbers would be opened than are saved.
-_DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"}
+# Attributes by which other values would be opened than are saved.
+_DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} | {
+    *("dtype", "_Unsigned", "calendar", "grid_mapping")
+}
 
 
 def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
@@ -64,9 +66,9 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     Parameters
     ----------
     dataset : Dataset
-        Of any stage; it is not changed. TypeError for a DataArray, ValueError for attributes by
-        which other numbers would be opened: `_FillValue`, `missing_value`, `scale_factor`,
-        `add_offset`.
+        Of any stage; it is not changed. TypeError for a DataArray and for values or attributes that
+        zarr cannot hold, ValueError for attributes by which other values would be opened, such as
+        `_FillValue`, `scale_factor` and times since a date.
     path : str or Path
         Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
     provenance : mapping
@@ -100,7 +102,8 @@ def save_rows(
     ----------
     parts : iterable of Dataset
         Rows from the first to the last, made when they are asked for: no more than one is held.
-        What has no y, and the attributes, are those of the first.
+        What has no y, and the attributes, are those of the first. ValueError for none, and for one
+        whose variables, coordinates or units are others.
     path, provenance : str or Path, mapping
         See `save`.
     height : int, optional
@@ -119,7 +122,10 @@ def save_rows(
     [[0, 0], [1, 0], [2, 0]]
     """
     rest = iter(parts)
-    first = next(rest)
+    if (first := next(rest, None)) is None:
+        raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
+    if height is not None and (type(height) is not int or height < 1):
+        raise ValueError(f"Invalid height {height!r} of the rows. Must be a whole number from 1.")
     _save(chain([first], rest), path, provenance, height or first.sizes.get("y"))
 
 
@@ -131,24 +137,28 @@ def _save(
 ) -> None:
     """Save parts that follow one another along y, each of a height that chunks then divide."""
     options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+    first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
         for number, part in enumerate(parts):
-            for name, variable in part.variables.items():
-                for label in _DECODED & variable.attrs.keys():
-                    found = f"Invalid attribute '{label}' of '{name}'"
-                    raise ValueError(f"{found}. Must be left out: values are kept as they are.")
+            _check(part)
+            if number == 0:
+                first = part.isel(y=slice(0)) if "y" in part.dims else part
+                attrs = {**MARK, **part.attrs, **attrs}
+            _check_same(part, first, number)
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
-            encoding = {
-                name: {"chunks": _chunks(variable, height), "compressors": _COMPRESSORS}
-                for name, variable in plain.variables.items()
-            }
-            if number == 0:
-                plain.attrs = {**MARK, **part.attrs, "provenance": json.loads(as_json(provenance))}
-            else:
+            plain.attrs = attrs  # of each part, or those of the store would be lost
+            chunks = {name: _chunks(one, height) for name, one in plain.variables.items()}
+            if number > 0:
                 rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
-                plain = plain.drop_vars(rest).drop_attrs(deep=False)
+                plain = plain.drop_vars(rest)
+            for name, one in plain.variables.items():
+                if one.chunks is not None:  # those of dask are written as those of the store
+                    plain[name] = one.chunk(dict(zip(one.dims, chunks[name], strict=True)))
+            encoding = {
+                name: {"chunks": one, "compressors": _COMPRESSORS} for name, one in chunks.items()
+            }
             plain.to_zarr(
                 SummedStore(folder),
                 zarr_format=3,
@@ -157,6 +167,49 @@ def _save(
                 **(options if number else {"mode": "w-", "encoding": encoding}),
             )
         (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
+
+
+def _check(part: xr.Dataset) -> None:
+    """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
+    every = {f"'{name}'": one.attrs for name, one in part.variables.items()}
+    for label, attrs in {"the dataset": part.attrs, **every}.items():
+        for key, value in attrs.items():
+            decoded = key in _DECODED or (key == "units" and " since " in str(value))
+            if (decoded and attrs is not part.attrs) or key == "coordinates":
+                found = f"Invalid attribute '{key}' of {label}"
+                raise ValueError(f"{found}. Must be left out: values are kept as they are.")
+            try:
+                json.dumps(value, default=lambda it: it.tolist())  # what NumPy made
+            except (AttributeError, TypeError) as error:
+                found = f"Invalid attribute '{key}' of {label}, of type {type(value).__name__}"
+                raise TypeError(f"{found}. Must be text, numbers, or lists of these.") from error
+    for name, one in part.variables.items():
+        text = one.dtype.kind == "O" and all(isinstance(it, str) for it in one.values.flat)
+        if not (
+            text
+            or one.dtype.kind in "UTMm"
+            or (one.dtype.kind in "biuf" and one.dtype.itemsize <= 8)
+        ):
+            rule = "Must be real numbers of at most 64 bits, truth values, or text"
+            raise TypeError(f"Invalid dtype {one.dtype} of '{name}'. {rule}.")
+
+
+def _check_same(part: xr.Dataset, first: xr.Dataset, number: int) -> None:
+    """Refuse a part whose variables, units or coordinates are not those of the first."""
+    for name in part.variables.keys() ^ first.variables.keys():
+        raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
+    for name, one in part.variables.items():
+        other = first.variables[name]
+        same = one.dims == other.dims and one.dtype == other.dtype
+        sizes = [[it.sizes[dim] for dim in it.dims if dim != "y"] for it in (one, other)]
+        same &= sizes[0] == sizes[1] and one.attrs.get("units") == other.attrs.get("units")
+        if same and name in part.coords and "y" not in one.dims:
+            same = bool(one.equals(other))  # type: ignore[no-untyped-call]
+        if not same:
+            raise ValueError(
+                f"Invalid '{name}' of rows {number}. Must have the dims, type, unit and, of a "
+                "coordinate, the values of the first."
+            )
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:

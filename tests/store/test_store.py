@@ -379,3 +379,83 @@ def test_text_keeps_its_record(tmp_path: Path) -> None:
     text, _, comment = (tmp_path / "a.md").read_text().partition("\n<!-- ")
     assert text == "| a |\n"
     assert json.loads(comment.removesuffix(" -->\n")) == RECORD
+
+
+def rows(count: int) -> list[xr.Dataset]:
+    """Rows of a small capture with attributes, one in each part."""
+    values = np.arange(2 * 3 * count * 4, dtype=np.float32).reshape(2, 3, count, 4)
+    counts = (("band", "time", "y", "x"), values, {"units": "count"})
+    whole = xr.Dataset({"counts": counts}, {"band": ["8-14", "9.5"], "time": np.arange(3.0)})
+    whole.attrs = {"origin": "simulated", "warnings": ["one"]}
+    return [whole.isel(y=slice(top, top + 1)) for top in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_rows_keep_the_attributes(tmp_path: Path, count: int) -> None:
+    """Parts have those of the first, in the store and its variables."""
+    store.save_rows(rows(count), tmp_path / "a.zarr", store.provenance({"frames": 3}))
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    assert opened.attrs["origin"] == "simulated"
+    assert opened.attrs["warnings"] == ["one"]
+    assert opened.attrs["provenance"]["parameters"] == {"frames": 3}
+    assert opened.counts.attrs == {"units": "count"}
+    assert opened.drop_attrs().equals(xr.concat(rows(count), "y").drop_attrs())
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    {
+        "bands": (lambda one: one.isel(band=[1, 0]), "'band' of rows 1"),
+        "times": (lambda one: one.assign_coords(time=one.time + 1.0), "'time' of rows 1"),
+        "unit": (lambda one: one.assign(counts=one.counts.assign_attrs(units="K")), "'counts'"),
+        "type": (lambda one: one.astype(np.float64), "'counts' of rows 1"),
+        "frames": (lambda one: one.isel(time=slice(2)), "of rows 1"),
+        "name": (lambda one: one.rename(counts="c"), "with, or without"),
+    }.values(),
+)
+def test_rows_of_another_kind_are_refused(
+    tmp_path: Path, change: Callable[[xr.Dataset], xr.Dataset], named: str
+) -> None:
+    """Another part is named by its number, and nothing is left behind."""
+    first, second = rows(2)
+    with pytest.raises(ValueError, match=named):
+        store.save_rows([first, change(second)], tmp_path / "a.zarr", store.provenance({}))
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_no_rows_and_no_height(tmp_path: Path) -> None:
+    """No parts, and rows of no height, are refused."""
+    with pytest.raises(ValueError, match="Must be at least one part"):
+        store.save_rows([], tmp_path / "a.zarr", {})
+    with pytest.raises(ValueError, match="Invalid height -1"):
+        store.save_rows(rows(1), tmp_path / "a.zarr", {}, height=-1)
+
+
+def test_chunks_of_dask_are_no_obstacle(tmp_path: Path) -> None:
+    """A dataset in any chunks is saved in those of the store."""
+    whole = xr.concat(rows(5), "y")
+    store.save(whole.chunk({"y": 3, "time": 2}), tmp_path / "a.zarr", store.provenance({}))
+    assert store.open_dataset(tmp_path / "a.zarr").counts.equals(whole.counts)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "error", "named"),
+    {
+        "none": (xr.Dataset({"a": ("x", np.array(["a", None], object))}), TypeError, "of 'a'"),
+        "long": (xr.Dataset({"a": ("x", np.ones(2, np.longdouble))}), TypeError, "of 'a'"),
+        "bytes": (xr.Dataset({"a": 1.0}, attrs={"z": b"x"}), TypeError, "'z' of the dataset"),
+        "dtype": (xr.Dataset({"a": ("x", [0.5], {"dtype": "bool"})}), ValueError, "'dtype' of 'a'"),
+        "since": (
+            xr.Dataset({"a": ("x", [0.5], {"units": "seconds since 2000-01-01"})}),
+            ValueError,
+            "'units' of 'a'",
+        ),
+        "names": (xr.Dataset({"a": ("x", [0.5], {"coordinates": "b"})}), ValueError, "'coordin"),
+    }.values(),
+)
+def test_what_would_open_as_other_values_is_refused(
+    tmp_path: Path, dataset: xr.Dataset, error: type[Exception], named: str
+) -> None:
+    """Values that zarr cannot hold, and attributes that it would decode by, are named."""
+    with pytest.raises(error, match=named):
+        store.save(dataset, tmp_path / "a.zarr", store.provenance({}))
