@@ -4,15 +4,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import gaussian_filter
 
-from dbthermal import alignment
+from dbthermal import _smooth as smooth
+from dbthermal import alignment, schema
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._apart.side_by_side import hold
@@ -21,6 +25,7 @@ from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._solve import get_method, separated, solve
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material
 
 if TYPE_CHECKING:
@@ -31,6 +36,10 @@ _LOOKED_AT: Final = 2000
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought,
 # if it is that by more than so many of its standard deviations.
 _APART, _SIGMAS = 0.02, 3.0
+# Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
+# displacement is looked for [pixel]; deviations and pixels from which it is one.
+_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 4, (8, 24), 4, 2.0
+_CERTAIN, _LEAST = 5.0, 0.3
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
@@ -129,15 +138,13 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
-    # At one place a result of each pixel alone tells the materials, and has then had its use.
-    over = alone if given is None and reflection_shift is None else None
-    again = partial(separated, alone=alone, over=over, workers=workers, progress=progress)
+    again = partial(separated, alone=alone, workers=workers, progress=progress)
     if materials is not None:
         result = again(replace(known, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(again, known, corrected, alone)
-    if materials is not None and reflection_shift is not None:
-        hold(alone, result, materials)
+    if materials is not None:
+        hold(alone, result, materials, borders=reflection_shift is not None)
     if result is given:  # which is the caller's
         result = result.copy(deep=True)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
@@ -195,14 +202,63 @@ def cameras_apart(
 ) -> tuple[float, float]:
     """Share of pixels with moving reflections whose bands are apart, 0 if that may be chance.
 
-    Of some pixels, for all would take long; and the share of them without a flag.
+    Of some pixels, for all would take long; and the share of them without a flag. Slow reflections
+    are simultaneous within a frame though they are apart: then the share of windows displaced.
     """
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
     some = solve(corrected.isel(y=every, x=every).load(), response, workers=workers)
     apart, moving = _pixels_apart(some)
     chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
-    return apart / moving if apart / moving > _APART + chance else 0.0, _unflagged(some)
+    share = apart / moving if apart / moving > _APART + chance else 0.0
+    return share or _displaced(corrected, response), _unflagged(some)
+
+
+def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
+    r"""Share of windows of the image in which the bands show rapid changes displaced; 0 if none do.
+
+    In each the displacement d is that of the regression of one band on another and its gradient
+    (Lucas and Kanade 1981), of both blurred, less what noise adds to the normal equations:
+
+    .. math:: z_2 = \kappa \, (z_1 + d \cdot \nabla z_1)
+
+    It is seen if its median over the windows is beyond chance, for an object's own rapid changes
+    are displaced anyhow, and is more than that of a poor registration.
+    """
+    inputs = check(corrected, response, get_method("subspace"), "subspace")
+    every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
+    counts, time = corrected["counts"].isel(time=every), corrected["time"].values[every]
+    functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+    height, width = counts.shape[-2:]
+    side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
+    tops, lefts = (
+        np.linspace(0, size - side, min(_ALONG, size // side)).astype(int)
+        for size in (height, width)
+    )
+    found = []
+    for top, left in product(tops, lefts):
+        part = counts.isel(y=slice(top, top + side), x=slice(left, left + side)).values
+        rapid = []
+        for band in inputs.bands[:2]:
+            signal = inputs.curves[band].linearise(part[band].astype(np.float64))
+            signal = np.where(schema.measured(signal).all(axis=0), signal, 0.0)
+            signal -= np.tensordot(functions, np.tensordot(functions.T, signal, 1), 1)
+            rapid.append(gaussian_filter(signal, (0.0, _BLUR, _BLUR)))
+        design = np.stack([rapid[0], *np.gradient(rapid[0], axis=(1, 2))]).reshape(3, -1)
+        normal, right = design @ design.T, design @ rapid[1].ravel()
+        # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
+        white = design.shape[1] * inputs.noise[inputs.bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
+        normal -= white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
+        if np.linalg.eigvalsh(normal)[0] > 0:
+            ratio, *shift = np.linalg.solve(normal, right)
+            found.append(np.array(shift) / ratio)
+    if len(found) < _FEWEST:
+        return 0.0
+    middle = np.median(found, axis=0)
+    error = MAD * np.median(np.abs(found - middle), axis=0) * np.sqrt(0.5 * np.pi / len(found))
+    if not np.any(np.abs(middle) > np.maximum(_CERTAIN * error, _LEAST)):
+        return 0.0
+    return float(np.mean(np.hypot(*np.transpose(found)) > _LEAST))
 
 
 def _unflagged(result: xr.Dataset) -> float:

@@ -209,7 +209,6 @@ def separated(
     inputs: Inputs,
     *,
     alone: xr.Dataset | None = None,
-    over: xr.Dataset | None = None,
     regroup: Regroup | None = None,
     workers: int = 2,
     progress: bool = False,
@@ -218,7 +217,7 @@ def separated(
     Separate checked inputs.
 
     To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
-    What is told of the materials may `regroup` them. It may be written `over` another result.
+    What is told of the materials may `regroup` them.
     """
     variables, capture = schema.STAGES["separated"], inputs.capture
     apart, pooled = inputs.displacement is not None, inputs.labels is not None
@@ -226,7 +225,7 @@ def separated(
         alone = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     if inputs.method.survey:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
-    result = _allocate(capture, variables, over)
+    result = _allocate(capture, variables)
     # Cameras apart, and materials that are regrouped, take passes that are not known beforehand.
     total = None if apart or regroup else result["status"].size * (1 + pooled)
     with (
@@ -343,17 +342,14 @@ def _separate(
         bar.update(cut.status.size)
 
 
-def _allocate(
-    corrected: xr.Dataset, variables: Mapping[str, schema.Variable], over: xr.Dataset | None
-) -> xr.Dataset:
+def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
     """Make an empty result of some variables with the coordinates of a capture."""
     sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
     kept = {name: value for name, value in corrected.attrs.items() if name in tiles.KEPT_ATTRS}
     arrays = {}
     for name, variable in variables.items():
         attrs = schema.status_attrs() if name == "status" else variable.attrs
-        shape = tuple(sizes[dim] for dim in variable.dims)
-        array = empty(shape, variable.dtype) if over is None else over[name].values
+        array = empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
         arrays[name] = xr.DataArray(array, dims=variable.dims, attrs={**attrs, **kept})
     names = ("band", "time", "y", "x")
     coordinates = {name: corrected[name] for name in names if name in corrected.coords}

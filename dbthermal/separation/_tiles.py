@@ -90,7 +90,7 @@ class Material(Pixels):
     ratio: Array  # reflection ratios (band, pixel) [1]
     inverse_energy: Array  # their variance, see `ReflectionRatio` (pixel) [1/K^2]
     emissivity: Array  # of the first band (pixel) [1]
-    noise_variance: Array  # its variance from the noise (pixel) [1]
+    noise_variance: Array  # its variance from the noise, NaN of a guess (pixel) [1]
     drift_variance: Array  # its variance from the background's slow part (pixel) [1]
     spread: Array  # variance of single pixels' ratios about these, as `inverse_energy` (pixel)
 

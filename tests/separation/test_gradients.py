@@ -177,3 +177,20 @@ def test_three_bands_with_gradients() -> None:
     print(f"ratios that change by {change} are off by {largest}, intervals {held:.3f}")
     assert held > 0.92
     assert np.all(largest < 0.1 * change)
+
+
+def test_an_undulation_is_a_spread() -> None:
+    """What undulates over some pixels is seen in squares of them, though their noise hides it."""
+    rows, columns = np.divmod(np.arange(1600), 40)
+    wave = 0.03 * np.sin(rows / 2.5) * np.sin(columns / 2.5)
+    found, alone = [], []
+    for seed in range(20):
+        cost = costs(2.0 + wave, np.full(1600, 0.07), seed)
+        fit = gradients.fit((rows, columns), (rows, columns), cost)
+        found.append(gradients.spreads([fit])[0])
+        alone.append(fit.left[0].excess()[0] > 3.0 * fit.left[0].excess()[1])
+    print(
+        f"spread {np.sqrt(np.mean(found)):.4f} of {wave.std():.4f}, in pixels {np.mean(alone):.2f}"
+    )
+    assert 0.7 < np.sqrt(np.mean(found)) / wave.std() < 1.3
+    assert np.mean(alone) < 0.5

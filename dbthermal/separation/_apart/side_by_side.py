@@ -15,6 +15,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 
 from dbthermal._arrays import release
+from dbthermal.schema import Status
 from dbthermal.separation._apart import joint, neighbours
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._tiles import Array, Mask, Material
@@ -29,6 +30,8 @@ _REACH: Final = 2
 _SINGLE: Final = 3
 # Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
 _HARDLY: Final = 0.5
+# Share of gray pixels from which their material is [1].
+_MOSTLY: Final = 0.5
 # Square of the difference in deviations that is no chance, of a pixel and of those around [1].
 _MORE: Final = 4.0
 _MORE_AROUND: Final = 1.5
@@ -95,23 +98,28 @@ def regrouped(
     return inputs, survey(inputs)
 
 
-def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
+def hold(
+    alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, borders: bool = True
+) -> None:
     """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
 
     A pixel alone has the ratio that its own changes show, with errors of how the cameras are
     paired, or of what is mixed at an edge, in it; at the ratio of its material they are left in the
     object. Where pooling is right, the two differ by no more than the deviation of the pixel alone.
 
-    One stays alone without a label, at the border of its material, where only alone it has no flag,
-    and where pooling hardly makes its ratio more certain. With D the mean square of the difference
-    of the objects in deviations of a pixel alone, its own or that around, the pooled variance is
+    One stays alone without a label, where only alone it has no flag, where pooling hardly makes its
+    ratio more certain, with `borders` at the border of its material, and where most pixels of that
+    are gray with it, too: the others are not by chance. With D the mean square of the difference of
+    the objects in deviations of a pixel alone, its own or that around, the pooled variance is
     larger by D times that of the pixel alone, if that is no chance; of one that tells nothing
     alone, by as much as around.
     """
     sound, told = (one["status"].values == 0 for one in (alone, pooled))
-    stay = sound & (~told | _outer(labels.values))
+    stay = sound & (~told | (labels.values < 0) | (_border(labels.values) & borders))
     ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
     stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
+    gray = (pooled["status"].values & np.uint32(Status.GRAY)) != 0
+    stay |= _share(labels.values, gray) > _MOSTLY
     both, single = sound & told & ~stay, alone["object_temperature_std"].values
     films = [one["object_temperature"].values for one in (pooled, alone)]
     square, variance = np.zeros((2, *both.shape))
@@ -122,8 +130,8 @@ def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
         release()
     local = np.where(both, _around(square, both), 0.0)
     more = both & ((square > _MORE) | (local > _MORE_AROUND))
-    square = np.where(more, np.maximum(square, local), 1.0 * stay)
-    constant = np.where(told & ~sound, _around(square * variance, both | stay), 0.0)
+    square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
+    constant = np.where(told & ~sound, _around(square * variance, both | (stay & sound)), 0.0)
     for row, (factor, offset) in enumerate(zip(square * both, constant, strict=True)):
         film = pooled["object_temperature_std"].values[:, row]
         film[...] = np.sqrt(film**2 + factor * np.nan_to_num(single[:, row]) ** 2 + offset)
@@ -133,11 +141,19 @@ def hold(alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray) -> None:
         release()
 
 
-def _outer(labels: Array) -> Mask:
-    """Pixels (y, x) without a material, or at its border."""
+def _share(labels: Array, holds: Mask) -> Array:
+    """Share (y, x) of the pixels of each one's material for which something holds; 0 without."""
+    numbers = labels + 1
+    share = np.bincount(numbers.ravel(), holds.ravel()) / np.maximum(
+        np.bincount(numbers.ravel()), 1
+    )
+    return np.where(labels >= 0, share[numbers], 0.0)
+
+
+def _border(labels: Array) -> Mask:
+    """Pixels (y, x) at the border of a material."""
     whole, size = median_filter(labels, _SINGLE, mode="nearest"), 1 + 2 * _REACH
-    border = minimum_filter(whole, size) < maximum_filter(whole, size)
-    return np.asarray(border | (labels < 0))
+    return np.asarray(minimum_filter(whole, size) < maximum_filter(whole, size))
 
 
 def _around(values: Array, known: Mask) -> Array:

@@ -6,7 +6,8 @@ material q is a polynomial of the place, :math:`q = \sum_k c_k f_k(x, y)`:
 .. math:: c = A^{-1} \sum b f, \quad A = \sum a f f^T, \quad C = A^{-1} (\sum v f f^T) A^{-1}
 
 It is a constant unless the Bayesian information criterion [1]_ says otherwise, and then of the
-degree that predicts best [2]_. What pixels scatter about it beyond v is their spread.
+degree that predicts best [2]_. What pixels, and squares of some, scatter about it beyond v is their
+spread: one that undulates is seen in sums over neighbours long before it is in single pixels.
 
 References
 ----------
@@ -19,7 +20,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from dbthermal._arrays import Array, Mask
 
@@ -31,6 +32,8 @@ DEGREE: Final = 4
 
 # Pixels for each coefficient, at least.
 _ENOUGH: Final = 4
+# Pixels in a square, about, of which the sum is looked at.
+_TOGETHER: Final = 16
 # Condition number of the normal equations from which a degree is not determined.
 _SINGULAR: Final = 1e8
 # Highest degree beside a step at a border.
@@ -52,13 +55,10 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Gradient:
-    """Polynomial of the place, and what the pixels show beyond it."""
+class Left:
+    """What a polynomial leaves of the costs of pixels, or of their sums over squares (part,)."""
 
-    degree: int
-    value: Array  # at the places asked for (place,)
-    variance: Array  # of it, without a spread (place,)
-    residual: Array  # of b (pixel,)
+    residual: Array  # of b
     cost: Cost
 
     def excess(self, spread: float = 0.0) -> tuple[float, float]:
@@ -67,6 +67,24 @@ class Gradient:
         deviation = np.sqrt(2.0 * np.sum((variance + spread * square) ** 2))
         total = float(np.sum(square))
         return float(np.sum(self.residual**2 - variance)) / total, float(deviation) / total
+
+    def over_squares(self, places: Places, side: int) -> "Left":
+        """Sums over squares of the image with so many pixels along a side."""
+        rows, columns = (place // side for place in places)
+        group = np.unique(rows * (1 + columns.max()) + columns, return_inverse=True)[1]
+        parts = self.residual, self.cost.square, self.cost.linear, self.cost.variance
+        residual, *cost = (np.bincount(group, one).astype(np.float64) for one in parts)
+        return Left(residual, Cost(*cost))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Polynomial of the place, and what the pixels show beyond it."""
+
+    degree: int
+    value: Array  # at the places asked for (place,)
+    variance: Array  # of it, without a spread (place,)
+    left: tuple[Left, ...]  # in single pixels, and in squares of some
 
 
 def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
@@ -87,7 +105,7 @@ def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradie
         fits.append((functions, inverse, coefficients, residual))
     if not fits:  # no pixel tells anything
         nothing = np.full(asked[0].size, np.nan)
-        return Gradient(0, nothing, nothing, np.zeros(pixels), cost)
+        return Gradient(0, nothing, nothing, (Left(np.zeros(pixels), cost),) * 2)
     # What pixels scatter beyond the highest degree is no gradient of theirs.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
@@ -106,26 +124,43 @@ def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradie
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = _powers(asked, known, more)
-    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), residual, cost)
+    left, side = Left(residual, cost), round(np.sqrt(_TOGETHER * asked[0].size / pixels))
+    return Gradient(
+        chosen,
+        value,
+        np.einsum("pi,ij,pj->p", at, covariance, at),
+        (left, left.over_squares(known, max(side, 1))),
+    )
 
 
 def spreads(fits: list[Gradient]) -> list[float]:
-    """Variance of single pixels about each gradient, 0 where none is seen.
+    """Variance of single pixels about each gradient, 0 where none is seen; or of squares of some.
 
     Few pixels do not tell it. What all materials tell together, if it is seen, is taken for the
     mean and the deviation of a normal distribution; that of a material is the posterior's mean.
     """
-    alone = [fit.excess() for fit in fits]
+    scales = [_spreads([fit.left[scale] for fit in fits]) for scale in range(2)]
+    return [max(both) for both in zip(*scales, strict=True)]
+
+
+def _spreads(fits: list[Left]) -> list[float]:
+    alone, sizes = [fit.excess() for fit in fits], [fit.residual.size for fit in fits]
     weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in alone])
     usual = float(weights @ [value for value, _ in alone]) / max(weights.sum(), _TINY)
-    if not usual * np.sqrt(weights.sum()) > _SIGMAS:
-        return [value if value > _SIGMAS * deviation else 0.0 for value, deviation in alone]
+    if not usual * np.sqrt(weights.sum()) > _seen(sum(sizes)):
+        pairs = zip(alone, sizes, strict=True)
+        return [value if value > _seen(size) * std else 0.0 for (value, std), size in pairs]
     result = []
     for fit in fits:
         value, deviation = fit.excess(usual)
         share = usual**2 / (usual**2 + deviation**2)
         result.append(max(usual + share * (value - usual), 0.0))
     return result
+
+
+def _seen(freedom: int) -> float:
+    """Deviations from which an excess is no chance: a chi-square of little freedom is skew."""
+    return float((chi2.isf(norm.sf(_SIGMAS), freedom) - freedom) / np.sqrt(2.0 * freedom))
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:

@@ -195,8 +195,12 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
 
 
 def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    """Materials (y, x), and connected pixels of none of them as further labels."""
-    free = (labels.values < 0) & ((result["status"].values & int(_UNUSABLE)) == 0)
+    """Materials (y, x), and connected pixels of none of them as further labels.
+
+    What tells nothing by itself belongs to none: it would agree with any.
+    """
+    telling = int(_UNUSABLE | schema.Status.NO_BACKGROUND_MOTION)
+    free = (labels.values < 0) & ((result["status"].values & telling) == 0)
     others = feature_maps.connected(free.astype(np.intp)) * free
     sizes = np.bincount(others.ravel())
     others[sizes[others] < _SMALLEST] = 0

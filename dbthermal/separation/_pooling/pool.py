@@ -57,12 +57,13 @@ def materials(
         told = np.isfinite(together.emissivity).sum() / max((together.frames > 0).sum(), 1)
         return found, told
 
+    unknown = np.full(whole.size, np.nan)  # the emissivity is a guess, of constant objects alone
     if known is not None:
-        return pooled(replace(known, emissivity=np.full_like(known.emissivity, np.nan)))[0]
+        return pooled(replace(known, noise_variance=unknown))[0]
     material, told = pooled(None)
     if material is None or surveyed is not None or told > _MOST_TOLD:
         return material
-    return pooled(replace(material, emissivity=np.full_like(material.emissivity, np.nan)))[0]
+    return pooled(replace(material, noise_variance=unknown))[0]
 
 
 def _survey(

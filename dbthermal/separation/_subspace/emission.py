@@ -103,7 +103,7 @@ def estimate(
     change = xp.amax(fit.emitted, axis=0) - xp.amin(fit.emitted, axis=0)
     drifting = (limit / change) ** 2 + xp.maximum(upper, linear)
     if tile.material is not None:
-        known = ratios.pooled & xp.isfinite(tile.material.emissivity)
+        known = ratios.pooled & xp.isfinite(tile.material.emissivity + tile.material.noise_variance)
         noise_variance = xp.where(known, tile.material.noise_variance, noise_variance)
         drifting = xp.where(known, tile.material.drift_variance, drifting)
     level_std = _level_std(tile, ratios, fit, noise_variance + walk)
@@ -156,7 +156,11 @@ def _alternate(
     smoothed = xp.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     target = functions.object_part @ smoothed
     temperature = tile.temperature(1, target)
-    middle = _middle(ratios.ratio)
+    middle, known = _middle(ratios.ratio), xp.zeros_like(ratios.pooled)
+    if tile.material is not None:
+        told = ratios.pooled & xp.isfinite(tile.material.emissivity)
+        middle = xp.where(told, tile.material.emissivity, middle)
+        known = told & xp.isfinite(tile.material.noise_variance)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     guess = _plain_slope(tile.blackbody(0, temperature), tile.signals[0])
     emissivity = xp.where((guess > 0) & (guess < 1), guess, middle)
@@ -172,11 +176,8 @@ def _alternate(
         rate = xp.where(slow, moved / xp.where(slow, change, 1.0), 0.0)
         before, slope_before = emissivity, line.slope
         extrapolated = line.slope + (line.slope - before) * rate / (1.0 - rate)
-        emissivity = xp.where(constant, middle, extrapolated)
-        if tile.material is not None:
-            known = ratios.pooled & xp.isfinite(tile.material.emissivity)
-            constant = constant & ~known
-            emissivity = xp.where(known, tile.material.emissivity, emissivity)
+        emissivity = xp.where(constant | known, middle, extrapolated)
+        constant = constant & ~known
         temperature, steepness, partial = _newton(tile, ratios, emissivity, target, temperature)
     assert line is not None
     return _Fit(temperature, emitted, emissivity, constant, line, steepness, partial)

@@ -277,12 +277,13 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     kernels.temperature(model.second, work.target, temperature)
     largest = max(1.0, ratios.ratio)
     middle = 0.5 * (1.0 + (largest - 1.0) / largest)
+    middle = material[2] if ratios.pooled and not np.isnan(material[2]) else middle
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     kernels.blackbody(model.first, temperature, work.emitted, work.spare)
     kernels.fill(work.lack, 1.0)
     guess = regression.moments(work.emitted, z, work.lack)[0]
     emissivity = guess if 0 < guess < 1 else middle
-    known = ratios.pooled and not np.isnan(material[2])
+    known = ratios.pooled and not np.isnan(material[2] + material[3])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     before, slope_before = np.nan, np.nan
