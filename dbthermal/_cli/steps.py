@@ -30,7 +30,7 @@ from dbthermal._cli.files import (
     staged,
 )
 from dbthermal._warnings import warned
-from dbthermal.separation._doubts import against_response, hardly_measured
+from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
 
 
@@ -142,7 +142,6 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         )
     elif options.method is None:
         doubts = [one for data in (source, response) for one in data.attrs.get("warnings", [])]
-        doubts += against_response(source, response)
         result = separation.separate(source.load(), response, **known, progress=shown)
         result = warned(result, *doubts, *hardly_measured(result))
         return saved(result, options)

@@ -22,6 +22,7 @@ from dbthermal.separation._apart import displaced
 from dbthermal.separation._apart.side_by_side import hold
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
+from dbthermal.separation._doubts import against_response
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._solve import get_method, separated, solve
@@ -94,7 +95,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     Dataset
         As from `complete`, and `material` (y, x). Attribute `reflection_shift` says whether one was
         "given", "found" or "none"; `warnings`, and a UserWarning, that bands are apart and no shift
-        explains it.
+        explains it, or that the counts lie outside the response, as those of another band.
 
     Raises
     ------
@@ -118,6 +119,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
+    unlike = against_response(corrected, response)
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     if alone is not None:
         made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}
@@ -151,7 +153,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     result = filled(result, corrected, response, beside, workers)
     if materials is not None:
         result["material"] = materials
-    return warned(result.assign_attrs(reflection_shift=source), *doubts)
+    return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
 
 
 def _over_found_materials(

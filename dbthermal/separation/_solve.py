@@ -247,7 +247,9 @@ def separated(
         _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
-    doubts = dict.fromkeys(one for attrs in sources for one in attrs.get("warnings", []))
+    doubts = dict.fromkeys(
+        str(one) for attrs in sources for one in np.atleast_1d(attrs.get("warnings", []))
+    )
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)

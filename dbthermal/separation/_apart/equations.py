@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, release
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart.displaced import without
@@ -245,10 +245,20 @@ def _bends(curves: list[Curve]) -> Floats:
     return bends
 
 
+def told(film: Floats) -> tuple[Mask, Mask]:
+    """Pixels of a film (frame, pixel) with a number in some frame, and in every one."""
+    some, every = np.zeros(film.shape[1], dtype=bool), np.ones(film.shape[1], dtype=bool)
+    for frame in film:
+        known = np.isfinite(frame)
+        some, every = some | known, every & known
+        release()
+    return some, every
+
+
 def bridge(film: Floats, solved: Mask) -> Floats:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
     frames = np.arange(len(film))
-    for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
+    for pixel in np.flatnonzero(solved & ~told(film)[1]):
         known = np.isfinite(film[:, pixel])
         if known.any():
             film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])

@@ -155,8 +155,7 @@ def solve(
             for name in ("object_temperature", "background_temperature", "object_temperature_std")
         )
         raw = system.first_emissivity(inputs, result)
-        solved = np.all(np.isfinite(raw), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
-        release()
+        solved = np.all(np.isfinite(raw), axis=0) & system.told(film)[0]
         equations = system.equations(inputs, system.inside(raw), solved)
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         first, steps, change, variance = system.first_band(inputs, equations.loose, some)
@@ -216,7 +215,7 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film = copied(result["object_temperature"].values).reshape(result.sizes["time"], -1)
         emissivity = system.inside(system.first_emissivity(inputs, result))
-        solved = np.all(np.isfinite(emissivity), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
+        solved = np.all(np.isfinite(emissivity), axis=0) & system.told(film)[0]
         equations = system.equations(inputs, emissivity, solved)
         change = system.first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
         curve, there = inputs.curves[inputs.bands[0]], empty(film.shape, film.dtype)

@@ -189,6 +189,10 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
                 f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
                 "standard deviation. Must be of one that does, as 'subspace'."
             )
+    measured = result["emissivity"].where(result["status"] == 0).values
+    if np.any(bad := (measured <= 0.0) | (measured >= 1.0)):
+        rule = "Must lie in (0, 1) where the status is 0, and not in per cent"
+        raise ValueError(f"Invalid emissivity {measured[bad][0]} of the result. {rule}.")
     return laid_on(result, corrected, "the result", "the capture")
 
 
@@ -227,7 +231,8 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
     """Fill in missing values, and set the bits that say so."""
     y, x = np.divmod(places, completed.sizes["x"])
-    filled = np.zeros(places.size, dtype=bool)
+    filled, beyond = np.zeros((2, places.size), dtype=bool)
+    curve = scene.inputs.curves[scene.inputs.bands[0]]
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
         both = (name, f"{name}_std")
@@ -235,12 +240,15 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
         new = [values[one][order] if name in MAPS else values[one] for one in both]
         take = np.isnan(old[0]) & np.isfinite(new[0]) & np.isfinite(new[1])
         filled |= take.any(axis=0)
+        if name == FILMS[0]:
+            beyond |= np.any(take & tiles.out_of_range(new[0], new[1], curve), axis=0)
         for one, pair in zip(both, zip(new, old, strict=True), strict=True):
             completed[one].values[:, y, x] = np.where(take, *pair)
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
     completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
+    completed["status"].values[y, x] |= beyond * np.uint32(Status.OUTSIDE_RESPONSE)
 
 
 def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:

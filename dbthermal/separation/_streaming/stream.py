@@ -20,15 +20,13 @@ from dbthermal.separation._apart import displaced
 from dbthermal.separation._solve import require_workers
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
+from dbthermal.separation._streaming.kernels import Planes
 from dbthermal.separation._subspace.method import METHOD
 from dbthermal.separation._subspace.steps import FILMS
-from dbthermal.separation._tiles import KEPT_ATTRS
+from dbthermal.separation._tiles import KEPT_ATTRS, Array
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
-
-Array = npt.NDArray[np.float64]
-Planes = npt.NDArray[np.float32]
 
 _PARTS: Final = 5  # means over the latency
 _LOST: Final = 1.5  # intervals between frames, from which some are lost
@@ -250,7 +248,12 @@ class Stream:
 
     def _checked(self, time: npt.ArrayLike, frames: Any, segment: int) -> tuple[Array, Planes]:
         """Times (time) and frames (band, time, y, x), the quietest band first."""
-        times, counts = np.asarray(time, dtype=np.float64), np.asarray(frames)
+        if isinstance(frames, xr.DataArray):
+            if "band" in frames.coords:
+                places = schema.band_positions(frames, [*self.bands], "the frames")
+                frames = frames.isel(band=places)
+            frames = frames.transpose("band", ..., "y", "x").values
+        times, counts = np.asarray(time, dtype=np.float64), np.ma.asarray(frames)
         if counts.dtype.kind != "f":
             raise TypeError(
                 f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "
@@ -274,8 +277,8 @@ class Stream:
             raise ValueError(f"Invalid segment {segment} after {self._segment}. Must not fall.")
         if segment > self._segment:  # a mean is of one segment
             self._segment, self._filled = int(segment), 0
-        counts = counts.reshape(2, -1, *self._shape)
-        return times, counts if self._order[0] == 0 else counts[::-1]
+        planes = counts.filled(np.nan).reshape(2, -1, *self._shape)
+        return times, planes[:: 1 if self._order[0] == 0 else -1]
 
     def _take(self, now: float, frame: Planes) -> bool:
         """Take a frame (band, y, x) into the block that is being filled; true if it is full."""
@@ -363,23 +366,20 @@ class Stream:
         if len(films) != 1:
             films = [np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)]
         maps |= zip(FILMS, films[0], strict=True)
-        attrs = {name: v for name, v in self._template.attrs.items() if name in KEPT_ATTRS}
+        kept = {name: v for name, v in self._template.attrs.items() if name in KEPT_ATTRS}
         stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
-        variables = {
-            name: (stage[name].dims, v, stage[name].attrs | attrs) for name, v in maps.items()
-        }
+        variables = {n: (stage[n].dims, v, stage[n].attrs | kept) for n, v in maps.items()}
         variables["status"][2].update(schema.status_attrs())
         coords = {name: self._template[name] for name in self._template.coords}
         coords["other_band"] = coords["band"].rename(band="other_band")
         time = ("time", np.concatenate([[], *known]), schema.COORDINATES["time"].attrs)
-        result = xr.Dataset(variables, {**coords, "time": time}, attrs)
-        back = np.argsort(self._order)
-        return result.isel(band=back, other_band=back).assign_attrs(
-            method="stream",
-            response_kind=self._kind,
-            reference_band=str(self._template["band"].values[0]),
-            lost_frames=self.lost_frames,
+        attrs = kept | {"method": "stream", "response_kind": self._kind}
+        attrs |= {"reference_band": str(self._template["band"].values[0])}
+        result, back = (
+            xr.Dataset(variables, {**coords, "time": time}, attrs),
+            np.argsort(self._order),
         )
+        return result.isel(band=back, other_band=back).assign_attrs(lost_frames=self.lost_frames)
 
     def _rows(self) -> list[slice]:
         """Rows that threads take at once."""
