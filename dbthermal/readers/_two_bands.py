@@ -75,11 +75,7 @@ def two_bands(
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
     pair = (first, second)
-    listed: Any = bands
-    several = isinstance(listed, Sequence) and not isinstance(listed, str) and len(listed) == 2
-    names = [str(one) for one in listed if isinstance(one, str) and one.strip()] if several else []
-    if len({*names}) != 2:
-        raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
+    names = _names(bands)
     for name, one in zip(names, pair, strict=True):
         _check(one, name)
     if offset is not None:
@@ -136,6 +132,15 @@ def two_bands(
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
     borders = [_border(part, name) for part, name in zip(parts, names, strict=True)]
     return warned(capture, *_temperatures(parts), *filter(None, borders))
+
+
+def _names(bands: Any) -> list[str]:
+    """Names of two bands, which must be texts, and differ."""
+    several = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
+    names = [str(one) for one in bands if isinstance(one, str) and one.strip()] if several else []
+    if len({*names}) != 2:
+        raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
+    return names
 
 
 def _border(part: npt.NDArray[np.uint16], name: str) -> str:
