@@ -253,6 +253,8 @@ def test_report_and_explorer(results: Path) -> None:
     assert found.returncode == 0, found.stderr
     assert "rows 2 to 8, columns 2 to 8" in (results / "out.html").read_text(encoding="utf-8")
     done(results, "explore", *shown, "-o", "look.ipynb")
+    for name in ("scene", "aligned"):
+        done(results, "explore", f"{name}.zarr", "-o", f"{name}.ipynb")
     notebook = nbformat.read(results / "look.ipynb", as_version=4)
     nbformat.validate(notebook)
     paths = ", ".join(repr(str(results / name)) for name in shown)
@@ -509,6 +511,7 @@ def test_mistakes_are_explained_in_words_of_the_commands(
         ("calibrate --blackbody scene.zarr --frames 64 -o x.zarr", "frames", "--blackbody"),
         ("calibrate --sweep a b --bands a b -o x.zarr", "bands", "--sweep"),
         ("calibrate --maker a --correction-output y -o x", "correction-output", "--maker"),
+        ("calibrate --clock 10 -o x", "", ""),
         (SWEEP.replace("--bands", "--variable q --bands"), "variable", "TIFF"),
         ("align corrected.zarr --offset 0 --search 5 -o x.zarr", "search", "--offset"),
         ("separate aligned.zarr response.zarr --method naive --workers 2 -o x", "workers", "--met"),

@@ -62,6 +62,8 @@ def _of_files(options: argparse.Namespace) -> dict[str, str]:
             kinds |= {kind_of(path, options) for path in paths}
     sources = {"blackbody": "frames", "sweep": "", "maker": "frames correction_output"}
     stated = [one for one in sources if vars(options).get(one)]
+    if options.command == "calibrate" and not (options.at or stated):
+        return {}
     taken = " ".join(_FORM[kind] for kind in kinds).split()
     names = [one for one in " ".join(_FORM.values()).split() if one not in taken]
     names += sources[stated[0]].split() if stated and not kinds else []
