@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from dbthermal._cli import is_source, leaves
+from dbthermal._cli import is_source, leaves, unused
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -45,7 +45,7 @@ def _kelvin(text: str) -> float:
         value, unit = float(text[:-1]), text[-1:]
         kelvin = value + {"C": 273.15, "K": 0.0}[unit]
     except (KeyError, ValueError) as error:
-        rule = "Must be a number with its unit, such as 20C or 293.15K"
+        rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"
         raise argparse.ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
     if unit == "C" and value > _UNIT_DOUBTED:
         warnings.warn(f"{text} is {kelvin:g} K; kelvin are written {value:g}K.", stacklevel=1)
@@ -56,7 +56,7 @@ def _kelvin(text: str) -> float:
 
 
 def _kelvin_or_path(text: str) -> float | Path:
-    return _kelvin(text) if re.fullmatch(r"[-+\d.]+ ?\W?[A-Za-z]?", text) else Path(text)
+    return _kelvin(text) if re.fullmatch(r"[-+\d.,]+ ?\W?[A-Za-z]?", text) else Path(text)
 
 
 _KINDS: Final[dict[str, Any]] = {
@@ -283,6 +283,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = tell
     options = _parsed(arguments)
     try:
+        unused.refuse(options, sys.argv[1:] if arguments is None else arguments)
         return _carry_out(options)
     except BrokenPipeError:  # nobody reads the summary any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -253,6 +253,8 @@ def test_report_and_explorer(results: Path) -> None:
     assert found.returncode == 0, found.stderr
     assert "rows 2 to 8, columns 2 to 8" in (results / "out.html").read_text(encoding="utf-8")
     done(results, "explore", *shown, "-o", "look.ipynb")
+    for name in ("scene", "aligned"):
+        done(results, "explore", f"{name}.zarr", "-o", f"{name}.ipynb")
     notebook = nbformat.read(results / "look.ipynb", as_version=4)
     nbformat.validate(notebook)
     paths = ", ".join(repr(str(results / name)) for name in shown)
@@ -449,12 +451,11 @@ def test_compiling_is_noticed_once(tmp_path: Path) -> None:
     assert took.startswith("data: ")
 
 
-def test_the_explorer_says_what_it_lacks(tmp_path: Path) -> None:
+def test_the_explorer_says_what_it_lacks(results: Path) -> None:
     """Without the explorer's extra, its notebook comes with the command that installs it."""
-    (tmp_path / "a.zarr").mkdir()
-    command = ["explore", "a.zarr", "--overwrite", "-o", "a.ipynb"]
+    command = ["explore", "result.zarr", "--overwrite", "-o", "a.ipynb"]
     for missing in ("anywidget", "jupyterlab"):
-        found = run(tmp_path, *command, before=f"sys.modules['{missing}'] = None; ")
+        found = run(results, *command, before=f"sys.modules['{missing}'] = None; ")
         assert "opened by: python -m pip install 'dbthermal[explorer]' jupyter" in found.stdout
 
 
@@ -472,6 +473,16 @@ def test_the_explorer_says_what_it_lacks(tmp_path: Path) -> None:
         ("separate aligned.zarr response.zarr --offset 0 -o x.zarr", "Unused option --offset."),
         ("info result.zarr/status", "an array. Must be the store that it is in: 'result.zarr'."),
         ("report result.zarr -o x.html --region 0 900 0 4", "Invalid rows 0 to 900, columns 0 to"),
+        (
+            "report result.zarr aligned.zarr response.zarr nuc.zarr -o x.html",
+            "Invalid 3 stores beside 'result.zarr'. Must be its capture, and the cameras' response",
+        ),
+        (
+            "explore result.zarr aligned.zarr response.zarr nuc.zarr -o x.ipynb",
+            "Invalid 3 stores beside 'result.zarr'. Must be its capture, and the cameras' response",
+        ),
+        ("explore response.zarr -o x.ipynb", "Invalid result 'response.zarr' of stage 'response'."),
+        ("explore result.zarr nuc.zarr -o x.ipynb", "Missing variable 'counts' in the capture"),
     ],
 )
 def test_mistakes_are_explained_in_words_of_the_commands(
@@ -479,6 +490,47 @@ def test_mistakes_are_explained_in_words_of_the_commands(
 ) -> None:
     """Missing options, raw counts, exchanged stores and places outside have a line each."""
     assert reason in refused(results, *arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option", "why"),
+    [
+        ("import scene.zarr --unit K -o x.zarr", "unit", "a store"),
+        ("import scene.zarr --clock=99 -o x.zarr", "clock", "a store"),
+        ("import scene.zarr --offset 5 -o x.zarr --dry-run", "offset", "a store"),
+        ("import scene.zarr --bands a b -o x.zarr", "bands", "a store"),
+        (f"{ONE} --shape 3 3 -o x.zarr", "shape", "TIFF"),
+        (f"{ONE} --header 0 -o x.zarr", "header", "TIFF"),
+        (f"{ONE} --byte-order big -o x.zarr", "byte-order", "TIFF"),
+        (f"{ONE} --variable q -o x.zarr", "variable", "TIFF"),
+        ("import a.seq b.seq --bands a b --unit count -o x.zarr", "unit", "FLIR"),
+        ("import a.seq + b.npy --shape 9 9 -o x.zarr --variable q --header 3", "", ""),
+        ("info scene.zarr --clock 10", "clock", "a store"),
+        ("info a.tif --unit count --clock 10 --frame-header 3", "frame-header", "TIFF"),
+        ("calibrate --blackbody scene.zarr --clock 10 -o x.zarr", "clock", "--blackbody"),
+        ("calibrate --blackbody scene.zarr --frames 64 -o x.zarr", "frames", "--blackbody"),
+        ("calibrate --sweep a b --bands a b -o x.zarr", "bands", "--sweep"),
+        ("calibrate --maker a --correction-output y -o x", "correction-output", "--maker"),
+        ("calibrate --clock 10 -o x", "", ""),
+        (SWEEP.replace("--bands", "--variable q --bands"), "variable", "TIFF"),
+        ("align corrected.zarr --offset 0 --search 5 -o x.zarr", "search", "--offset"),
+        ("separate aligned.zarr response.zarr --method naive --workers 2 -o x", "workers", "--met"),
+        ("separate aligned.zarr response.zarr --emissivity 1 1 -o x", "emissivity", "--method"),
+        ("export result.zarr --pixel 1 1 -o x.tif", "pixel", ".tif"),
+        ("export result.zarr --region 0 1 0 1 -o x.nc", "region", ".nc"),
+        ("export result.zarr --variable emissivity -o x.nc", "variable", ".nc"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    results: Path, arguments: str, option: str, why: str
+) -> None:
+    """What the files, the output or another option leave without effect is named, one as another.
+
+    Options that one of two cameras' files takes are taken.
+    """
+    line = refused(results, *arguments.split())
+    rule = rf"Unused option --{option}\. Must be left out with(out)? {re.escape(why)}"
+    assert re.search(rule, line) if option else "Unused" not in line
 
 
 @pytest.mark.parametrize(
@@ -533,7 +585,9 @@ def test_temperatures_below_zero(tmp_path: Path) -> None:
     line = refused(tmp_path, "complete", *"abc", "--surroundings", "-40C", "-o", "d.zarr")
     assert "No file or folder 'a'" in line
     found = run(tmp_path, "calibrate", "--at", "5c", "a.tif", "b.tif", "-o", "a.zarr")
-    assert "Invalid temperature '5c'. Must be a number with its unit" in found.stderr
+    assert "Invalid temperature '5c'. Must be a number, with a decimal point, and" in found.stderr
+    found = run(tmp_path, "calibrate", "--at", "25,0C", "a.tif", "b.tif", "-o", "a.zarr")
+    assert "Invalid temperature '25,0C'. Must be a number, with a decimal point" in found.stderr
 
 
 @pytest.mark.parametrize(

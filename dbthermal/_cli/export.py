@@ -123,17 +123,26 @@ def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, 
     return {"variables": sorted(map(str, result.data_vars))}
 
 
+def _shown(options: argparse.Namespace, stages: str) -> list[xr.Dataset]:
+    """Result, and its capture and the cameras' response, as far as they are to be shown beside."""
+    if len(options.shown) > 2:
+        found = f"{len(options.shown)} stores beside '{options.result}'"
+        raise ValueError(f"Invalid {found}. Must be its capture, and the cameras' response.")
+    return [*staged(options, result=stages), *map(opened, options.shown)]
+
+
 def report(options: argparse.Namespace) -> dict[str, Any]:
     """Command `report`."""
     from dbthermal import reporting  # noqa: PLC0415 - optional
 
-    (result,), shown = staged(options, result="separated"), [*map(opened, options.shown)]
+    result, *shown = _shown(options, "separated")
     reporting.report(result, options.output, *shown, regions=_regions(result, options.region))
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 
 
 def explore(options: argparse.Namespace) -> dict[str, Any]:
     """Command `explore`: a notebook of one cell, which JupyterLab opens."""
+    explorer.View(*_shown(options, "separated|corrected|capture"))  # or the notebook cannot
     paths = ", ".join(repr(str(path.resolve())) for path in [options.result, *options.shown])
     cell: dict[str, Any] = {"id": "explore", "cell_type": "code", "metadata": {}, "outputs": []}
     cell |= {"execution_count": None, "source": f"import dbthermal\n\ndbthermal.explore({paths})"}

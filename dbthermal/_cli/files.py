@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
 from dbthermal._cli import PLUS, is_source, leaves
+from dbthermal._cli.unused import kind_of
 from dbthermal._warnings import warned
 
 _MADE_BY = {
@@ -20,9 +21,7 @@ _MADE_BY = {
     "response": "calibrate",
     "separated": "separate",
 }
-_TIFF = {".tif", ".tiff", ".btf"}
 _NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
-_ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
 
 
 def opened(path: Path) -> xr.Dataset:
@@ -52,17 +51,17 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
     """Recording of one camera, by the kind of its files."""
-    kind, clock = paths[0].suffix.lower(), options.clock
-    if options.shape is None and kind not in _TIFF | _ARRAYS:
+    kind, clock = kind_of(paths[0], options), options.clock
+    if kind == "FLIR":
         return readers.flir(paths, clock=clock)
     for name in ("unit", "clock"):
         if getattr(options, name) is None:
             raise ValueError(f"Missing --{name}: '{paths[0].name}' does not tell. Must be stated.")
-    if kind in _TIFF:
+    if kind == "TIFF":
         return readers.tiff(paths, unit=options.unit, clock=clock)
     if len(paths) > 1:
-        raise ValueError(f"Invalid list of {len(paths)} '{kind}'. Must be one file of all frames.")
-    if kind in _ARRAYS:
+        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
+    if kind == "arrays":
         return readers.array(paths[0], options.variable, unit=options.unit, clock=clock)
     return readers.raw(
         paths[0],

@@ -123,7 +123,6 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     if options.correction:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
-    _refuse_unused(options)
     source, response, *fitted = staged(options, **stages)
     tell_of_compiling()
     response.load()
@@ -163,20 +162,6 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             progress=shown,
         )
     return described(options.output)
-
-
-def _refuse_unused(options: argparse.Namespace) -> None:
-    """Refuse an option of `separate` that another one leaves without effect."""
-    apart = "without --correction, for the capture is aligned"
-    unused = {"emissivity": "without --method", "register": apart, "offset": apart}
-    if options.correction:
-        unused = dict.fromkeys(("method", "emissivity"), "with --correction")
-    elif options.method:
-        unused = dict.fromkeys(("surroundings", "prior"), "with --method: 'dbthermal complete'")
-        unused |= {"register": apart, "offset": apart}
-    for name, why in unused.items():
-        if getattr(options, name) is not None:
-            raise ValueError(f"Unused option --{name}. Must be left out {why}.")
 
 
 def tell_of_compiling() -> None:

@@ -1,5 +1,6 @@
 """Counts in files of NumPy, HDF5, NetCDF and zarr, or in an array that is opened already."""
 
+import re
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -16,7 +17,11 @@ from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._recording import Clock
 
-_PLACES: Final = {"time": 0, "y": 1, "x": 2, "band": None}  # of dims that have these names
+# Names of dims by their place, and those of an array without names, of any case.
+_DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
+_WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
+_UNITS: Final = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ATTRIBUTES: Final = ("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value")
 
 
@@ -38,10 +43,12 @@ def array(
     ----------
     source : str, Path, array or DataArray
         Regular file, folder of zarr, or an array with `shape` and `dtype`: (time, y, x), uint16.
+        Dims with names must have one of their place: time, t, frame, image; y, row, height; x,
+        column, col, width.
     name : str, optional
         Name of the array in a file of several, such as ``"entry/frames"``.
     unit, clock, memory
-        As for `tiff`; an array's own ``units`` must agree.
+        As for `tiff`; an array's own ``units``, and its times to half a frame, must agree.
 
     Returns
     -------
@@ -54,10 +61,10 @@ def array(
         If the file does not exist.
     ImportError
         If h5py, the extra ``recordings``, is not installed for HDF5, which NetCDF 4 is too.
-    ValueError
+    TypeError, ValueError
         If a file is of another format, or damaged; the array is not one of three dimensions and
-        uint16, has other dims, is scaled, lacks values, or is not in the file; as `tiff` for unit,
-        clock, memory and 8 bits.
+        uint16, has other dims, is scaled, lacks values, has times that the clock contradicts, or is
+        not in the file; as `tiff` for unit, clock, memory and 8 bits.
 
     Examples
     --------
@@ -68,25 +75,32 @@ def array(
     """
     label = Path(source).name if isinstance(source, str | Path) else "array"
     recordings.check_unit(unit, label)
+    recordings.check_number(memory, "memory")
 
     own = dict[str, Any]()
 
-    def check(values: Any, dims: Sequence[Any]) -> None:
-        if any(_PLACES.get(dim, place) != place for place, dim in enumerate(dims)):
-            raise ValueError(f"Invalid dims {[*dims]} of '{label}'. Must be (time, y, x).")
+    def check(values: Any, dims: Sequence[Any], times: Any = None) -> None:
+        for dim, names in zip(dims, _DIMS, strict=False):
+            if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
+                rule = "Must be (time, y, x): rename or transpose"
+                raise ValueError(f"Invalid dims {[*dims]} of '{label}'. {rule}.")
         attrs = getattr(values, "attrs", {})
         own.update({name: attrs[name] for name in _ATTRIBUTES if name in attrs})
         for scale in {"scale_factor", "add_offset"} & own.keys():
             raise ValueError(f"Invalid '{scale}' of '{label}'. Must be counts as measured.")
         dtype = getattr(values, "dtype", np.dtype(object))
-        _check(np.shape(values), dtype, memory, label)
+        _check(getattr(values, "shape", ()), dtype, memory, label)
         said = own.get("units", own.get("unit", unit))
         recordings.check_unit(said.decode() if isinstance(said, bytes) else str(said), label)
+        if times is not None:
+            _check_times(times, clock, label)
 
     with ExitStack() as stack:
         values = source
         if not isinstance(source, str | Path):
-            check(source, source.dims if isinstance(source, xr.DataArray) else ())
+            coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
+            times = [one for one in coords if containers.are_times(one.name, one)]
+            check(source, containers.dims_of(source), *times[:1])
         elif containers.kind_of(Path(source)):
             values = containers.read(Path(source), name, check, memory, stack)
         else:
@@ -94,8 +108,7 @@ def array(
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
     fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
-    if np.ma.is_masked(values) or (fills and np.isin(counts, fills).any()):
-        raise ValueError(f"Missing counts in '{label}': masked, or {fills}. Must all be there.")
+    recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
     return recordings.clocked(counts, clock, label, format="array")
 
 
@@ -105,6 +118,27 @@ def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: st
         rule = "Must be uint16: counts, neither temperatures nor objects"
         raise ValueError(f"Invalid dtype {dtype} of '{name}'. {rule}.")
     recordings.check_memory(shape, memory, name)
+
+
+def _check_times(times: Any, clock: Clock, name: str) -> None:
+    """Raise ValueError for an array's own times that do not rise, or that the clock contradicts."""
+    own, unit = np.asarray(times[...]), times.attrs.get("units", "s")
+    unit = (unit.decode() if isinstance(unit, bytes) else str(unit)).partition(" since ")[0]
+    if own.dtype.kind in "mM":
+        own, unit = (own - own[0]) / np.timedelta64(1, "s"), "s"
+    if own.dtype.kind not in "iuf":
+        return
+    if (unit := _UNITS.get(unit, unit)) not in _SECONDS:
+        raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
+    seconds = (own.astype(np.float64) - own[0]) * _SECONDS[unit]
+    stated = recordings.stamps(clock, len(seconds), name)
+    near = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
+    near &= np.diff(seconds, prepend=-1.0) > 0
+    if not near.all():
+        first = int(np.argmin(near))
+        found = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
+        rule = "Must agree to half a frame, and rise: give clock= the times, or leave those out"
+        raise ValueError(f"Invalid times of '{name}': {found}. {rule}.")
 
 
 def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:

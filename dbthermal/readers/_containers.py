@@ -16,6 +16,7 @@ import zarr
 from dbthermal.readers import _recording as recordings
 
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
+_NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
 def kind_of(path: Path) -> str:
@@ -27,8 +28,24 @@ def kind_of(path: Path) -> str:
     return "HDF5" if start == b"\x89HDF\r\n\x1a\n" else "NetCDF" if start[:3] == b"CDF" else ""
 
 
+def dims_of(values: Any) -> list[Any]:
+    """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty of one that has none."""
+    if isinstance(values, zarr.Array):
+        own: Any = values.attrs.get("_ARRAY_DIMENSIONS", ())
+        return [*(getattr(values.metadata, "dimension_names", None) or own)]
+    dims = getattr(values, "dims", getattr(values, "dimensions", ()))
+    if not hasattr(values, "is_virtual"):
+        return [*dims]
+    return [dim.label or (dim[0].name.rpartition("/")[2] if len(dim) else "") for dim in dims]
+
+
+def are_times(name: object, values: Any) -> bool:
+    """Tell whether an array is a coordinate of times, by its name."""
+    return values.ndim == 1 and str(name).rpartition("/")[2].lower() in {"time", "t"}
+
+
 def read(
-    path: Path, name: str | None, check: Callable[[Any, Any], None], memory: float, stack: ExitStack
+    path: Path, name: str | None, check: Callable[..., None], memory: float, stack: ExitStack
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
     kind = kind_of(path)
@@ -40,25 +57,30 @@ def read(
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
         found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
-        values, dims = found[recordings.array_name(found, name, path)]
-        check(values, dims)
+        films = [key for key, one in found.items() if one.ndim == 3]
+        name = recordings.array_name(films, name, path)
+        values, dims = found[name], dims_of(found[name])
+        times = found.get("/".join([*name.split("/")[:-1], *map(str, dims[:1])]))
+        if isinstance(times, zarr.Array):
+            _check_chunks(times, path)
+        check(values, dims, times if times is not None and times.ndim == 1 else None)
         if isinstance(values, zarr.Array):
             _check_chunks(values, path)
         return values[...]
 
 
-def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
     h5py = recordings.optional("h5py", "recordings")
     file = stack.enter_context(h5py.File(path, "r"))
-    found, headers = dict[str, tuple[Any, list[str]]](), [8]
+    found, headers = dict[str, Any](), [8]
 
     def visit(name: str, one: Any) -> None:
         headers.append(h5py.h5o.get_info(one.id).addr)
-        if isinstance(one, h5py.Dataset) and one.ndim == 3:
-            found[name] = (one, [dim.label or next(iter(dim.keys()), "") for dim in one.dims])
+        if isinstance(one, h5py.Dataset) and _NO_VARIABLE not in str(one.attrs.get("NAME")):
+            found.update({name: one} if one.ndim == 3 or are_times(name, one) else {})
 
     file.visititems(visit)  # follows no link to another file
-    for name, (one, _) in found.items():
+    for name, one in found.items():
         if one.is_virtual or one.external:
             raise ValueError(f"Invalid '{name}' in other files. Must be in '{path.name}' itself.")
         start = one.id.get_offset() if one.chunks is None else None
@@ -75,7 +97,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
     return found
 
 
-def _netcdf(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
     opened = xr.open_dataset(
         path,
         engine="scipy",
@@ -101,26 +123,25 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
                 there = content[start - size :][: one[0].size * kind.itemsize].view(">u2")
                 if not np.array_equal(one[0].values.ravel(), there):
                     raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-    return {
-        str(name): (one, [*map(str, one.dims)]) for name, one in variables.items() if one.ndim == 3
-    }
+    return {str(n): one for n, one in variables.items() if one.ndim == 3 or are_times(n, one)}
 
 
-def _foreign_store(path: Path, _: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         root = zarr.open(str(path), mode="r")
         found: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
             found = dict(root.members(max_depth=None))
-    arrays = {n: one for n, one in found.items() if isinstance(one, zarr.Array) and one.ndim == 3}
+    arrays = {n: one for n, one in found.items() if isinstance(one, zarr.Array)}
+    arrays = {n: one for n, one in arrays.items() if one.ndim == 3 or are_times(n, one)}
     for name, one in arrays.items():
-        recordings.check_memory(one.shards or one.chunks, 2.0**30, f"a chunk of '{name}'")
-        if missing := one.nchunks - one.nchunks_initialized:
+        chunk = (1, 1, *(one.shards or one.chunks))[-3:]
+        recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
+        if one.ndim == 3 and (missing := one.nchunks - one.nchunks_initialized):
             raise ValueError(
                 f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
             )
-    names = {name: getattr(one.metadata, "dimension_names", None) for name, one in arrays.items()}
-    return {n: (one, [str(dim) for dim in names[n] or ()]) for n, one in arrays.items()}
+    return arrays
 
 
 def _check_chunks(values: zarr.Array[Any], path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbthermal import _text as texts
+from dbthermal.readers import _recording as recordings
 
 MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
 PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
@@ -39,6 +40,9 @@ def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> 
     """Decode a video left of `width` [pixel]; see `dbthermal.readers.palette_video`."""
     import av  # noqa: PLC0415  (a spectrum needs no video codec)
 
+    recordings.check_number(memory, "memory")
+    if width is not None:
+        recordings.check_number(width, "width", whole=True)
     content = texts.regular_file(path, int(memory)).read_bytes()
     kinds = _CONTAINERS.items()
     form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)

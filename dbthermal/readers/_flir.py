@@ -115,10 +115,10 @@ def flir(
     OSError, ImportError
         If a file cannot be opened, or an image is compressed and PyAV, the extra ``recordings``, is
         not installed.
-    ValueError
+    TypeError, ValueError
         If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
         differ in size or in the maker's constants; the byte order is unclear or contradicts the
-        image; the counts have 8 bits; or the times are unknown or fall.
+        image; the counts have 8 bits; the times are unknown or fall; or memory is no number.
 
     Examples
     --------
@@ -129,11 +129,12 @@ def flir(
     """  # noqa: E501
     paths = recordings.files(path)
     name = recordings.label(paths)
-    wanted = frames or slice(None)
+    recordings.check_number(memory, "memory")
+    wanted = slice(None) if frames is None else frames
     with ExitStack() as stack:
         try:
             selected = islice(_walk(paths, memory, stack), wanted.start, wanted.stop, wanted.step)
-        except ValueError as error:
+        except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"Invalid frames {frames}. Must be >= 0, and the step > 0.") from error
         listed = [*selected]
         if not listed:

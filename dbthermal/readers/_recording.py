@@ -32,6 +32,7 @@ _REFUSED: Final = {
     **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
+_FASTEST: Final = 1e6  # frame rate of a camera [Hz]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
 # What the libraries of the formats raise for files that are damaged.
 DAMAGE: Final = (
@@ -83,8 +84,25 @@ def damage_named(found: str, rule: str) -> Iterator[None]:
         raise ValueError(f"{found}: {message}. Must be {rule}.") from error
 
 
+def check_number(value: Any, name: str, *, whole: bool = False) -> None:
+    """Raise TypeError or ValueError for an argument that is not one finite, or whole, number."""
+    rule = f"Must be a {'whole' if whole else 'finite'} number"
+    array = np.asarray(value)
+    if array.ndim or array.dtype.kind not in ("iu" if whole else "iuf"):
+        raise TypeError(f"Invalid {name} {texts.shown(value)}. {rule}.")
+    if not np.isfinite(array):
+        raise ValueError(f"Invalid {name} {value}. {rule}.")
+
+
+def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bool = False) -> None:
+    """Raise ValueError where counts are masked, or values that stand for missing ones."""
+    if masked or (fills and np.isin(counts, fills).any()):
+        raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
+
+
 def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
     """Raise ValueError if counts (time, y, x) take more memory than is allowed."""
+    check_number(memory, "memory")
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
     frames, height, width = map(int, shape)
@@ -113,7 +131,7 @@ def array_name(found: Collection[str], name: str | None, path: Path) -> str:
     """Name of an array in a file, which may be left out if there is one alone."""
     if name is None and len(found) == 1:
         return next(iter(found))
-    if name in found:
+    if name in [*found]:
         return str(name)
     if not found:
         rule = "Must have one; a store of dbthermal that has two bands is a capture as it is"
@@ -124,7 +142,7 @@ def array_name(found: Collection[str], name: str | None, path: Path) -> str:
 
 def check_unit(unit: str, name: str) -> None:
     """Raise ValueError if the numbers of a file are no counts."""
-    if unit not in {"count", "counts"}:
+    if str(unit) not in {"count", "counts"}:
         raise ValueError(
             f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
             "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
@@ -134,7 +152,7 @@ def check_unit(unit: str, name: str) -> None:
 
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
-    if value not in {"little", "big"}:
+    if str(value) not in {"little", "big"}:
         raise ValueError(f"Invalid byte_order '{value}' for '{name}'. Must be 'little' or 'big'.")
     return "<" if value == "little" else ">"
 
@@ -143,13 +161,18 @@ def stamps(clock: Clock, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
     stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
     values = stated.values.astype(np.float64)
+    rule = f"Must be a rate in (0, {_FASTEST:g}] Hz, or one finite time each in s"
     if values.ndim == 0:
-        if not 0 < values < np.inf:
-            raise ValueError(f"Invalid clock {values} of '{name}'. Must be a positive rate in Hz.")
+        if not 0 < values <= _FASTEST:
+            raise ValueError(f"Invalid clock {values} of '{name}'. {rule}.")
         return np.arange(frames) / float(values)
-    if values.shape != (frames,) or not np.all(np.isfinite(values)):
+    if (
+        values.shape != (frames,)
+        or not np.all(np.isfinite(values))
+        or (0 < np.ptp(values) * _FASTEST < frames - 1)
+    ):
         found = f"clock of shape {values.shape} for {frames} frames of '{name}'"
-        raise ValueError(f"Invalid {found}. Must be a rate in Hz, or one finite time each in s.")
+        raise ValueError(f"Invalid {found}. {rule}.")
     return np.asarray(values - values[0])
 
 

@@ -16,7 +16,8 @@ from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._recording import Clock, Paths
 
-# What a page must say: the attribute of tifffile's page, its name in messages, and the value.
+# What a page must say: the attribute of tifffile's page, or the tag, which is 1 where it is
+# missing; its name in messages, and the value.
 _FORM: Final = (
     ("compression", "compression", 1, "none: save it uncompressed"),
     ("bitspersample", "bits of a pixel", 16, "16: counts, not a picture"),
@@ -24,7 +25,11 @@ _FORM: Final = (
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
     ("is_tiled", "tiled pages", False, "False: save it in strips"),
+    (262, "photometric interpretation", 1, "1: more counts are whiter"),
+    (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
+_METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
+_SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _FIRST: Final = 8  # frames that tell rows from columns
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
@@ -36,8 +41,9 @@ _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re
 
 # Numbers of images along axes, as ImageJ and OME write them.
 _AXES: Final = re.compile(
-    r"""(?:^(?:channels|slices|frames)=|\bSize[CZT]=")([0-9]{1,9})""", re.MULTILINE
+    r"""(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""", re.MULTILINE
 )
+_OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slices are ImageJ's own
 
 
 def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
@@ -69,10 +75,13 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     OSError, ImportError
         If a file cannot be opened, or tifffile, the extra ``recordings``, is not installed.
     ValueError
-        If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, or
-        two bands in one;
-        a page is compressed, in tiles, in colours or not of 16 bits, or differs in size; the counts
-        take too much memory or have 8 bits; or the clock does not fit.
+        If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, two
+        bands in one, or axes that are not time, rows, columns; a page is compressed, in tiles, in
+        colours or not of 16 bits, or differs in size; it is mirrored, rotated, scaled (GDAL), or
+        white where it is 0; counts are those of no data, take too much memory or have 8 bits; or
+        the clock does not fit.
+    TypeError
+        If clock, memory or a header are no numbers.
 
     Examples
     --------
@@ -102,6 +111,7 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
             form = f"{page.order}u2"
             values[at : at + length // 2] = np.fromfile(page.path, form, length // 2, offset=offset)
             at += length // 2
+    recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
     return recordings.clocked(counts, clock, name, format="TIFF", **decided)
@@ -152,11 +162,14 @@ def raw(
     name = one.name
     recordings.check_unit(unit, name)
     order = recordings.byte_order(name, byte_order)
-    sizes = {"shape": min(shape, default=0) - 1, "header": header, "frame_header": frame_header}
-    for label, value in sizes.items():
-        if value < 0 or (label == "shape" and len(shape) != 2):
-            stated = {"shape": shape}.get(label, value)
-            raise ValueError(f"Invalid {label} {stated} of '{name}'. Must be of positive sizes.")
+    for label, value in {"header": header, "frame_header": frame_header}.items():
+        recordings.check_number(value, f"{label} of '{name}'", whole=True)
+        if value < 0:
+            raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
+    sizes = np.asarray(shape)
+    if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
+        rule = "Must be rows and columns, two whole numbers"
+        raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
     frame = frame_header + 2 * shape[0] * shape[1]
     frames, rest = divmod(one.stat().st_size - header, frame)
     if frames < 1 or rest:
@@ -184,6 +197,7 @@ class _Page(NamedTuple):
     images: int
     order: str
     spans: list[tuple[int, int]]
+    missing: list[float]
 
 
 def _pages(path: Path) -> list[_Page]:
@@ -251,8 +265,9 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         span = f" from {values.min():g} to {values.max():g}" if values.size else ""
         rule = "Must be 16-bit counts, not temperatures: record or export those"
         raise ValueError(f"Invalid values of page {number}, {page.dtype}{span}. {rule}.")
-    for attribute, label, value, rule in _FORM:
-        if (found := getattr(page, attribute)) != value:
+    for key, label, value, rule in _FORM:
+        found = page.tags.valueof(key, 1) if isinstance(key, int) else getattr(page, key)
+        if found != value:
             raise ValueError(f"Invalid {label} {found} of page {number}. Must be {rule}.")
     shape = (int(page.imagelength), int(page.imagewidth))
     spans = list[tuple[int, int]]()
@@ -265,17 +280,36 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     total = sum(length for _, length in spans)
     if not shape[0] * shape[1] or total != 2 * shape[0] * shape[1]:
         raise ValueError(f"Truncated: {total} bytes of page {number}. Must be 2 x {shape}.")
-    return _Page(path, shape, 1, order, spans)
+    return _Page(path, shape, 1, order, spans, _no_data(page, number))
+
+
+def _no_data(page: Any, number: int) -> list[float]:
+    """Values of missing counts, by GDAL's tags of a page, which must say that it is not scaled."""
+    for role, text in _SCALING.findall(str(page.tags.valueof(_METADATA, ""))):
+        if float(text) != (none := float(role == "scale")):
+            found = f"GDAL {role} {text} of page {number}"
+            raise ValueError(f"Invalid {found}. Must be {none:g}: counts as measured.")
+    return [float(text) for text in str(page.tags.valueof(_NO_DATA, "")).strip("\0").split()]
 
 
 def _stated(description: str) -> int:
     """Number of images that ImageJ or tifffile wrote into a description, 0 if none is there."""
-    axes = [int(size) for size in _AXES.findall(description)]
+    stated = _AXES.findall(description)
+    axes = [int(size) for *_, size in stated]
+    names = "".join((a or b)[0].upper() for a, b, size in stated if int(size) > 1) + "YX"
+    names = names.replace("S", "Z").replace("F", "T")  # of ImageJ's slices and frames
     if shaped := description.startswith('{"shape": ['):
-        shape = json.loads(description)["shape"]
+        about = json.loads(description)
+        shape = about["shape"]
         axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
+        every = str(about.get("axes", "YX"))
+        named = zip(every[:-2], shape, strict=False)
+        names = "".join(name for name, size in named if size != 1) + every[-2:]
     if sum(size > 1 for size in axes) > 1:
         raise ValueError(f"Invalid axes of {axes} images. Must be one, time: a band is a file.")
+    if not _OVER_TIME.fullmatch(names):
+        rule = "Must be TYX, time, rows and columns: a band is a file"
+        raise ValueError(f"Invalid axes {names} of the images. {rule}.")
     if found := _IMAGEJ.match(description):
         return int(found.group(1))
     return math.prod(axes) if shaped else 0

@@ -1,7 +1,8 @@
 """Two recordings as one capture of two bands."""
 
+from collections.abc import Sequence
 from datetime import datetime
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +10,9 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
+from dbthermal._text import shown
 from dbthermal._warnings import warned
+from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
@@ -51,8 +54,9 @@ def two_bands(
     Raises
     ------
     TypeError, ValueError
-        If a recording is not one of counts in one band, sizes differ, bands repeat, there is no
-        offset and no date, the recordings do not overlap in time, or they hold the same counts.
+        If a recording is not one of counts in one band, or its times are unknown, infinite or fall;
+        bands are not two different names; sizes differ; an offset is no number, or there is none
+        and no date; the recordings do not overlap in time, or they hold the same counts.
 
     Warns
     -----
@@ -71,11 +75,11 @@ def two_bands(
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
     pair = (first, second)
-    names = [str(band) for band in bands]
+    names = _names(bands)
     for name, one in zip(names, pair, strict=True):
         _check(one, name)
-    if names[0] == names[1]:
-        raise ValueError(f"Repeated band '{names[0]}'. Must be two names.")
+    if offset is not None:
+        recordings.check_number(offset, "offset")
     shapes = [(one.sizes["y"], one.sizes["x"]) for one in pair]
     if shapes[0] != shapes[1]:
         raise ValueError(
@@ -130,6 +134,15 @@ def two_bands(
     return warned(capture, *_temperatures(parts), *filter(None, borders))
 
 
+def _names(bands: Any) -> list[str]:
+    """Names of two bands, which must be texts, and differ."""
+    several = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
+    names = [str(one) for one in bands if isinstance(one, str) and one.strip()] if several else []
+    if len({*names}) != 2:
+        raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
+    return names
+
+
 def _border(part: npt.NDArray[np.uint16], name: str) -> str:
     """Sentence on rows and columns at the border of a band that have one value in all frames."""
     some = part[:: 1 + len(part) // _FRAMES]
@@ -165,6 +178,12 @@ def _check(one: xr.Dataset, name: str) -> None:
                 f"Invalid recording of band '{name}': '{variable}' is {found}. Must be {dims}, as "
                 "from a reader of recordings."
             )
+    for variable in ("time", "exposure_time"):
+        values = schema.check_numbers(one[variable], f"'{variable}' of band '{name}'", "s").values
+        known = values[~np.isnan(values)] if variable == "exposure_time" else values
+        if not known.size or not np.isfinite(known).all() or np.any(np.diff(known) <= 0):
+            rule = "Must be known, finite and rise; an exposure time may be NaN, not all"
+            raise ValueError(f"Invalid '{variable}' of band '{name}' {shown(values)}. {rule}.")
     if one["counts"].dtype != np.uint16:
         dtype = one["counts"].dtype
         raise TypeError(f"Invalid dtype {dtype} of the counts of band '{name}'. Must be uint16.")

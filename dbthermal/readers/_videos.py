@@ -76,10 +76,11 @@ def palette_video(
     ------
     OSError
         If the file cannot be opened.
-    ValueError
+    TypeError, ValueError
         If the palette is unknown or another fits better; the file is of another container or
-        checksum, takes more than `memory`, cannot be decoded to its end or has a damaged frame; its
-        timestamps do not increase, or its frames or its length are not the declared ones.
+        checksum, takes more than `memory`, a number, cannot be decoded to its end or has a damaged
+        frame; its timestamps do not increase, or its frames or its length are not the declared
+        ones.
 
     Examples
     --------
@@ -140,7 +141,7 @@ def masked_palette_video(
 
     Raises
     ------
-    FileNotFoundError, ValueError
+    FileNotFoundError, TypeError, ValueError
         As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
 
     Examples

@@ -66,15 +66,133 @@ def test_arrays_of_other_libraries() -> None:
         read(scene().tolist())
 
 
-@pytest.mark.parametrize("dims", [("y", "x", "t"), ("time", "x", "y"), ("band", "y", "x")])
-def test_dims_in_another_order(tmp_path: Path, dims: tuple[str, ...]) -> None:
-    """Dims whose names say that they are not (time, y, x) are refused, of a file and an array."""
-    array = xr.DataArray(scene(), dims=dims)
-    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
+def named(folder: Path, dims: tuple[str, ...]) -> dict[str, Any]:
+    """Arrays and files whose dims have names."""
+    array = xr.DataArray(scene(), dims=dims, name="frames")
+    group = zarr.open_group(folder / "3.zarr", mode="w", zarr_format=3)
     group.create_array("frames", data=scene(), dimension_names=dims)
-    for source in (array, tmp_path / "a.zarr"):
-        with pytest.raises(ValueError, match=r"Invalid dims \[.*'\. Must be \(time, y, x\)"):
+    array.to_dataset().to_zarr(folder / "2.zarr", zarr_format=2)
+    with pytest.importorskip("h5py").File(folder / "a.h5", "w") as file:
+        file["frames"] = scene()
+        for place, dim in enumerate(dims):
+            file["frames"].dims[place].label = dim
+    return {
+        **{name: folder / name for name in ("2.zarr", "3.zarr", "a.h5")},
+        "array": array,
+        "variable": array.variable,
+        "zarr": group["frames"],
+    }
+
+
+@pytest.mark.parametrize(
+    "dims",
+    [
+        ("y", "x", "t"),
+        ("time", "x", "y"),
+        ("band", "y", "x"),
+        ("frame", "Column", "row"),
+        ("t", "width", "height"),
+        ("time", "lat", "lon"),
+        ("channel", "y", "x"),
+    ],
+)
+def test_dims_in_another_order(tmp_path: Path, dims: tuple[str, ...]) -> None:
+    """Dims whose names are not those of (time, y, x) are refused, of a file and an array."""
+    for source in named(tmp_path, dims).values():
+        expected = r"Invalid dims \[.*'\. Must be \(time, y, x\): rename or transpose"
+        with pytest.raises(ValueError, match=expected):
             read(source)
+
+
+@pytest.mark.parametrize(
+    "dims", [("Frame", "ROWS", "cols"), ("image", "height", "width"), ("dim_0", "phony_dim_1", "x")]
+)
+def test_names_of_dims_in_order(tmp_path: Path, dims: tuple[str, ...]) -> None:
+    """Names of the field in any case, and those that a library makes up, are taken."""
+    for source in named(tmp_path, dims).values():
+        assert_array_equal(read(source).counts, scene())
+
+
+def test_dims_of_netcdf_without_variables(tmp_path: Path) -> None:
+    """A dim of NetCDF 4 that has no values is no clock, and its name that of its scale."""
+    with pytest.importorskip("h5py").File(tmp_path / "a.nc", "w") as file:
+        frames = file.create_dataset("frames", data=scene())
+        for place, (dim, size) in enumerate(zip(("time", "y", "x"), frames.shape, strict=True)):
+            file[dim] = np.zeros(size, "f4")
+            file[dim].make_scale("This is a netCDF dimension but not a netCDF variable.")
+            frames.dims[place].attach_scale(file[dim])
+    assert_array_equal(read(tmp_path / "a.nc").counts, scene())
+
+
+@pytest.mark.parametrize(
+    ("times", "units", "fault"),
+    [
+        ([0.0, 0.1, 0.2], "s", ""),
+        ([5.0, 5.1, 5.21], None, ""),
+        ([0, 100, 200], "milliseconds since 2000-01-01", ""),
+        ([0.0, 0.5, 1.0], "s", r"Invalid times of '.*': frame 1 at 0\.5 s, by clock= at 0\.1"),
+        ([0.2, 0.1, 0.0], "s", "frame 1 at -0.1 s.* Must agree to half a frame, and rise"),
+        ([0.0, np.nan, 0.2], "s", "frame 1 at nan s"),
+        ([0, 1, 2], "frames", "Invalid units 'frames' of the times of"),
+    ],
+)
+def test_times_of_an_array_agree_with_the_clock(
+    tmp_path: Path, times: Any, units: str | None, fault: str
+) -> None:
+    """An array's own times that contradict the clock are refused, of a file and an array."""
+    time = ("time", times, {} if units is None else {"units": units})
+    array = xr.DataArray(scene(), {"time": time}, ("time", "y", "x"), "frames")
+    signed = array.astype("i2").assign_attrs(_Unsigned="true").to_dataset()
+    signed.to_netcdf(tmp_path / "a.nc", engine="scipy")
+    for form in (2, 3):
+        options: Any = {"group": "entry", "zarr_format": form, "consolidated": False}
+        array.to_dataset().to_zarr(tmp_path / f"{form}.zarr", **options)
+    with pytest.importorskip("h5py").File(tmp_path / "a.h5", "w") as file:
+        file.update({"frames": scene(), "time": times})
+        file["time"].attrs.update(time[2])
+        file["time"].make_scale("time")
+        file["frames"].dims[0].attach_scale(file["time"])
+    names = ("a.nc", "a.h5", "2.zarr", "3.zarr")
+    for source in (array, *(tmp_path / name for name in names)):
+        if fault:
+            with pytest.raises(ValueError, match=fault):
+                read(source)
+        else:
+            assert_allclose(read(source).time, [0, 0.1, 0.2])
+
+
+def test_dates_of_an_array_agree_with_the_clock() -> None:
+    """Dates are times, too, and those of text are not compared."""
+    array = xr.DataArray(scene(), dims=("time", "y", "x"))
+    steps = np.arange(3) * np.timedelta64(100, "ms")
+    read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + steps))
+    read(array.assign_coords(time=["a", "b", "c"]))
+    with pytest.raises(ValueError, match=r"frame 1 at 0\.3 s, by clock= at 0\.1"):
+        read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + 3 * steps))
+
+
+@pytest.mark.parametrize("clock", [0, -1.0, np.nan, np.inf, 1e300, 2e6, 1e-9 * np.arange(3)])
+def test_clocks_of_no_camera(clock: Any) -> None:
+    """A frame rate beyond a million a second is refused, as rate or as times."""
+    expected = r"Invalid clock .* of 'array'\. Must be a rate in \(0, 1e\+06\] Hz"
+    with pytest.raises(ValueError, match=expected.replace("of", ".*of", 1)):
+        read(scene(), clock=clock)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "rule"),
+    [
+        ("memory", "1e9", "a finite number"),
+        ("memory", np.nan, "a finite number"),
+        ("memory", True, "a finite number"),
+        ("unit", ["count"], "'count'"),
+        ("clock", None, "a real number"),
+    ],
+)
+def test_arguments_of_another_type(argument: str, value: Any, rule: str) -> None:
+    """What is no number, or no unit, is named with its value and the rule."""
+    with pytest.raises((TypeError, ValueError), match=rf"{argument}.*Must be {rule}"):
+        read(scene(), **{argument: value})
 
 
 def test_scaled_and_missing_counts(tmp_path: Path) -> None:

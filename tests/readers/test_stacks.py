@@ -20,13 +20,22 @@ FORMS: dict[str, dict[str, Any]] = {
     "pages": {"metadata": None},
     "big-endian": {"byteorder": ">"},
     "bigtiff": {"bigtiff": True},
-    "ImageJ": {"imagej": True},
+    "axes": {"metadata": {"axes": "TYX"}},
+    "ImageJ": {"imagej": True, "metadata": {"axes": "TYX"}},
+    "ImageJ's slices": {"imagej": True, "metadata": {"axes": "ZYX"}},
+    "OME": {"ome": True, "metadata": {"axes": "TYX"}},
     "strips": {"rowsperstrip": 5},
     "one page": {"truncate": True},
 }
 
 
 HALVES = f"{0.5 * scene()[0].min():g} to {0.5 * scene()[0].max():g}"
+
+
+GDAL = (
+    '<GDALMetadata>\n<Item name="{}" sample="0" role="{}">{}</Item>\n<Item name="a">3</Item>'
+    "</GDALMetadata>"
+)
 
 
 def write(path: Path, counts: Any, **options: Any) -> None:
@@ -88,6 +97,26 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
             {"ome": True, "metadata": {"axes": "CTYX"}},
             r"Invalid axes of \[1, 2, 2\] images",
         ),
+        *(
+            (
+                scene(),
+                {"metadata": {"axes": axes}},
+                f"Invalid axes {axes} .*Must be TYX, time, rows",
+            )
+            for axes in ("CYX", "XYT", "SYX", "TXY", "EYX")
+        ),
+        (scene(), {"imagej": True}, "Invalid axes CYX of the images"),
+        (scene(), {"ome": True}, "Invalid axes CYX of the images"),
+        (scene(), {"photometric": "miniswhite"}, "Invalid photometric interpretation 0 of page 0"),
+        *(
+            (scene(), {"extratags": [(code, kind, 0 if kind == 2 else 1, value, False)]}, message)
+            for code, kind, value, message in (
+                (274, 3, 6, "Invalid orientation 6 of page 0. Must be 1: rows from the top"),
+                (42112, 2, GDAL.format("SCALE", "scale", 0.01), "Invalid GDAL scale 0.01 of page"),
+                (42112, 2, GDAL.format("OFFSET", "offset", 9), "Invalid GDAL offset 9 .*Must be 0"),
+                (42113, 2, str(scene()[1, 2, 3]), "Missing counts in 'a.tif'.* Must all be there"),
+            )
+        ),
     ],
 )
 def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: str) -> None:
@@ -95,6 +124,14 @@ def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: 
     write(path := tmp_path / "a.tif", counts, **options)
     with pytest.raises(ValueError, match=message):
         read(path)
+
+
+def test_tags_that_change_nothing(tmp_path: Path) -> None:
+    """A scale of 1, an offset of 0, a value of no data that does not occur, and the way up."""
+    texts = {42112: GDAL.format("SCALE", "scale", "1.0"), 42113: "0"}
+    tags = [(274, 3, 1, 1, False), *((code, 2, 0, text, False) for code, text in texts.items())]
+    write(path := tmp_path / "a.tif", scene(), extratags=tags)
+    assert_array_equal(read(path).counts, scene())
 
 
 def test_unit_must_be_stated(tmp_path: Path) -> None:
@@ -167,6 +204,12 @@ def test_raw(tmp_path: Path) -> None:
         bare(path, shape=(0, 32))
     with pytest.raises(ValueError, match="Invalid frame_header -1"):
         bare(path, frame_header=-1)
+    for argument, value in {"header": "0", "frame_header": 1.5, "memory": "1e9"}.items():
+        with pytest.raises(TypeError, match=rf"Invalid {argument} .*{value}.*Must be a .* number"):
+            bare(path, byte_order="big", **{argument: value})
+    for argument, wrong in {"shape": ("24", 32), "unit": ["count"], "byte_order": ["big"]}.items():
+        with pytest.raises(ValueError, match=rf"Invalid {argument} .*a\.raw'\. Must be"):
+            bare(path, **{"byte_order": "big", argument: wrong})
     with pytest.raises(ValueError, match=r"Must be at most memory=100"):
         bare(path, byte_order="big", memory=100)
 

@@ -106,9 +106,21 @@ def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset])
     ("changes", "message"),
     [
         ({"offset": 100.0}, r"Invalid offset 100 s: .* do not overlap"),
-        ({"offset": np.nan}, r"Invalid offset nan s: .* do not overlap"),
+        ({"offset": np.nan}, r"Invalid offset nan\. Must be a finite number"),
+        ({"offset": "0"}, r"Invalid offset '0'\. Must be a finite number"),
+        ({"offset": True}, r"Invalid offset True\. Must be a finite number"),
+        ({"bands": "ab"}, "Invalid bands 'ab'. Must be two different names"),
+        ({"bands": (8.0, 9.5)}, "Invalid bands"),
+        ({"bands": ("a", "b", "c")}, "Invalid bands"),
+        ({"bands": ("a", " ")}, "Invalid bands"),
+        ({"bands": None}, "Invalid bands None"),
+        ({"second": "unknown"}, r"Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
+        ({"second": "infinite"}, "Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
+        ({"second": "resting"}, "Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
+        ({"second": "falling"}, "Invalid 'time' of band '9.5' .* Must be known, finite and rise"),
+        ({"second": "truth"}, "Invalid dtype bool of 'exposure_time' of band '9.5'"),
         ({"second": "timeless"}, "'time' is nothing"),
-        ({"bands": ("a", "a")}, "Repeated band 'a'"),
+        ({"bands": ("a", "a")}, r"Invalid bands \('a', 'a'\). Must be two different names"),
         ({"second": "crop"}, r"Different sizes \(24, 32\) and \(24, 31\)"),
         ({"second": "undated"}, r"Unknown dates .* offset="),
         ({"second": "temperatures"}, "Invalid dtype float32 of the counts of band '9.5'"),
@@ -120,7 +132,13 @@ def test_what_makes_no_capture(
 ) -> None:
     """Recordings that do not belong together are refused by band and rule."""
     first, second = pair
+    seconds = second.exposure_time
     others = {
+        "unknown": second.assign(exposure_time=seconds * np.nan),
+        "infinite": second.assign(exposure_time=seconds + np.where(seconds == 0, np.inf, 0)),
+        "resting": second.assign(exposure_time=seconds * 0 - 1),
+        "falling": second.assign_coords(time=-second.time),
+        "truth": second.assign(exposure_time=seconds > 0),
         "crop": second.isel(x=slice(1, None)),
         "undated": second.drop_attrs(deep=False),
         "temperatures": second.assign(counts=second.counts.astype("float32")),
