@@ -146,7 +146,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(again, known, corrected, alone)
     if materials is not None:
-        hold(alone, result, materials, borders=reflection_shift is not None)
+        hold(alone, result, materials, apart=reflection_shift is not None)
     if result is given:  # which is the caller's
         result = result.copy(deep=True)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)

@@ -99,7 +99,7 @@ def regrouped(
 
 
 def hold(
-    alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, borders: bool = True
+    alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, apart: bool = True
 ) -> None:
     """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
 
@@ -107,17 +107,18 @@ def hold(
     paired, or of what is mixed at an edge, in it; at the ratio of its material they are left in the
     object. Where pooling is right, the two differ by no more than the deviation of the pixel alone.
 
-    One stays alone without a label, where only alone it has no flag, where pooling hardly makes its
-    ratio more certain, with `borders` at the border of its material, and where most pixels of that
-    are gray with it, too: the others are not by chance. With D the mean square of the difference of
-    the objects in deviations of a pixel alone, its own or that around, the pooled variance is
-    larger by D times that of the pixel alone, if that is no chance; of one that tells nothing
-    alone, by as much as around.
+    One stays alone without a label, where only alone it has no flag, and where most pixels of its
+    material are gray, pooled, too: the others are not by chance. Of cameras `apart` also where
+    pooling hardly makes its ratio more certain, and at the border of its material. With D the mean
+    square of the difference of the objects in deviations of a pixel alone, its own or that around,
+    the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
+    that tells nothing alone, by as much as around.
     """
     sound, told = (one["status"].values == 0 for one in (alone, pooled))
-    stay = sound & (~told | (labels.values < 0) | (_border(labels.values) & borders))
-    ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
-    stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
+    stay = sound & (~told | (labels.values < 0))
+    if apart:
+        ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
+        stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
     gray = (pooled["status"].values & np.uint32(Status.GRAY)) != 0
     stay |= _share(labels.values, gray) > _MOSTLY
     both, single = sound & told & ~stay, alone["object_temperature_std"].values
