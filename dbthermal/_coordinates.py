@@ -32,6 +32,9 @@ def laid_on(
 
     `label` and `of` name the two in the ValueError, for other bands, sizes or values.
     """
+    if not isinstance(array, xr.DataArray | xr.Dataset):
+        found = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
+        raise TypeError(f"{found}. Must be a DataArray or a Dataset.")
     shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
     if "band" in shared and "band" in array.coords and "band" in reference.coords:
         names = [str(name) for name in reference["band"].values]

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import planck
+from dbthermal import _numbers, planck
 from dbthermal._arrays import Array
 
 __all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
@@ -24,6 +24,7 @@ TEMPERATURE_RANGE: Final = (100.0, 2000.0)
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _NEWTON_STEPS = 50
+_LONGEST: Final = 1e-3  # of thermal radiation [m]; beyond, a wavelength is in micrometres
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Band:
     name : str
         Its name, such as "9.5".
     lower, upper : float
-        Lower and upper edge [m].
+        Lower and upper edge [m], at most 1 mm, or a ValueError.
     """
 
     name: str
@@ -43,11 +44,11 @@ class Band:
     upper: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.lower < self.upper < np.inf:
-            raise ValueError(
-                f"Invalid edges {self.lower} m, {self.upper} m of band '{self.name}'. "
-                "Must be finite with 0 < lower < upper."
-            )
+        name, edges = f"edges of band '{self.name}'", (self.lower, self.upper)
+        lower, upper = _numbers.real_numbers(name, edges)
+        if not 0 < lower < upper <= _LONGEST:
+            rule = f"finite with 0 < lower < upper, at most {_LONGEST} m: metres, not micrometres"
+            raise ValueError(f"Invalid {name} {lower} m, {upper} m. Must be {rule}.")
 
     @property
     def centre(self) -> float:
@@ -91,15 +92,9 @@ class Band:
         until the temperature no longer changes. Raises ValueError for a radiance that is not of a
         temperature within `TEMPERATURE_RANGE`.
         """
-        radiance = np.asarray(radiance, dtype=np.float64)
-        lowest, highest = self.radiance(np.array(TEMPERATURE_RANGE))
-        bad = ~((radiance >= lowest) & (radiance <= highest))
-        if np.any(bad):
-            raise ValueError(
-                f"Invalid radiance {radiance[bad].flat[0]} W m-2 sr-1 in band '{self.name}'. "
-                f"Must lie in [{lowest:.6g}, {highest:.6g}], the radiances of "
-                f"{TEMPERATURE_RANGE[0]} to {TEMPERATURE_RANGE[1]} K."
-            )
+        name, limits = f"radiance [W m-2 sr-1] in band '{self.name}'", np.array(TEMPERATURE_RANGE)
+        lowest, highest = self.radiance(limits).tolist()
+        radiance = _numbers.real_numbers(name, radiance, (lowest, highest))
         inverse = 1.0 / planck.brightness_temperature(self.centre, radiance / self.width)
         for _ in range(_NEWTON_STEPS):
             temperature = 1.0 / inverse
@@ -121,14 +116,8 @@ class Band:
         return total
 
     def _within_range(self, temperature: npt.ArrayLike) -> Array:
-        (lowest, highest), temperature = TEMPERATURE_RANGE, np.asarray(temperature, np.float64)
-        bad = ~((temperature >= lowest) & (temperature <= highest))
-        if np.any(bad):
-            raise ValueError(
-                f"Invalid temperature {temperature[bad].flat[0]} K in band '{self.name}'. "
-                f"Must lie in [{lowest}, {highest}] K."
-            )
-        return temperature
+        name = f"temperature [K] in band '{self.name}'"
+        return _numbers.real_numbers(name, temperature, TEMPERATURE_RANGE)
 
 
 _FWHM: Final = {"8.5": 0.5, "9.5": 0.5, "10.6": 1.5, "12.1": 0.5}  # by centre [um]

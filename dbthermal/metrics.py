@@ -1,8 +1,9 @@
 """Agreement of an estimate with a reference: maps, and temperatures as the paper compares them.
 
-Both take labelled arrays of the same coordinates, bands by name; an array of fewer dims, such as a
-curve in time, is broadcast over the pixels. A value inside the mask that is not finite is an error:
-an average over the pixels that happened to work would flatter the method.
+Both take labelled arrays of the same coordinates, bands by name; a reference of fewer dims, such as
+a curve in time, is broadcast over the pixels, and one of other dims refused. A value inside the
+mask that is not finite is an error: an average over the pixels that happened to work would flatter
+the method.
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ def correlation(
 ) -> xr.DataArray:
     """Pearson's correlation of two maps, in [-1, 1], over the dims other than y and x.
 
-    ValueError if coordinates differ, fewer than two pixels count, one is not finite, or a map is
+    ValueError if dims or places differ, fewer than two pixels count, one is not finite, or a map is
     constant.
 
     Parameters
@@ -44,6 +45,7 @@ def correlation(
     for values, label in ((first, "the first map"), (second, "the second map")):
         if not {"y", "x"} <= {*schema.check_numbers(values, label).dims}:
             raise ValueError(f"Invalid dims {values.dims} of {label}. Must hold y and x.")
+    _require_dims(*sorted((second, first), key=lambda maps: maps.ndim))
     first, second = xr.broadcast(first, laid_on(second, first, "the second map", "the first"))
     left, right = (_centred(values, mask) for values in (first, second))
     norm = np.linalg.norm(left, axis=-1) * np.linalg.norm(right, axis=-1)
@@ -65,7 +67,7 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     Parameters
     ----------
     estimate, truth : DataArray
-        Temperatures [K] of the same coordinates; ValueError if a true one is not above 273.15 K.
+        Temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError.
         The result is NaN where the estimate is.
 
     Examples
@@ -78,7 +80,7 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     2.0
     """
     schema.check_numbers(estimate, "the estimate", "K")
-    schema.check_numbers(truth, "the truth", "K")
+    _require_dims(schema.check_numbers(truth, "the truth", "K"), estimate)
     bad = ~(truth.values > zero_Celsius)
     if np.any(bad):
         rule = f"Must be above {zero_Celsius} K, the zero of degrees Celsius"
@@ -88,6 +90,12 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     label = "error relative to the true temperature in degrees Celsius"
     bare: xr.DataArray = result.drop_attrs(deep=False).rename("relative_error")
     return bare.assign_attrs(long_name=label, units="percent")
+
+
+def _require_dims(few: xr.DataArray, many: xr.DataArray) -> None:
+    """Refuse a reference with a dim that the other array lacks, which would multiply its pixels."""
+    if not {*few.dims} <= {*many.dims}:
+        raise ValueError(f"Invalid dims {few.dims} of the reference. Must be among {many.dims}.")
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from scipy.special import ndtri
 from scipy.stats import chi2
 
+from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
-from dbthermal import schema
 from dbthermal._arrays import Array
 
 __all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
@@ -52,7 +52,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """
     if np.any(np.isinf(signal)):
         raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
-    time = np.asarray(time, dtype=np.float64)
+    time = _numbers.real_numbers("time [s]", time)
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
     line = before * signal[:-2] + (1.0 - before) * signal[2:]
     return np.asarray((signal[1:-1] - line) / np.sqrt(1.0 + before**2 + (1.0 - before) ** 2))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy import constants
 
 from dbthermal._arrays import Array
+from dbthermal._numbers import POSITIVE, real_numbers
 
 __all__ = [
     "FIRST_RADIATION_CONSTANT",
@@ -34,18 +35,17 @@ Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
     """Value as a float array, of which every element must be finite and positive, or a ValueError.
 
+    TypeError for text, truth values, durations, complex numbers and objects.
+
     Parameters
     ----------
     name : str
-        Name of the quantity, for the error.
+        Name of the quantity, for the error; a unit in brackets is the one that `value` must have
+        if it states one, as a DataArray does.
     value : array_like
         Its values, of any shape.
     """
-    array = np.asarray(value, dtype=np.float64)
-    bad = ~(np.isfinite(array) & (array > 0))
-    if np.any(bad):
-        raise ValueError(f"Invalid {name} {array[bad].flat[0]}. Must be finite and positive.")
-    return array
+    return real_numbers(name, value, POSITIVE)
 
 
 def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
@@ -56,7 +56,8 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
-    ValueError if a wavelength or a temperature is not finite and positive.
+    ValueError if a wavelength or a temperature is not finite and positive, or a DataArray of
+    another unit; TypeError if it is no real number.
 
     Parameters
     ----------

@@ -37,6 +37,7 @@ COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", 
 """Variables of a response that hold the Sakuma-Hattori curve."""
 
 _SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
+_MARGIN: Final = 100.0  # beyond the range, in which the reference temperature must lie [K]
 
 
 @dataclass(frozen=True)
@@ -195,8 +196,8 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     Raises
     ------
     ValueError
-        If the band is missing, the kind unknown, a coefficient not finite, or the slope not
-        positive.
+        If the band is missing, the kind unknown, a coefficient not finite, the slope not positive,
+        or the calibrated range does not increase or lies more than 100 K off the reference.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
@@ -208,6 +209,10 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     if bad:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")
     common = (number["reference_temperature"], number["temperature_min"], number["temperature_max"])
+    reference, lowest, highest = common
+    if not (0 < lowest < highest and lowest - _MARGIN <= reference <= highest + _MARGIN):
+        found = f"Invalid range {lowest} to {highest} K of the response, reference {reference} K"
+        raise ValueError(f"{found}. Must increase, be positive, and within {_MARGIN} K of it.")
     if kind == "linear":
         slope, intercept = number["linear_slope"], number["linear_intercept"]
         result: Curve = LinearCurve(band, slope, 0.0, 0.0, intercept, *common)
@@ -235,17 +240,14 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     bands : list of str
         Names of the bands, in the order of the result.
     """
-    if "noise" not in response:
+    if "noise" not in schema.check(response, "response"):
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
-    schema.check_variable(response["noise"], schema.NOISE, "'noise' of the response")
     places = schema.band_positions(response, bands, "the response")
     values = np.asarray(response["noise"].values[places], dtype=np.float64)
     bad = ~((values > 0) & np.isfinite(values))
     if np.any(bad):
-        raise ValueError(
-            f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'. "
-            "Must be finite and positive."
-        )
+        found = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
+        raise ValueError(f"{found}. Must be finite and positive.")
     return values
 
 
@@ -257,9 +259,11 @@ def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     response : Dataset
         Stage `response` of `schema`.
     temperature : DataArray
-        Temperature [K] in the calibrated range, or a ValueError; any dims but `band`.
+        Temperature [K] in the calibrated range, or a ValueError; any dims but `band`. TypeError
+        for what is no DataArray.
     """
-    names = [str(name) for name in response["band"].values]
+    schema.check_numbers(temperature, "the temperature", "K")
+    names = [str(name) for name in schema.check(response, "response")["band"].values]
     curves = [curve(response, name) for name in names]
     values = require_range(temperature.values, curves[0], "temperature")
     parts = [temperature.copy(data=one.counts(values)) for one in curves]

@@ -4,7 +4,7 @@ A name is agreed here first, then used. `check` holds a dataset against its stag
 the value that offends.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from typing import Any, Final, Self
 
@@ -180,11 +180,14 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
     return np.abs(values) < LARGEST
 
 
-def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+def check(
+    dataset: xr.Dataset, stage: str, names: Sequence[str] = (), label: str = ""
+) -> xr.Dataset:
     """Check a dataset against its stage, one of `STAGES`, and return it unchanged.
 
-    A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
-    values only those of the coordinates are read.
+    Variables of `OPTIONAL` are checked, too, where it has them. A missing `units` attribute is
+    taken as the agreed unit; a different one is an error. Of the values only those of the
+    coordinates are read.
 
     Parameters
     ----------
@@ -192,6 +195,10 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
         Data of a stage.
     stage : str
         Its name.
+    names : sequence of str
+        Variables of the stage that are checked, where not all are needed.
+    label : str
+        What the error calls it, "the" and the stage by default.
 
     Raises
     ------
@@ -211,15 +218,17 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """
     if stage not in STAGES:
         raise ValueError(f"Unknown stage '{stage}'. Must be one of {sorted(STAGES)}.")
-    if not isinstance(dataset, xr.Dataset):
-        raise TypeError(f"Invalid {stage} of type {type(dataset).__name__}. Must be a Dataset.")
-    for name, variable in STAGES[stage].items():
+    label = label or f"the {stage}"
+    _require(dataset, xr.Dataset, label)
+    optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
+    for name in names or (*STAGES[stage], *optional):
         if name not in dataset:
             fitting = [one for one in STAGES if STAGES[one].keys() <= set(dataset)]
             most = max(fitting, key=lambda one: len(STAGES[one]), default="")
             found = f"{sorted(map(str, dataset))}" + (f", as has a {most}" if most else "")
-            raise ValueError(f"Missing variable '{name}' in the {stage}. Has {found}.")
-        check_variable(dataset[name], variable, f"'{name}' of the {stage}")
+            raise ValueError(f"Missing variable '{name}' in {label}. Has {found}.")
+        variable = STAGES[stage].get(name) or OPTIONAL[stage][name]
+        check_variable(dataset[name], variable, f"'{name}' of {label}")
     return dataset
 
 
@@ -255,13 +264,14 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
     label : str
         Its name in the error.
     """
+    _require(array, xr.DataArray, label)
     if array.dims != variable.dims:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if variable.dtype != "bool":
         check_numbers(array, label, variable.units)
-        if variable is STATUS and array.dtype.kind == "f":
+        if variable in (STATUS, SEGMENT) and array.dtype.kind == "f":
             raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
@@ -286,8 +296,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
     units : str, optional
         Unit that it has if it states one; any by default.
     """
-    if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {label} of type {type(array).__name__}. Must be a DataArray.")
+    _require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui":
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
     if units is not None and array.attrs.get("units", units) != units:
@@ -298,7 +307,8 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
     """Positions of bands on the dimension `band`, by name as text.
 
-    ValueError if there is no coordinate `band`, or a band is missing or repeated.
+    TypeError if it is none of xarray; ValueError if there is no coordinate `band`, or a band is
+    missing or repeated.
 
     Parameters
     ----------
@@ -309,6 +319,7 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     label : str
         Name of the array in the error.
     """
+    _require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
@@ -353,6 +364,13 @@ def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """
     known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
     return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
+
+
+def _require(data: object, kind: type, label: str) -> None:
+    """Refuse what is of another type."""
+    if not isinstance(data, kind):
+        found = f"Invalid {label.removeprefix('the ')} of type {type(data).__name__}"
+        raise TypeError(f"{found}. Must be a {kind.__name__}.")
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

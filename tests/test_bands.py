@@ -119,7 +119,7 @@ def test_nodes_span_the_band() -> None:
 @pytest.mark.parametrize("temperature", [99.9, 2000.1, np.nan, 25.0])
 def test_temperature_outside_the_range(temperature: float) -> None:
     """A temperature outside the range raises a ValueError that gives it, the band and the range."""
-    message = f"Invalid temperature {temperature} K in band '9.5'. Must lie in [100.0, 2000.0] K."
+    message = f"Invalid temperature [K] in band '9.5' {temperature}. Must lie in [100.0, 2000.0]."
     for function in (FILTERS["9.5"].radiance, FILTERS["9.5"].slope):
         with pytest.raises(ValueError, match=re.escape(message)):
             function([300.0, temperature])
@@ -128,15 +128,19 @@ def test_temperature_outside_the_range(temperature: float) -> None:
 @pytest.mark.parametrize("radiance", [-1.0, 0.0, np.nan, 1e9])
 def test_radiance_outside_the_range(radiance: float) -> None:
     """A radiance outside the range raises a ValueError; it is not clipped."""
-    message = f"Invalid radiance {radiance} W m-2 sr-1 in band '8-14'. Must lie in ["
+    message = f"Invalid radiance [W m-2 sr-1] in band '8-14' {radiance}. Must lie in ["
     with pytest.raises(ValueError, match=re.escape(message)):
         FILTERS["8-14"].temperature([50.0, radiance])
 
 
-@pytest.mark.parametrize("edges", [(9e-6, 8e-6), (0.0, 8e-6), (8e-6, 8e-6), (8e-6, np.inf)])
+@pytest.mark.parametrize(
+    "edges", [(9e-6, 8e-6), (0.0, 8e-6), (8e-6, 8e-6), (8e-6, np.inf), (8.0, 14.0)]
+)
 def test_edges_that_are_no_band(edges: tuple[float, float]) -> None:
-    """A band without a positive, finite width raises a ValueError."""
-    with pytest.raises(ValueError, match=re.escape("of band 'odd'. Must be finite")):
+    """A band without a positive, finite width, or in micrometres, raises a ValueError."""
+    with pytest.raises(
+        ValueError, match=r"edges of band 'odd' .* Must be finite .* metres, not mic"
+    ):
         Band("odd", *edges)
 
 

@@ -18,7 +18,17 @@ GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.beckn
 
 
 def spectrum(wavelength_um: object, values: object) -> xr.Dataset:
-    """Spectrum from wavelengths in micrometres."""
+    """Spectrum from wavelengths in micrometres, linear and without gaps between them."""
+    ends, knots = np.asarray(values, dtype=float), np.asarray(wavelength_um, dtype=float)
+    if np.all(np.diff(knots) > 0) and np.all(np.isfinite(ends)):
+        within = np.arange(0.0, 20.0, 0.5)
+        fine = np.union1d(knots, within[(within > knots[0]) & (within < knots[-1])])
+        knots, ends = fine, np.interp(fine, knots, ends)
+    return sparse(knots, ends)
+
+
+def sparse(wavelength_um: object, values: object) -> xr.Dataset:
+    """Spectrum of these wavelengths in micrometres alone."""
     wavelength = np.asarray(wavelength_um, dtype=float) * 1e-6
     return xr.Dataset(
         {"emissivity": ("wavelength", np.asarray(values, dtype=float))},
@@ -166,7 +176,7 @@ def test_wrong_spectrum_is_named() -> None:
             ValueError,
             "Invalid emissivity 86.0 of 'percent'",
         ),
-        ({"temperature": 27.0}, ValueError, "Invalid temperature 27.0 K"),
+        ({"temperature": 27.0}, ValueError, "Invalid temperature [K] in band '8-14' 27.0"),
         ({"minimum_coverage": 0.0}, ValueError, "Invalid minimum_coverage 0.0"),
         ({"minimum_coverage": 1.1}, ValueError, "Invalid minimum_coverage 1.1"),
     ],
@@ -357,3 +367,37 @@ def test_filter_of_the_paper(spectra: dict[str, xr.Dataset]) -> None:
     choice = emissivity.rank_filters(made, emissivity.filter_noise(0.03, FILTERS))
     assert choice.attrs["lowest_condition_number"] == "9.5"
     assert float(choice["condition_number"][0]) == pytest.approx(98.9, abs=0.5)
+
+
+def test_gap_is_not_covered() -> None:
+    """Nothing is known across a gap of more than 1 um, nor between the two ends of a spectrum."""
+    whole = np.arange(6.0, 16.01, 0.1)
+    holed = whole[(whole < 8.55) | (whole > 13.45)]
+    for knots, share in ((holed, "0.1"), ([6.0, 16.0], "0.0000")):
+        with pytest.raises(ValueError, match=f"Invalid coverage {share}.* without gaps"):
+            emissivity.band_table({"m": sparse(knots, np.sin(knots) ** 2)}, ["8-14"])
+    made = emissivity.band_table({"m": sparse(holed, holed / 20)}, ["8-14"], minimum_coverage=0.1)
+    parts = [Band("low", 8e-6, 8.5e-6), Band("high", 13.5e-6, 14e-6)]
+    weights = np.array([float(part.radiance(300.0)) for part in parts])
+    alone = emissivity.band_table({"m": sparse(whole, whole / 20)}, parts)["emissivity"].values[0]
+    expected = weights @ alone / weights.sum()
+    assert float(made["emissivity"][0, 0]) == pytest.approx(expected, abs=1e-3)
+    share = weights.sum() / float(FILTERS["8-14"].radiance(300.0))
+    assert float(made["coverage"][0, 0]) == pytest.approx(share, abs=1e-2)
+    coarse = emissivity.band_table({"m": sparse(np.arange(7.0, 16.0), np.full(9, 0.5))}, FILTERS)
+    np.testing.assert_array_equal(coarse["coverage"], 1.0)
+
+
+def test_per_cent_is_refused() -> None:
+    """Emissivities in per cent have neither a condition number nor a best filter."""
+    percent = table(glass=[86.0, 72.0])
+    for call in (
+        lambda: emissivity.condition_numbers(percent),
+        lambda: emissivity.rank_filters(percent, emissivity.filter_noise(0.03, ["8-14", "9.5"])),
+    ):
+        with pytest.raises(ValueError, match="Invalid emissivity of the table 86"):
+            call()
+    with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
+        emissivity.pair_summary(np.ones(3))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):
+        emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]

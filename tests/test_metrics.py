@@ -132,3 +132,14 @@ def test_missing_dimension(truth: xr.DataArray) -> None:
     """Maps without one of their dimensions raise a ValueError."""
     with pytest.raises(ValueError, match="Must hold y and x"):
         metrics.correlation(truth.isel(x=0), truth.isel(x=0))
+
+
+def test_other_dims_are_refused(truth: xr.DataArray) -> None:
+    """A curve in time is broadcast; a dim that the other array lacks raises a ValueError."""
+    curve = truth.isel(y=0, x=0, drop=True)
+    assert metrics.relative_error_celsius(truth, curve).dims == truth.dims
+    for estimate, reference in ((truth.rename(x="column"), truth), (curve, truth)):
+        with pytest.raises(ValueError, match=r"Invalid dims .* Must be among"):
+            metrics.relative_error_celsius(estimate, reference)
+    with pytest.raises(ValueError, match=r"Invalid dims .* Must be among"):
+        metrics.correlation(truth, truth.rename(time="frame"))

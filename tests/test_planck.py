@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import constants
@@ -11,6 +12,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 
 from dbthermal import planck
+from dbthermal.bands import get
 
 WAVELENGTHS = st.floats(1e-6, 1e-4)
 TEMPERATURES = st.floats(100.0, 3000.0)
@@ -102,3 +104,26 @@ def test_bad_value_is_named(
     first, second = ([1.0, bad] if value is None else value for value in arguments)
     with pytest.raises(ValueError, match=re.escape(f"Invalid {name} {bad}. Must be finite")):
         function(first, second)
+
+
+@pytest.mark.parametrize(
+    "value", ["3", b"3", True, np.timedelta64(3, "s"), np.datetime64(3, "s"), 3j, None, [3, None]]
+)
+def test_what_is_no_number_is_refused(value: object) -> None:
+    """Text, truth values, durations, complex numbers and objects raise a TypeError."""
+    with pytest.raises(TypeError, match=r"Invalid length \[m\] .* Must be a number, not of type"):
+        planck.require_positive("length [m]", value)  # type: ignore[arg-type]
+
+
+def test_stated_units_must_agree() -> None:
+    """A DataArray whose units are not those in the name raises a ValueError."""
+    micrometres = xr.DataArray([10.0], attrs={"units": "um"})
+    with pytest.raises(ValueError, match=re.escape("Invalid units 'um' of wavelength [m]")):
+        planck.spectral_radiance(micrometres, 300.0)
+    celsius = xr.DataArray([20.0], attrs={"units": "degC"})
+    with pytest.raises(ValueError, match=re.escape("Invalid units 'degC' of temperature [K]")):
+        planck.spectral_radiance(1e-5, celsius)
+    with pytest.raises(ValueError, match=re.escape("Invalid units 'degC' of temperature [K]")):
+        get("9.5").slope(celsius)
+    radiance = xr.DataArray([1e7], attrs={"units": "W m-2 sr-1 m-1"})
+    assert planck.brightness_temperature(1e-5, radiance) > 0

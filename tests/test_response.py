@@ -178,3 +178,33 @@ def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
     schema.check(two_bands, "response")
     with pytest.raises(ValueError, match="Missing variable 'offset' in the response"):
         response.curve(two_bands.drop_vars("offset"), "9.5")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"temperature_max": 80.0}, "Invalid range 280.0 to 80.0 K of the response"),
+        ({"temperature_min": -10.0}, "Invalid range -10.0 to 340.0 K of the response"),
+        ({"reference_temperature": 25.0}, "280.0 to 340.0 K of the response, reference 25.0 K"),
+        ({"reference_temperature": 29815.0}, "280.0 to 340.0 K of the response, reference 29815.0"),
+    ],
+)
+def test_range_that_contradicts_itself(
+    two_bands: xr.Dataset, change: dict[str, float], message: str
+) -> None:
+    """A range that falls, or lies far from the reference temperature, raises a ValueError."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        response.curve(two_bands.assign(change), "9.5")
+
+
+def test_temperatures_of_counts_are_labelled_kelvin(two_bands: xr.Dataset) -> None:
+    """Bare numbers, text and another unit raise an error that names the temperature."""
+    milli = xr.DataArray([300.0], dims="x", attrs={"units": "mK"})
+    with pytest.raises(ValueError, match="Invalid units 'mK' of the temperature"):
+        response.counts(two_bands, milli)
+    with pytest.raises(TypeError, match="Invalid temperature of type float"):
+        response.counts(two_bands, 300.0)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"of the temperature. Must be a real number"):
+        response.counts(two_bands, milli.astype(str))
+    with pytest.raises(TypeError, match="Invalid response of type NoneType"):
+        response.noise(None, ["9.5"])  # type: ignore[arg-type]

@@ -183,7 +183,7 @@ def test_odd_emissivities_and_truths_warn_of_nothing() -> None:
     assert glass == mixing.condition_number([0.86, 0.72])
     table = emissivity.embedded_table()
     noises = emissivity.filter_noise(0.03, [str(name) for name in table["band"].values])
-    with pytest.raises(ValueError, match="Invalid emissivity of the table: infinite"):
+    with pytest.raises(ValueError, match="Invalid emissivity of the table inf"):
         emissivity.rank_filters(table.assign(emissivity=table["emissivity"] + np.inf), noises)
     for name in ("object_temperature", "background_temperature"):
         endless = SCENE.assign({name: SCENE[name].where(SCENE["time"] > 1.0, np.inf)})

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
 
 Indices = npt.NDArray[np.intp]
@@ -116,13 +116,13 @@ def exposure_times(corrected: xr.Dataset) -> Array:
     Raises
     ------
     TypeError, ValueError
-        If they have other dims or another unit, are fewer than two of a band, or do not increase.
+        If the capture is none, or they have other dims or another unit, are fewer than two of a
+        band, or do not increase.
     """
-    counts = corrected["counts"]
+    counts = schema.check(corrected, "corrected")["counts"]
     if "exposure_time" not in corrected:
         stamps = np.tile(corrected["time"].values.astype(np.float64), (counts.sizes["band"], 1))
     else:
-        schema.check_variable(corrected["exposure_time"], schema.EXPOSURE_TIME, "'exposure_time'")
         stamps = corrected["exposure_time"].values.astype(np.float64)
     for band, row in zip(counts["band"].values, stamps, strict=True):
         _check_stamps(row[~np.isnan(row)], f"band '{band}'")
@@ -140,9 +140,10 @@ def fill_times(stamps: Array) -> Array:
 
     Raises
     ------
-    ValueError
-        If fewer than two frames have a time, or the times do not increase.
+    TypeError, ValueError
+        If they are no numbers, fewer than two frames have a time, or the times do not increase.
     """
+    stamps = _numbers.real_numbers("exposure times [s]", stamps)
     _check_stamps(stamps[~np.isnan(stamps)], "the camera")
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
@@ -170,13 +171,7 @@ def segments(corrected: xr.Dataset) -> Indices:
     """Number of shutter events before each frame (time), 0 without a variable `segment`."""
     if "segment" not in corrected:
         return np.zeros(corrected.sizes["time"], dtype=np.intp)
-    segment = corrected["segment"]
-    if segment.dims != ("time",) or segment.dtype.kind not in "iu":
-        raise ValueError(
-            f"Invalid segment {segment.dims} of {segment.dtype}. "
-            "Must be ('time',) of whole numbers."
-        )
-    return np.asarray(segment.values, dtype=np.intp)
+    return np.asarray(corrected["segment"].values, dtype=np.intp)
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:

@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
-from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 
@@ -205,8 +205,7 @@ def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
             f"Invalid capture of {frames} frames for a time offset. "
             f"Must have at least {_MINIMUM_FRAMES}."
         )
-    if not 1 <= search <= frames // 4:
-        raise ValueError(f"Invalid search of {search} frames. Must lie in [1, {frames // 4}].")
+    _numbers.whole_number("search [frame]", search, (1, frames // 4))
     (place,) = schema.band_positions(counts, [names[1] if band is None else band], "the capture")
     if place == 0:
         raise ValueError(f"Invalid band '{names[0]}'. Must be another than the first.")

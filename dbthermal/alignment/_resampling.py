@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from dbthermal import _rows, schema
+from dbthermal import _numbers, _rows, schema
 from dbthermal import noise as noises
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
@@ -245,16 +245,13 @@ def _offsets(
         found = [time_offset(corrected, band=name, search=search) for name in names[1:]]
         return np.array([0.0, *found])
     if isinstance(offset, xr.DataArray):
-        places = schema.band_positions(offset, names, "the time offset")
-        if offset.attrs.get("units", "s") != "s":
-            raise ValueError(f"Invalid unit '{offset.attrs['units']}' of the offset. Must be 's'.")
-        values = offset.values[places].astype(np.float64)
+        values = schema.band_values(offset, names, "the time offset", "s")
     else:
         if len(names) != 2:
             raise ValueError(
                 f"Invalid offset {offset} s for bands {names}. Must be one for each, (band)."
             )
-        values = np.array([0.0, float(offset)])
+        values = np.array([0.0, _numbers.real_number("offset [s]", offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Invalid offset {values.tolist()} s. Must be finite, and 0 in band '{names[0]}', the "

@@ -11,13 +11,14 @@ from typing import Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
 
 _ITERATIONS: Final = 50
 _CONVERGED: Final = 1e-12
+_BEYOND: Final = 3.0  # standard deviations by which an emissivity may lie outside its limits
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,9 @@ class Bias:
 
     def __post_init__(self) -> None:
         for name in ("object_tolerance", "background_tolerance"):
-            value = getattr(self, name)
-            if not 0 <= value < np.inf:
-                raise ValueError(f"Invalid {name} {value} K. Must be zero or positive.")
+            _numbers.real_number(f"{name} [K]", getattr(self, name), (0.0, schema.LARGEST))
         for name in ("contact", "stray"):
-            least, largest = getattr(self, name)
+            least, largest = _numbers.real_numbers(name, getattr(self, name), shape=(2,))
             if not 0 <= least <= largest < 1:
                 raise ValueError(
                     f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
@@ -199,10 +198,11 @@ def fit_emissivity(
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         If an input is not as described or not finite, there are fewer than two measurements, a
-        temperature lies outside the response, or object and background never differ by more than
-        three standard deviations of their difference.
+        temperature lies outside the response, object and background never differ by more than three
+        standard deviations of their difference, or a result lies outside `schema.EMISSIVITY_LIMITS`
+        by more than three of its own.
     ArithmeticError
         If the fit does not converge.
 
@@ -324,7 +324,7 @@ def _readings(
                 f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
             )
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
-    return warm, planck.require_positive("reading_std [K]", reading_std)
+    return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
 
 
 def _bands(
@@ -385,7 +385,14 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
     squares = residual @ signals.weighted(emissivity, residual)
     freedom = residual.size - 1
     chi2 = float(squares / freedom) if freedom else float("nan")
-    return emissivity, float((weights @ adjusted) ** -0.5), chi2, residual
+    std, (lowest, highest) = float((weights @ adjusted) ** -0.5), schema.EMISSIVITY_LIMITS
+    if max(lowest - emissivity, emissivity - highest) > _BEYOND * std:
+        raise ValueError(
+            f"Invalid emissivity {emissivity:.4g} +- {std:.2g} in band '{name}'. Must lie in "
+            f"[{lowest}, {highest}] within {_BEYOND:g} deviations: are the bands' names or files "
+            "exchanged, or temperatures not in kelvin?"
+        )
+    return emissivity, std, chi2, residual
 
 
 def _uniform_std(span: tuple[float, float]) -> float:

@@ -10,7 +10,7 @@ from scipy.constants import zero_Celsius
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from dbthermal import bands, planck, schema
+from dbthermal import _numbers, bands, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal._warnings import warned
@@ -123,14 +123,12 @@ def fit_response(
     (True, 0.038)
     """
     _check_blackbody(counts)
-    planck.require_positive("temperature_std [K]", temperature_std)
+    _numbers.real_number("temperature_std [K]", temperature_std, _numbers.POSITIVE)
     names = [str(name) for name in counts["band"].values]
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
     noises = np.zeros(len(names))
     if noise is not None:
-        if not isinstance(noise, xr.DataArray):
-            raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
         noises = schema.band_values(noise, names, "the noise", "count")
         planck.require_positive("noise [count]", noises)
     curves, lines = [], []
@@ -276,8 +274,6 @@ def _response(curves: list[Curve], lines: list[Array]) -> xr.Dataset:
 
 
 def _check_blackbody(counts: xr.DataArray) -> None:
-    if not isinstance(counts, xr.DataArray):
-        raise TypeError(f"Invalid counts of type {type(counts).__name__}. Must be a DataArray.")
     schema.check_variable(counts, schema.STAGES["blackbody"]["counts"], "the blackbody counts")
     temperature = planck.require_positive("temperature [K]", counts["temperature"].values)
     if temperature[0] < bands.TEMPERATURE_RANGE[0]:

@@ -173,7 +173,6 @@ def _closed(capture: xr.Dataset) -> xr.DataArray | None:
     if "frame_flags" not in capture:
         return None
     flags = capture["frame_flags"]
-    schema.check_variable(flags, schema.FRAME_FLAGS, "'frame_flags'")
     if schema.SHUTTER_CLOSED not in str(flags.attrs.get("flag_meanings", "")).split():
         return None  # of a file that does not tell
     return schema.has_flag(flags, schema.SHUTTER_CLOSED)

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy.stats import chi2
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
@@ -140,8 +140,9 @@ def fit_correction(
     Raises
     ------
     TypeError, ValueError
-        If there are fewer than two temperatures, the threshold is not positive, no more than half
-        of the pixels of a band are usable, or the mean does not rise with the temperature.
+        If there are fewer than two temperatures, the threshold is not positive, `maximum` no whole
+        number of 16 bits, no more than half of the pixels of a band are usable, or the mean does
+        not rise with the temperature.
 
     Examples
     --------
@@ -162,8 +163,8 @@ def fit_correction(
     counts = schema.check(blackbody, "blackbody_frames")["counts"]
     if counts.sizes["temperature"] < 2:
         raise ValueError("Invalid blackbody frames of 1 temperature. Must have at least 2.")
-    if not threshold > 0:
-        raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
+    threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
+    _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = (counts.sizes["y"], counts.sizes["x"])
     parts = []
     for band in counts:
@@ -200,9 +201,9 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     Raises
     ------
     TypeError, ValueError
-        If bands or pixels are not the same, or a good pixel of the image is not finite.
+        If bands or pixels are not the same, or a good pixel is not finite or its gain not positive.
     """
-    _check(correction)
+    _require_rising(_checked(correction))
     schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         raise ValueError(
@@ -251,14 +252,15 @@ def correct(
     Raises
     ------
     TypeError, ValueError
-        If the capture is not uint16 or was corrected before, or the correction lacks a band, is not
-        finite, or is of other pixels.
+        If the capture is not uint16 or was corrected before, `maximum` is no whole number of 16
+        bits, or the correction lacks a band, is not finite, or is of other pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):
         raise ValueError("Invalid capture: gain and offset were corrected before. Must be raw.")
     if counts.dtype != np.uint16:
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
+    _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     maps = _maps(correction, counts)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -381,17 +383,21 @@ def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
     return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
 
 
-def _check(correction: xr.Dataset) -> None:
+def _checked(correction: xr.Dataset) -> xr.Dataset:
     """Refuse what is no correction with its bad pixels."""
-    schema.check(correction, "correction")
-    if "bad" not in correction or correction["bad"].dims != ("band", "y", "x"):
+    if "bad" not in schema.check(correction, "correction"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
+    return correction
 
 
 def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
     """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
-    _check(correction)
-    maps = laid_on(correction, counts, "the correction", "the capture")[["gain", "offset", "bad"]]
+    correction = laid_on(_checked(correction), counts, "the correction", "the capture")
+    return _require_rising(correction[["gain", "offset", "bad"]])
+
+
+def _require_rising(maps: xr.Dataset) -> xr.Dataset:
+    """Refuse gains and offsets that are not finite, and gains of good pixels not positive."""
     rising = {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}
     for name, holds in rising.items():
         if not np.all(schema.measured(maps[name]) & holds):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from dbthermal import _rows, schema
+from dbthermal import _numbers, _rows, schema
 from dbthermal import _samples as samples
 from dbthermal._arrays import Array, Mask
 from dbthermal._warnings import warned
@@ -107,8 +107,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     ([[5, 7]], 1)
     """
     counts = schema.check_corrected(corrected)["counts"]
-    if not threshold > 0:
-        raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
+    threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))

@@ -151,13 +151,13 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
     shape = counts.sizes["band"], counts.sizes["time"]
     if closed is None:
         return np.zeros(shape, dtype=bool)
+    closed = laid_on(closed, counts, "the closed frames", "the capture")
     if closed.dtype != bool:
         raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
     if closed.dims not in {("time",), ("band", "time")}:
         raise ValueError(
             f"Invalid dims {closed.dims} of the closed frames. Must be (time) or (band, time)."
         )
-    closed = laid_on(closed, counts, "the closed frames", "the capture")
     return np.broadcast_to(closed.values, shape)
 
 

@@ -4,10 +4,13 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _rows, planck, schema
+from dbthermal import _numbers, _rows, schema
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+
+_LONGEST = 1.0  # time constant of a pixel [s]; of microbolometers it is some 10 ms
+_PATCH = schema.Variable(("y", "x"), "bool", "1", "patch of constant temperature")
 
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
@@ -27,7 +30,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     corrected : Dataset
         Stage `corrected` of `schema`, after `mark_shutter`: a repeated frame is no measurement.
     time_constant : float or DataArray
-        Time constant of the pixels [s], of all bands or (band), by name.
+        Time constant of the pixels [s], at most 1 s, of all bands or (band), by name.
 
     Returns
     -------
@@ -40,7 +43,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     ------
     TypeError, ValueError
         If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not finite and positive.
+        or a time constant is not positive, or above 1 s.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -75,7 +78,7 @@ def lag_coefficients(
     Parameters
     ----------
     time_constant : float or DataArray
-        Time constant :math:`\tau` [s], positive, of all bands or (band).
+        Time constant :math:`\tau` [s], positive and at most 1 s, of all bands or (band).
     counts : DataArray
         Counts (band, time, ...), whose times are taken.
     """
@@ -106,7 +109,8 @@ def undo_drift(
     reference : DataArray
         True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
     order : int
-        Number of polynomials in a segment, the constant included.
+        Number of polynomials in a segment, the constant included; at most that of the frames, and
+        a segment of fewer has as many.
     lazy : bool
         As in `correct_capture`.
 
@@ -119,14 +123,13 @@ def undo_drift(
     Raises
     ------
     TypeError, ValueError
-        If the drift was undone before, the reference marks no good pixel, `order` is below 2, or a
-        pixel of the patch is NaN in a frame in which others are not.
+        If the drift was undone before, the reference marks no good pixel, `order` is no whole
+        number from 2 to that of the frames, or a part of the patch is NaN in a frame.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
         raise ValueError("Invalid dataset: the drift was undone before. Must be as it drifts.")
-    if order < 2:
-        raise ValueError(f"Invalid order {order} of the drift. Must be 2 or more.")
+    order = _numbers.whole_number("order of the drift", order, (2, counts.sizes["time"]))
     rows, columns = np.nonzero(_patch(corrected, reference))
     patch = counts.isel(y=xr.DataArray(rows, dims="p"), x=xr.DataArray(columns, dims="p"))
     level = patch.mean("p", dtype=np.float64, skipna=False)
@@ -154,20 +157,20 @@ def undo_drift(
 
 def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:
     """Time constant of each band [s]."""
-    names = [str(name) for name in counts["band"].values]
+    names, name = [str(name) for name in counts["band"].values], "time_constant [s]"
     if isinstance(time_constant, xr.DataArray):
         values = schema.band_values(time_constant, names, "the time constants", "s")
-        return planck.require_positive("time_constant [s]", values)
-    return np.full(len(names), float(planck.require_positive("time_constant [s]", time_constant)))
+    else:
+        values = np.full(len(names), _numbers.real_number(name, time_constant))
+    longest = _numbers.real_numbers(name, values, _numbers.POSITIVE).max()
+    if longest > _LONGEST:
+        raise ValueError(f"Invalid {name} {longest}. Must be at most 1: seconds, not milliseconds.")
+    return values
 
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
     """Good pixels (y, x) of the reference patch."""
-    dtype = getattr(reference, "dtype", type(reference).__name__)
-    if str(dtype) != "bool":
-        raise TypeError(f"Invalid dtype {dtype} of the reference. Must be bool.")
-    if reference.dims != ("y", "x"):
-        raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
+    schema.check_variable(reference, _PATCH, "the reference")
     good = laid_on(reference, corrected, "the reference", "the capture").values.copy()
     if "status" in corrected:
         good &= corrected["status"].values == 0

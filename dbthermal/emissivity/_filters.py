@@ -3,10 +3,11 @@
 import numpy as np
 import xarray as xr
 
-from dbthermal import mixing, planck, schema
+from dbthermal import _numbers, mixing, planck, schema
 from dbthermal.emissivity._tables import CAMERA_BAND, Bands, chosen_bands
 
 _TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
+_NUMBERS = schema.Variable(("material", "first", "second"), "float64", "1", "condition number")
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
@@ -15,7 +16,8 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     Parameters
     ----------
     table : Dataset
-        Stage `emissivity_table` of `schema`, of at least two bands, or a ValueError.
+        Stage `emissivity_table` of `schema`, of at least two bands, its emissivities NaN or within
+        `schema.EMISSIVITY_LIMITS`, or a ValueError.
 
     Returns
     -------
@@ -30,7 +32,7 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     >>> numbers.sel(material=["plate window glass", "water"]).values.round(1).tolist()
     [9.4, 649.2]
     """
-    values = schema.check(table, "emissivity_table")["emissivity"]
+    values = _emissivities(table)
     names = values["band"].values
     if len(names) < 2:
         raise ValueError(f"Invalid bands {names.tolist()} of the table. Must be at least two.")
@@ -67,6 +69,7 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     >>> summary["median"].sel(first="8-14", second=["9.5", "10.6"]).values.round(1).tolist()
     [110.7, 342.3]
     """
+    schema.check_variable(numbers, _NUMBERS, "the condition numbers")
     finite = numbers.copy(data=np.isfinite(numbers.values))
     mean = numbers.where(finite).mean("material").fillna(np.inf)
     parts = {
@@ -109,7 +112,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     [0.04, 0.398, 0.15]
     """
     chosen = chosen_bands(bands)
-    netd = float(planck.require_positive("netd [K]", netd))
+    netd = _numbers.real_number("netd [K]", netd, _numbers.POSITIVE)
     slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
     return xr.DataArray(
         netd * slopes[0] / slopes,
@@ -149,8 +152,8 @@ def rank_filters(
     Raises
     ------
     TypeError, ValueError
-        If the table is not as `schema` has it or has no band `beside` and another, or the noise
-        lacks a band, is in another unit, or is not finite and positive.
+        If the table is not as for `condition_numbers` or has no band `beside` and another, or the
+        noise lacks a band, is in another unit, or is not finite and positive.
 
     Examples
     --------
@@ -181,6 +184,14 @@ def rank_filters(
     )
 
 
+def _emissivities(table: xr.Dataset) -> xr.DataArray:
+    """Checked emissivity (material, band) of a table; averages of measured spectra may exceed 1."""
+    values = schema.check(table, "emissivity_table")["emissivity"]
+    known = values.values[~np.isnan(values.values)]
+    _numbers.real_numbers("emissivity of the table", known, within=schema.EMISSIVITY_LIMITS)
+    return values
+
+
 def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
     r"""Standard deviation [K] of the object temperature from one frame (material, band).
 
@@ -188,12 +199,10 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     :math:`\mathrm{var}(x) = [(1 - e_m)^2 s_1^2 + (1 - e_1)^2 s_m^2] / (e_1 - e_m)^2`; infinite for
     equal emissivities.
     """
-    values = schema.check(table, "emissivity_table")["emissivity"]
+    values = _emissivities(table)
     names = [str(name) for name in values["band"].values]
     if beside not in names or len(names) < 2:
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
-    if np.any(np.isinf(values)):
-        raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     others = [name for name in names if name != beside]
     camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values

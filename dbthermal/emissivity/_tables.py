@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
+from dbthermal import _numbers, planck, schema
 from dbthermal import _text as texts
-from dbthermal import planck, schema
 from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band, get
 
@@ -29,6 +29,8 @@ _MIXTURE = "emissivity_mixture.csv"
 # Share of the materials that are none of the libraries' [1], and what is known of them: mean and
 # standard deviation of an emissivity, and its correlation between two bands.
 _OTHERS = (0.05, 0.7, 0.25, 0.9)
+# Step between wavelengths [m] across which a spectrum is not known; libraries have 0.1 um at most.
+_GAP = 1e-6
 # Steps on which Planck's law is integrated beside those of the spectrum, and nodes in each.
 _STEPS = 64
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -45,9 +47,9 @@ def band_table(
 
     .. math:: e_m = \frac{\int_m e(\lambda) L(\lambda, T) d\lambda}{\int_m L(\lambda, T) d\lambda}
 
-    over the band's top hat, the spectrum taken as linear between its values. Where the spectrum
-    does not cover the whole band both integrals run over the covered part, whose share is
-    `coverage`; nothing is extrapolated.
+    over the band's top hat, the spectrum taken as linear between values that are at most 1 um
+    apart. Where the spectrum does not cover the whole band, or has a wider gap in it, both
+    integrals run over the covered part, whose share is `coverage`; nothing is extrapolated.
 
     Parameters
     ----------
@@ -76,13 +78,12 @@ def band_table(
     Examples
     --------
     >>> import xarray as xr
-    >>> wavelength = ("wavelength", [7e-6, 9e-6, 15e-6], {"units": "m"})
-    >>> spectrum = xr.Dataset(
-    ...     {"emissivity": ("wavelength", [0.9, 0.6, 0.9])}, {"wavelength": wavelength}
-    ... )
+    >>> wavelength = np.arange(7, 16) * 1e-6  # [m]
+    >>> values = 0.6 + 5e4 * abs(wavelength - 9e-6)
+    >>> spectrum = xr.Dataset({"emissivity": ("wavelength", values)}, {"wavelength": wavelength})
     >>> table = band_table({"quartz": spectrum}, ["8-14", "9.5"])
     >>> table.emissivity.sel(material="quartz").values.round(3).tolist()
-    [0.711, 0.625]
+    [0.703, 0.625]
     """
     chosen = chosen_bands(bands)
     if not isinstance(spectra, Mapping):
@@ -91,7 +92,7 @@ def band_table(
         )
     if not spectra:
         raise ValueError("Empty spectra. Must hold at least one material.")
-    if not 0 < minimum_coverage <= 1:
+    if not 0 < _numbers.real_number("minimum_coverage", minimum_coverage) <= 1:
         raise ValueError(f"Invalid minimum_coverage {minimum_coverage}. Must lie in (0, 1].")
     whole = [float(band.radiance(temperature)) for band in chosen]
     rows = np.empty((2, len(spectra), len(chosen)))
@@ -103,7 +104,7 @@ def band_table(
                 reach = f"{wavelength[0]:.4g} to {wavelength[-1]:.4g} m"
                 raise ValueError(
                     f"Invalid coverage {covered:.4f} of band '{band.name}' by the spectrum of "
-                    f"'{material}', {reach}. Must be at least {minimum_coverage}; "
+                    f"'{material}', {reach} without gaps. Must be at least {minimum_coverage}; "
                     "a lower minimum_coverage averages over the covered part."
                 )
             rows[:, row, column] = mean, covered
@@ -256,10 +257,11 @@ def _average(
     half = 0.5 * np.diff(knots)[:, np.newaxis]
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
-    mean = float(np.sum(weights * np.interp(nodes, wavelength, emissivity)) / np.sum(weights))
-    if (lower, upper) == (band.lower, band.upper):
-        return mean, 1.0
-    return mean, float(Band(band.name, lower, upper).radiance(temperature)) / whole
+    gap = np.diff(wavelength) > (1.0 + 1e-9) * _GAP
+    weights *= ~gap[np.searchsorted(wavelength, nodes[:, 1:2]) - 1]
+    covered = float(np.sum(weights))
+    mean = float(np.sum(weights * np.interp(nodes, wavelength, emissivity))) / (covered or np.nan)
+    return mean, round(covered / whole, 12)
 
 
 def _dataset(materials: list[str], names: list[str], values: Array, coverage: Array) -> xr.Dataset:

@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
+from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
@@ -51,6 +52,7 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
     """
     bands = response["band"].values
+    schema.check_numbers(response["temperature"], "'temperature' of the response", "K")
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
     celsius = response["temperature"] - zero_Celsius
     for column, band in enumerate(bands):

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
+from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
@@ -36,11 +37,13 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
     pixel : tuple of int
         Row and column.
     """
+    names = ("object_temperature", "background_temperature")
+    for part, label in ((truth, "the truth"), (result, "the result")):
+        schema.check(part, "separated", names, label)
     figure, axes = canvas(2, 1, (7.4, 5.6))
     truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
     place = {"y": pixel[0], "x": pixel[1]}
     true, estimate = truth.isel(place), result.isel(place)
-    names = ("object_temperature", "background_temperature")
     for axis, name in zip(axes[:, 0], names, strict=True):
         value, std = estimate[name] - zero_Celsius, estimate[f"{name}_std"]
         time = estimate["time"]
@@ -127,6 +130,7 @@ def separated_temperatures(
     ['emission, 0.0 s', 'reflection less its mean, 0.0 s']
     """
     labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", label)
+    _require_kelvin(apparent, emission, change)
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
@@ -176,6 +180,7 @@ def separated_film(
     ndarray of uint8, shape (rows, columns, 3)
         As from `film`.
     """
+    _require_kelvin(apparent, emission, change)
     emission = laid_on(emission, apparent, "the emission", "the inputs")
     change = laid_on(change, apparent, "the reflection", "the inputs")
     names = apparent["band"].values
@@ -186,6 +191,13 @@ def separated_film(
     panels.append(FilmPanel(emission - zero_Celsius, "emission"))
     panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
     yield from film(panels, title=title + drawing.provenance_note(apparent))
+
+
+def _require_kelvin(*temperatures: xr.DataArray) -> None:
+    """Refuse inputs, emission or reflection in another unit than kelvin."""
+    labels = ("the inputs", "the emission", "the reflection")
+    for temperature, label in zip(temperatures, labels, strict=True):
+        schema.check_numbers(temperature, label, "K")
 
 
 @dataclass(frozen=True)

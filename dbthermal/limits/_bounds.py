@@ -13,11 +13,13 @@ from scipy.stats import mode
 from dbthermal import mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
+from dbthermal._numbers import POSITIVE, real_number, real_numbers, whole_number
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
 # Standard deviation of a uniform number, over the width of its interval.
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)
+_LEAST_STD: Final = 1e-9  # of an emissivity that is not known exactly [1]
 
 
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
@@ -50,7 +52,8 @@ def ratio_variance_bound(
     Parameters
     ----------
     emissivity, noise : tuple of float
-        Emissivities [1] of the two bands, and standard deviations of their noise [K].
+        Emissivities [1] of the two bands, and standard deviations of their noise [K]; TypeError or
+        ValueError for other than two numbers, in [0, 1] and positive.
     background : ndarray, shape (time, ...)
         Background temperature [K].
     functions : ndarray, shape (time, order)
@@ -66,7 +69,9 @@ def ratio_variance_bound(
     >>> np.sqrt(variance).round(2).item()
     0.15
     """
-    ratio = float(reflection_ratio(emissivity))
+    ratio = float(reflection_ratio(real_numbers("emissivity", emissivity, (0.0, 1.0), (2,))))
+    real_numbers("noise [K]", noise, POSITIVE, (2,))
+    background, functions = real_numbers("background", background), real_numbers("basis", functions)
     rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
     energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
     return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)
@@ -103,7 +108,7 @@ def bounds(
         temperature, where two or more share it; False assumes nothing about y.
     emissivity_std : float
         Prior standard deviation [1] of each emissivity: 0 if it is known, infinite for no prior. A
-        finite one gives the Bayesian bound of van Trees.
+        finite one, at least 1e-9, gives the Bayesian bound of van Trees.
     response_kind : {"exact", "linear"}
         See `response.curve`.
 
@@ -120,7 +125,7 @@ def bounds(
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
         If an input is not as described, there is one band only, an emissivity lies outside (0, 1),
         a temperature outside the response's range, or no smooth subspace holds the object.
 
@@ -150,8 +155,11 @@ def bounds(
     >>> std.mean("time").values.round(2).tolist()  # K
     [[0.04, inf]]
     """
-    if not emissivity_std >= 0:
-        raise ValueError(f"Invalid emissivity_std {emissivity_std}. Must not be negative.")
+    if real_number("emissivity_std", emissivity_std) != 0 and not emissivity_std >= _LEAST_STD:
+        found = f"Invalid emissivity_std {emissivity_std}"
+        raise ValueError(f"{found}. Must be 0, or at least {_LEAST_STD}.")
+    if not isinstance(resting, bool | np.bool_):
+        raise TypeError(f"Invalid resting {resting!r}. Must be True or False.")
     truth = _truth(scene, resting=resting)
     names = [str(name) for name in scene["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
@@ -163,6 +171,7 @@ def bounds(
     if order is None:
         orders = smallest_order(truth, truth.sensitivity(curves, noise))
     else:
+        order = whole_number("order", order, (1, truth.time.size))
         orders = np.full(truth.object_temperature.shape[1], order)
     sensitivity = truth.smoothed(orders).sensitivity(curves, noise)
     stds = deviations(sensitivity, truth.time, orders, reference, emissivity_std=emissivity_std)
@@ -178,12 +187,8 @@ def bounds(
 
 def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
     """Checked truth of a scene."""
-    stage = schema.STAGES["separated"]
     names = (*TEMPERATURES, "emissivity")
-    for name in names:
-        if name not in scene:
-            raise ValueError(f"Missing variable '{name}' in the scene.")
-        schema.check_variable(scene[name], stage[name], f"'{name}' of the scene")
+    schema.check(scene, "separated", names, "the scene")
     temperature, background, emissivity = (
         scene[name].values.astype(np.float64).reshape(scene[name].shape[0], -1) for name in names
     )

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import bands, mixing, planck, schema
+from dbthermal import _numbers, bands, mixing, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
@@ -43,8 +43,8 @@ class CaptureDesign:
 
     Raises
     ------
-    ValueError
-        If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
+    TypeError, ValueError
+        If one is not finite, or not positive (all but `span` and `amplitude`), a pulse is
         longer than the period, or there are fewer than two frames or more than 100 000.
     """
 
@@ -59,10 +59,9 @@ class CaptureDesign:
 
     def __post_init__(self) -> None:
         for name in ("seconds", "rate", "start", "level", "period", "duration"):
-            planck.require_positive(name, getattr(self, name))
+            _numbers.real_number(name, getattr(self, name), _numbers.POSITIVE)
         for name in ("span", "amplitude"):
-            if not np.isfinite(getattr(self, name)):
-                raise ValueError(f"Invalid {name} {getattr(self, name)} K. Must be finite.")
+            _numbers.real_number(name, getattr(self, name), (-schema.LARGEST, schema.LARGEST))
         if self.duration > self.period:
             rule = f"Must be at most the period, {self.period} s"
             raise ValueError(f"Invalid duration {self.duration} s of a pulse. {rule}.")
@@ -127,15 +126,14 @@ def plan(
     ['9.5', 'none']
     """
     design = CaptureDesign() if design is None else design
+    if not isinstance(design, CaptureDesign):
+        raise TypeError(f"Invalid design {design!r}. Must be a CaptureDesign.")
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
     if beside not in names:
         raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
     others = [place for place, name in enumerate(names) if name != beside]
-    if not 1 <= together <= len(others):
-        raise ValueError(
-            f"Invalid together {together}. Must lie in [1, {len(others)}], the number of filters."
-        )
+    together = _numbers.whole_number("together", together, (1, len(others)))
     sets = [[names.index(beside), *chosen] for chosen in combinations(others, together)]
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     bodies = [TopHat(bands.get(name), temperature) for name in names]
@@ -193,8 +191,8 @@ def plan_durations(
     [0.4, 0.2]
     """
     design = CaptureDesign() if design is None else design
-    lengths = np.asarray(seconds, dtype=np.float64)
-    if lengths.size == 0 or np.any(np.diff(lengths) <= 0):
+    lengths = _numbers.real_numbers("seconds", seconds)
+    if lengths.ndim != 1 or lengths.size == 0 or np.any(np.diff(lengths) <= 0):
         raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
     plans = [plan(table, noise, replace(design, seconds=float(length))) for length in lengths]
     coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, schema
 from dbthermal._arrays import Array
 from dbthermal.correction import lag_coefficients
 from dbthermal.simulation._rig import observe
@@ -59,7 +59,8 @@ def expose(
     ValueError
         If there are not as many offsets and rates as bands, or a frame lies outside the scene.
     """
-    bands, last = response.sizes["band"], scene.sizes["time"] - 1
+    bands = schema.check(response, "response").sizes["band"]
+    last = schema.check(scene, "separated", ("object_temperature",), "the scene").sizes["time"] - 1
     rates = [every] * bands if isinstance(every, int) else list(every)
     if not len(rates) == len(offsets) == bands:
         raise ValueError(f"Invalid every {every} and offsets {offsets}. Must be one for each band.")
@@ -103,7 +104,7 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
         If the share is outside, or the dataset is not of the stage.
     """
     counts = schema.check(corrected, "corrected")["counts"]
-    if not 0 <= share < 1:
+    if not 0 <= _numbers.real_number("share", share) < 1:
         raise ValueError(f"Invalid share {share} of lost frames. Must lie in [0, 1).")
     lost = rng.random(counts.shape[:2]) < share
     lost[:, 0] = False  # no frame before it to be repeated
@@ -152,11 +153,12 @@ def fire_shutter(
     [0.0, 1.0, 2.0, 2.0, 2.0, 5.0]
     """
     counts = _floating(corrected)
-    planck.require_positive("duration [s]", duration)
+    _numbers.real_number("duration [s]", duration, _numbers.POSITIVE)
+    _numbers.real_number("offset_std [count]", offset_std, (0.0, schema.LARGEST))
     clock = counts["time"].values.astype(np.float64)
     names = [str(name) for name in counts["band"].values] if bands is None else list(bands)
     places = schema.band_positions(counts, names, "the capture")
-    for time in np.sort(np.atleast_1d(np.asarray(times, dtype=np.float64))):
+    for time in np.sort(np.atleast_1d(_numbers.real_numbers("times [s]", times))):
         if not clock[0] <= time <= clock[-1]:
             raise ValueError(
                 f"Invalid time {time} s of the shutter. Must lie in [{clock[0]}, {clock[-1]}] s."
@@ -187,7 +189,7 @@ def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) 
         Source of the pixels and of their signals.
     """
     counts = _floating(corrected)
-    if not 0 <= share < 1:
+    if not 0 <= _numbers.real_number("share", share) < 1:
         raise ValueError(f"Invalid share {share} of bad pixels. Must lie in [0, 1).")
     shape = (counts.sizes["band"], counts.sizes["y"], counts.sizes["x"])
     kind = np.where(rng.random(shape) < share, rng.integers(1, len(SPOILED), shape), 0)

@@ -1,12 +1,12 @@
 """A simulated rig: response from Planck's law, fixed pattern, noise, 16-bit counts."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from dbthermal import bands, calibration, correction, mixing, planck, schema
+from dbthermal import _numbers, bands, calibration, correction, mixing, planck, schema
 from dbthermal import response as responses
 from dbthermal._coordinates import laid_on
 from dbthermal.response import require_range
@@ -63,7 +63,9 @@ class Rig:
         if len(self.noise) != len(self.bands):
             raise ValueError(f"Invalid noise {self.noise} K. Must be one for each of {self.bands}.")
         planck.require_positive("noise [K]", self.noise)
-        if not 0 <= self.bad_fraction < 1:
+        for name in ("counts_per_kelvin", "lowest", "highest", "gain_std", "offset_std"):
+            _numbers.real_number(name, getattr(self, name), (0.0, schema.LARGEST))
+        if not 0 <= _numbers.real_number("bad_fraction", self.bad_fraction) < 1:
             raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
 
     def response(self) -> xr.Dataset:
@@ -107,7 +109,8 @@ def observe(
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
-    ValueError if a temperature lies outside the response, or a band is missing.
+    TypeError or ValueError if a temperature lies outside the response, an emissivity outside
+    [0, 1], or something is missing.
 
     Parameters
     ----------
@@ -132,9 +135,14 @@ def observe(
     >>> corrected["counts"].mean("time").squeeze().values.round().tolist()
     [23040.0, 16182.0]
     """
-    emitted = _blackbody(response, scene["object_temperature"])
-    reflected = _blackbody(response, scene["background_temperature"])
+    schema.check(scene, "separated", ("object_temperature", "emissivity"), "the scene")
+    background: Any = scene.get("background_temperature")
+    schema.check_numbers(background, "'background_temperature' of the scene", "K")
+    _numbers.real_numbers("emissivity of the scene", scene["emissivity"].values, (0.0, 1.0))
+    schema.check(response, "response", ("noise",))
     names = [str(name) for name in response["band"].values]
+    emitted = _blackbody(response, scene["object_temperature"])
+    reflected = _blackbody(response, background)
     schema.band_positions(scene, names, "the scene")
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
@@ -192,7 +200,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
-    ValueError if the detector lacks a band, or a count does not fit into 16 bits.
+    TypeError or ValueError if the detector lacks a band, or a count does not fit into 16 bits.
 
     Parameters
     ----------
@@ -210,6 +218,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     >>> raw["counts"].dtype.name, round(float((raw["counts"] == 0).mean()), 1)  # dead pixels
     ('uint16', 0.1)
     """
+    schema.check(corrected, "corrected")
     detector = laid_on(detector, corrected, "the detector", "the counts")
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
@@ -333,4 +342,6 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
 def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
     """Pattern (y, x) of one band."""
     schema.band_positions(detector, [band], "the detector")
+    dead = schema.OPTIONAL["correction"]["bad"]  # a map of other bands would be filled with NaN
+    schema.check_variable(detector["dead"], dead, "'dead' of the detector")
     return detector.sel(band=band)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, planck, schema
 from dbthermal._arrays import Array
 
 _BACKGROUNDS: Final = ("pulses", "random walk", "still")
@@ -48,14 +48,13 @@ class Background:
     def __post_init__(self) -> None:
         if self.kind not in _BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
+        for name in ("level", "amplitude", "drift", "count", "duration"):
+            _numbers.real_numbers(name, getattr(self, name))
         if not 0 <= self.count[0] <= self.count[1]:
             raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
         if not 0 < self.duration[0] <= self.duration[1]:
             raise ValueError(f"Invalid duration {self.duration} s. Must be positive, not falling.")
-        if not self.correlation_time > 0:
-            raise ValueError(
-                f"Invalid correlation_time {self.correlation_time} s. Must be positive."
-            )
+        _numbers.real_number("correlation_time [s]", self.correlation_time, _numbers.POSITIVE)
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
         """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
@@ -123,9 +122,9 @@ def scene(
     time : Array
         Times (time,) [s], two or more, increasing.
     object_temperature, background_temperature : Array
-        Temperatures (time, y, x) [K].
+        Temperatures (time, y, x), positive [K].
     emissivity : DataArray
-        Emissivity (band) or (band, y, x) [1].
+        Emissivity (band) or (band, y, x), in [0, 1], or a ValueError [1].
 
     Returns
     -------
@@ -133,6 +132,10 @@ def scene(
         Names, dims and units of the stage `separated` without its deviations.
     """
     increasing(time, "a scene")
+    planck.require_positive("object_temperature [K]", object_temperature)
+    planck.require_positive("background_temperature [K]", background_temperature)
+    schema.check_numbers(emissivity, "the emissivity", "1")
+    _numbers.real_numbers("emissivity", emissivity.values, (0.0, 1.0))
     height, width = object_temperature.shape[1:]
     values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
     parts = {
@@ -279,7 +282,7 @@ def walkers(
 
 def increasing(times: npt.ArrayLike, name: str) -> Array:
     """Checked times (time,) [s]: two or more, finite, increasing; `name` is for the ValueError."""
-    array = np.asarray(times, dtype=np.float64)
+    array = _numbers.real_numbers(f"times [s] of {name}", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")
     # A NaN fails the comparison, too.

@@ -478,7 +478,7 @@ def test_wrong_options() -> None:
         alignment.align(ramp(), offset=0.1, clock="7")
     with pytest.raises(ValueError, match=r"Invalid band 'b0'\. Must be another than the first"):
         alignment.time_offset(ramp(), band="b0")
-    with pytest.raises(ValueError, match=r"Invalid search of 11 frames"):
+    with pytest.raises(ValueError, match=r"Invalid search \[frame\] 11"):
         alignment.time_offset(ramp(), search=11)
 
 
@@ -526,7 +526,7 @@ def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
     aligned = alignment.align(capture.assign(drift=told), offset=0.02)
     assert set(aligned.data_vars) == {"counts", "noise_factor"}
     offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
-    with pytest.raises(ValueError, match="Invalid unit 'ms' of the offset"):
+    with pytest.raises(ValueError, match="Invalid units 'ms' of the time offset"):
         alignment.align(capture, offset=offset.assign_attrs(units="ms"))
 
 
@@ -540,3 +540,15 @@ def test_frames_beside_lost_ones_are_not_bridged() -> None:
         stamps, np.ones(time.size, dtype=bool), time + 0.03, np.zeros(time.size, dtype=np.intp), 1.0
     )
     assert not between.valid[~(known & np.roll(known, -1))].any()
+
+
+def test_arguments_of_another_type_are_named() -> None:
+    """A search that is not whole, an offset as text, and missing data raise an error with names."""
+    with pytest.raises(TypeError, match=r"Invalid search \[frame\] 2.5. Must be a whole number"):
+        alignment.time_offset(ramp(), search=2.5)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"Invalid offset \[s\] '0.1'"):
+        alignment.align(ramp(), offset="0.1")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="Missing variable 'counts'"):
+        alignment.exposure_times(ramp().drop_vars("counts"))
+    with pytest.raises(TypeError, match=r"Invalid exposure times \[s\] None"):
+        alignment.fill_times(None)  # type: ignore[arg-type]

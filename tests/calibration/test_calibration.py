@@ -213,7 +213,7 @@ def test_bad_noise(noise: xr.DataArray, message: str) -> None:
 def test_not_a_data_array() -> None:
     """Bare arrays in place of labelled ones raise a TypeError."""
     counts, bare = blackbody(4), np.ones(2)
-    with pytest.raises(TypeError, match="Invalid counts of type ndarray"):
+    with pytest.raises(TypeError, match="Invalid blackbody counts of type ndarray"):
         calibration.fit_response(counts.values)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="Invalid noise of type ndarray"):
         calibration.fit_response(counts, bare)  # type: ignore[arg-type]
@@ -329,3 +329,12 @@ def test_emissivity_needs_noise_and_deviations(two_bands: xr.Dataset, measured: 
     for stds in ((0.0, 0.05), (0.1, -0.05), (np.nan, 0.05)):
         with pytest.raises(ValueError, match=r"Invalid reading_std \[K\]"):
             calibration.fit_emissivity(measured, two_bands, stds)
+
+
+def test_emissivity_far_outside_is_refused(two_bands: xr.Dataset, measured: xr.Dataset) -> None:
+    """Bands with exchanged names give no emissivity, but an error that says what may be wrong."""
+    exchanged = measured.assign_coords(band=measured["band"].values[::-1])
+    with pytest.raises(ValueError, match=r"Invalid emissivity .* names or files exchanged"):
+        calibration.fit_emissivity(exchanged, two_bands, STDS)
+    with pytest.raises(ValueError, match=r"Invalid reading_std \[K\] 0.1 of shape"):
+        calibration.fit_emissivity(measured, two_bands, 0.1)  # type: ignore[arg-type]

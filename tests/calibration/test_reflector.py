@@ -261,7 +261,7 @@ def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"object_tolerance": -0.5}, "Invalid object_tolerance -0.5 K. Must be zero or positive."),
+        ({"object_tolerance": -0.5}, r"Invalid object_tolerance \[K\] -0.5. Must lie in \[0.0, "),
         ({"contact": (0.05, 0.0)}, r"Invalid contact \(0.05, 0.0\). Must be a range"),
         ({"stray": (0.0, 1.0)}, r"Invalid stray \(0.0, 1.0\). Must be a range"),
         ({"air_temperature": -20.0}, r"Invalid air_temperature \[K\] -20.0"),

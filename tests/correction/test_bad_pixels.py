@@ -110,8 +110,15 @@ def test_bad_pixels_refuse_nonsense() -> None:
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid band '8-14' of 15 frames")):
         mark_bad(capture.isel(time=slice(15)))
-    with pytest.raises(ValueError, match="Invalid threshold 0 of bad pixels"):
+    with pytest.raises(ValueError, match="Invalid threshold of bad pixels 0"):
         mark_bad(capture, threshold=0)
     sparse = capture.assign(counts=capture["counts"].where(~holes("90%")[:, :60, :20, :24]))
     with pytest.raises(ValueError, match="'8-14': no pixel has 16 samples that are not NaN"):
         mark_bad(sparse.isel(time=slice(16)))
+
+
+@pytest.mark.parametrize("threshold", ["6", True, [6.0], np.inf])
+def test_threshold_is_a_number(threshold: object) -> None:
+    """A threshold that is no finite number raises an error that names it."""
+    with pytest.raises((TypeError, ValueError), match="Invalid threshold of bad pixels"):
+        mark_bad(still(), threshold=threshold)  # type: ignore[arg-type]

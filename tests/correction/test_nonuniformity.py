@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dbthermal import schema, simulation
-from dbthermal.correction import blackbody_statistics, correct, fit_correction, renew_offset
+from dbthermal.correction import (
+    blackbody_statistics,
+    correct,
+    fit_correction,
+    renew_offset,
+    undo_lag,
+)
 from dbthermal.schema import Status
 
 TEMPERATURES = np.array([288.15, 298.15, 308.15, 318.15])
@@ -156,7 +162,7 @@ def test_threshold_is_the_caller_s(ideal: xr.Dataset) -> None:
     marked = fit_correction(ideal, threshold=2.0)["bad"].values
     assert marked.flat[np.argmax(gain)]
     assert 0.0 < marked.mean() < 0.3
-    with pytest.raises(ValueError, match=re.escape("Invalid threshold 0 of bad pixels")):
+    with pytest.raises(ValueError, match=re.escape("Invalid threshold of bad pixels 0")):
         fit_correction(ideal, threshold=0)
 
 
@@ -368,3 +374,34 @@ def test_renewed_offset_evens_the_picture() -> None:
         renew_offset(correction, flat * np.nan)
     with pytest.raises(ValueError, match="Invalid size 3 of 'x' of the flat image"):
         renew_offset(correction, flat.isel(x=slice(3)))
+
+
+@pytest.mark.parametrize("maximum", [np.nan, [3], 3j, True, -1, "65535", 65536, 65535.0])
+def test_maximum_is_a_whole_number(
+    capture: xr.Dataset, correction: xr.Dataset, ideal: xr.Dataset, maximum: object
+) -> None:
+    """A largest count that a 16-bit detector does not have raises an error that names it."""
+    with pytest.raises((TypeError, ValueError), match="Invalid maximum of the detector"):
+        correct(capture, correction, maximum=maximum)  # type: ignore[arg-type]
+    with pytest.raises((TypeError, ValueError), match="Invalid maximum of the detector"):
+        fit_correction(ideal, maximum=maximum)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("gain", [np.nan, np.inf, 0.0, -1.0])
+def test_offsets_are_not_renewed_with_a_bad_gain(correction: xr.Dataset, gain: float) -> None:
+    """A good pixel's gain that is not finite and positive is refused as by `correct`."""
+    flat = 0 * correction["offset"] + 20000.0
+    spoilt = correction.copy(deep=True)
+    row, column = np.argwhere(~spoilt["bad"].values[0])[0]
+    spoilt["gain"][0, row, column] = gain
+    with pytest.raises(ValueError, match="Invalid gain of the correction"):
+        renew_offset(spoilt, flat)
+
+
+def test_optional_variables_are_checked(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A deviation of other dims and a status of another type are named."""
+    with pytest.raises(ValueError, match=r"Invalid dims .* of 'offset_std' of the correction"):
+        correct(capture, correction.assign(offset_std=2.0))
+    corrected = correct(capture, correction)
+    with pytest.raises(TypeError, match="Invalid dtype float64 of 'status' of the corrected"):
+        undo_lag(corrected.assign(status=corrected["status"].astype(float)), 0.01)

@@ -208,3 +208,9 @@ def test_a_step_costs_accuracy(times: tuple[float, ...], factor: float) -> None:
     both = np.hstack([functions, steps])
     covariance = np.linalg.inv(both.T @ both)[:5, :5]
     np.testing.assert_allclose(np.sqrt(np.trace(covariance) / 5), factor, rtol=0, atol=0.01)
+
+
+def test_closed_frames_are_labelled() -> None:
+    """Bare closed frames raise a TypeError that names them."""
+    with pytest.raises(TypeError, match="Invalid closed frames of type ndarray"):
+        find_shutter(still(), closed=np.zeros((2, 60), bool))  # type: ignore[arg-type]

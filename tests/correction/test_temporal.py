@@ -61,9 +61,9 @@ def test_drift_refuses_nonsense() -> None:
         undo_drift(capture, patch()[:, :5])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the reference"):
         undo_drift(capture, patch().astype(int))
-    with pytest.raises(TypeError, match="Invalid dtype dict of the reference"):
+    with pytest.raises(TypeError, match="Invalid reference of type dict"):
         undo_drift(capture, {})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="Invalid order 1 of the drift"):
+    with pytest.raises(ValueError, match="Invalid order of the drift 1"):
         undo_drift(capture, patch(), order=1)
     with pytest.raises(ValueError, match="the drift was undone before"):
         undo_drift(undo_drift(capture, patch()), patch())
@@ -147,3 +147,20 @@ def test_undoing_leaves_its_input() -> None:
     assert undo_lag(capture, 0.01) is not capture
     assert undo_drift(capture, patch()) is not capture
     xr.testing.assert_identical(capture, before)
+
+
+@pytest.mark.parametrize("constant", ["0.01", b"3", True, np.timedelta64(10, "ms"), [0.01], 10.0])
+def test_time_constant_is_one_number_of_seconds(constant: object) -> None:
+    """Text, durations, lists and milliseconds raise an error that names the time constant."""
+    with pytest.raises((TypeError, ValueError), match=r"Invalid time_constant \[s\]"):
+        undo_lag(still(), constant)  # type: ignore[arg-type]
+    named = xr.DataArray([10.0, 12.0], {"band": ["8-14", "9.5"]}, "band")
+    with pytest.raises(ValueError, match=r"\[s\] 12.0. Must be at most 1: seconds, not millisec"):
+        undo_lag(still(), named)
+
+
+@pytest.mark.parametrize("order", [np.inf, 61, 2.5, "3", True, 1])
+def test_order_of_the_drift_is_not_clipped(order: object) -> None:
+    """An order that is no whole number, or beyond the frames, raises an error."""
+    with pytest.raises((TypeError, ValueError), match="Invalid order of the drift"):
+        undo_drift(still(), patch(), order=order)  # type: ignore[arg-type]

@@ -262,3 +262,19 @@ def test_colours_are_told_apart_by_the_colour_blind(matrix: list[list[float]]) -
     steps = [float(np.linalg.norm(lab[one] - lab[other])) for one, other in pairs]
     print(f"least distance {min(steps):.1f}")
     assert min(steps) > 10
+
+
+def test_temperatures_in_another_unit_are_refused() -> None:
+    """Data in degrees Celsius are not drawn as if they were kelvins."""
+    movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
+    inputs = array("band time y x", 2, 2, 5, 6)
+    for call in (
+        lambda: figures.separated_temperatures(inputs, movie, movie, title="scene"),
+        lambda: next(figures.separated_film(inputs, movie, movie, title="scene")),
+    ):
+        with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
+            call()
+    scene = separated()
+    celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
+    with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
+        figures.truth_and_estimate(scene, celsius, (1, 2))

@@ -295,6 +295,9 @@ def test_glass_is_as_designed() -> None:
         ),
         (lambda s: s, {"emissivity_std": -0.1}, "emissivity_std -0.1"),
         (lambda s: s, {"order": 0}, "order 0"),
+        (lambda s: s, {"order": np.inf}, "order inf"),
+        (lambda s: s, {"order": 351}, "order 351"),
+        (lambda s: s, {"emissivity_std": 1e-300}, "emissivity_std 1e-300. Must be 0, or at least"),
     ],
 )
 def test_bad_scene_is_a_clear_error(
@@ -304,3 +307,25 @@ def test_bad_scene_is_a_clear_error(
     scene = spoil(scene_of(0.86, 0.72))
     with pytest.raises(ValueError, match=message):
         limits.bounds(scene, RIG.response(), **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"resting": 1}, {"resting": "no"}, {"order": 2.5}, {"order": True}, {"emissivity_std": "1"}],
+)
+def test_options_of_another_type_are_named(options: dict[str, Any]) -> None:
+    """Options of another type raise a TypeError with their name."""
+    with pytest.raises(TypeError, match=f"Invalid {next(iter(options))}"):
+        limits.bounds(scene_of(0.86, 0.72), RIG.response(), **options)
+
+
+def test_ratio_bound_names_what_is_wrong() -> None:
+    """One noise for two bands, per cent and missing functions raise an error that names them."""
+    call: Any = limits.ratio_variance_bound
+    for arguments, message in (
+        (((0.8, 0.7), 3, np.ones(9), np.ones((9, 1))), r"Invalid noise \[K\] 3 of shape"),
+        (((80, 70), (0.1, 0.1), np.ones(9), np.ones((9, 1))), "Invalid emissivity 80"),
+        (((0.8, 0.7), (0.1, 0.1), np.ones(9), None), "Invalid basis None"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=message):
+            call(*arguments)

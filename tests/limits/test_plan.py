@@ -116,3 +116,17 @@ def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
     """Invalid capture conditions raise a ValueError with the rule."""
     with pytest.raises(ValueError, match="Must"):
         replace(limits.CaptureDesign(), **change)
+
+
+def test_plan_names_what_is_of_another_type(materials: Materials) -> None:
+    """A length in place of a design, and numbers of another type, raise a TypeError."""
+    table, noise = materials
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"design": 35}, "Invalid design 35. Must be a CaptureDesign"),
+        ({"together": 1.0}, "Invalid together 1.0"),
+    ]
+    for options, message in cases:
+        with pytest.raises(TypeError, match=message):
+            limits.plan(table, noise, **options)
+    with pytest.raises(TypeError, match="Invalid span '25'"):
+        limits.CaptureDesign(span="25")  # type: ignore[arg-type]

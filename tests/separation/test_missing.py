@@ -185,7 +185,7 @@ BAD: dict[str, tuple[dict[str, Any], Any, type[Exception], str]] = {
     "mask of a list": ({}, [True] * 350, TypeError, "Invalid mask of type list"),
     "mask too short": ({}, xr.DataArray(np.ones(9, bool), dims="time"), ValueError, "of the mask"),
     "mask of bands": ({}, xr.DataArray([True, True], dims="band"), ValueError, "of the mask"),
-    "half segments": ({"segment": ("time", np.ones(350))}, None, ValueError, "of float64"),
+    "half segments": ({"segment": ("time", np.ones(350))}, None, TypeError, "dtype float64 of"),
     "falling": ({"segment": ("time", np.arange(350)[::-1])}, None, ValueError, "do not fall"),
     "of pixels": ({"segment": ("x", np.arange(PIXELS))}, None, ValueError, "Must be .'time',"),
 }

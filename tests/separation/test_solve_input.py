@@ -103,7 +103,7 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
         lambda c, r: separation.solve(
             c.assign(status=(("x", "y"), np.zeros((5, 4), np.uint16))), r
         ),
-        "Invalid status .'x', 'y'. of uint16",
+        "Invalid dims .'x', 'y'. of 'status' of the corrected",
     ),
     "status bits": (
         lambda c, r: separation.solve(

@@ -187,6 +187,8 @@ def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
         ({"noise": (0.03, 0.0)}, ValueError, "Invalid noise [K] 0.0. Must be finite and positive"),
         ({"bad_fraction": 1.0}, ValueError, "Invalid bad_fraction 1.0. Must lie in [0, 1)"),
         ({"bad_fraction": -0.1}, ValueError, "Invalid bad_fraction -0.1"),
+        ({"gain_std": np.nan}, ValueError, "Invalid gain_std nan"),
+        ({"offset_std": "40"}, TypeError, "Invalid offset_std '40'"),
     ],
 )
 def test_bad_rig(change: dict[str, object], error: type[Exception], message: str) -> None:
@@ -327,3 +329,36 @@ def test_same_seed_same_data(rig: Rig, known: xr.Dataset) -> None:
 
     xr.testing.assert_identical(record(1), record(1))
     assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9
+
+
+def test_detector_of_other_bands_is_refused(
+    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Dead pixels of one band, and a capture without the bands, raise an error with the name."""
+    seen, dead = simulation.observe(twin, known, rng), detector["dead"].isel(band=slice(0, 1))
+    with pytest.raises(TypeError, match=r"of 'dead' of the detector. Must be bool"):
+        simulation.capture(seen, detector.drop_vars("dead").assign(dead=dead))
+    with pytest.raises(ValueError, match="of 'counts' of the corrected"):
+        simulation.capture(seen.rename(band="b"), detector)
+    for name in ("object_temperature", "background_temperature"):
+        with pytest.raises((TypeError, ValueError), match=f"'{name}'"):
+            simulation.observe(twin.drop_vars(name), known, rng)
+    with pytest.raises(ValueError, match="Invalid emissivity of the scene 86"):
+        simulation.observe(twin.assign(emissivity=100 * twin["emissivity"]), known, rng)
+    with pytest.raises(ValueError, match="Invalid units 'K' of 'noise'"):
+        simulation.observe(twin, known.assign(noise=known["netd"]), rng)
+
+
+@pytest.mark.parametrize(
+    ("warm", "cold", "scale", "message"),
+    [
+        (-300.0, 295.0, 1.0, r"Invalid object_temperature \[K\] -300"),
+        (300.0, np.nan, 1.0, r"Invalid background_temperature \[K\] nan"),
+        (300.0, 295.0, 100.0, "Invalid emissivity 86"),
+    ],
+)
+def test_impossible_scene(warm: float, cold: float, scale: float, message: str) -> None:
+    """Temperatures that are not positive and emissivities above 1 raise a ValueError."""
+    object_temperature, background = (np.full((4, 1, 1), level) for level in (warm, cold))
+    with pytest.raises(ValueError, match=message):
+        simulation.scene(np.arange(4.0), object_temperature, background, scale * GLASS)

@@ -1,0 +1,52 @@
+"""Strict numbers: text, truth values, durations, complex numbers and objects are refused by name.
+
+A unit in brackets in the name, as in "temperature [K]", is the one that values must have if they
+state one, as a DataArray does. A wrong type is a TypeError, a wrong value a ValueError.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal._arrays import Array
+
+Limits = tuple[float, float]
+
+POSITIVE: Final = (np.nextafter(0.0, 1.0), np.finfo(np.float64).max)
+"""Limits of what is finite and positive."""
+
+
+def real_numbers(
+    name: str, value: Any, within: Limits | None = None, shape: tuple[int, ...] | None = None
+) -> Array:
+    """Value as a float array, of a shape and within limits if they are given."""
+    given = np.asarray(value)
+    if given.dtype.kind not in "fui":
+        (first,) = given.reshape(-1)[:1].tolist() or [value]
+        kind = type(first).__name__
+        raise TypeError(f"Invalid {name} {first!r:.60}. Must be a number, not of type {kind}.")
+    unit = name.partition("[")[2].partition("]")[0].replace("^", "")
+    stated = getattr(value, "attrs", {}).get("units", unit)
+    if unit and str(stated).replace("^", "") != unit:
+        raise ValueError(f"Invalid units '{stated}' of {name}. Must be '{unit}'.")
+    if shape not in (None, given.shape):
+        raise ValueError(f"Invalid {name} {value!s:.60} of shape {given.shape}. Must have {shape}.")
+    array = given.astype(np.float64, copy=False)
+    if within and np.any(bad := ~((array >= within[0]) & (array <= within[1]))):
+        rule = "be finite and positive" if within is POSITIVE else f"lie in {[*within]}"
+        raise ValueError(f"Invalid {name} {given[bad].flat[0]}. Must {rule}.")
+    return array
+
+
+def real_number(name: str, value: npt.ArrayLike, within: Limits | None = None) -> float:
+    """Value as one float."""
+    return float(real_numbers(name, value, within, ()))
+
+
+def whole_number(name: str, value: int, within: tuple[int, int]) -> int:
+    """Value as an int; a float is refused, be it whole."""
+    real_number(name, value, within)
+    if not isinstance(value, int | np.integer):
+        raise TypeError(f"Invalid {name} {value}. Must be a whole number.")
+    return int(value)
