@@ -23,11 +23,10 @@ DETECTOR_MAXIMUM: Final = 65535
 OUTLIER: Final = 6.0
 """Robust z-score beyond which a pixel is bad [1]: 1 of 5e8 normal pixels."""
 
-_PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
-_PARAMETERS |= {"by_camera"}
+_PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "by_camera"}
+_PARAMETERS |= {"offset_renewed"}
 _PATTERN = {"offset_std", "gain_std", "centre"}
-_PASSES = 2
-_LEVELS = 65536  # about as many samples of a band tell its levels
+_PASSES, _LEVELS = 2, 65536  # about as many samples of a band tell its levels
 # Below this a difference between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 
@@ -140,9 +139,8 @@ def fit_correction(
     Raises
     ------
     TypeError, ValueError
-        If there are fewer than two temperatures, the threshold is not positive, `maximum` no whole
-        number of 16 bits, no more than half of the pixels of a band are usable, or the mean does
-        not rise with the temperature.
+        If there are fewer than two temperatures, threshold or `maximum` are out of range, no more
+        than half of the pixels of a band are usable, or the mean does not rise with temperature.
 
     Examples
     --------
@@ -252,8 +250,8 @@ def correct(
     Raises
     ------
     TypeError, ValueError
-        If the capture is not uint16 or was corrected before, `maximum` is no whole number of 16
-        bits, or the correction lacks a band, is not finite, or is of other pixels.
+        If the capture is not uint16 or was corrected before, `maximum` is out of range, or the
+        correction lacks a band, is not finite, or is of other pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):
@@ -298,11 +296,8 @@ def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> d
     else:
         return {}
     energy = np.square(level - centre[:, np.newaxis]).sum(axis=1)
-    return {
-        "offset_std": np.sqrt(variance / number),
-        "gain_std": np.sqrt(variance / energy),
-        "centre": centre,
-    }
+    offset_std, gain_std = np.sqrt(variance / number), np.sqrt(variance / energy)
+    return {"offset_std": offset_std, "gain_std": gain_std, "centre": centre}
 
 
 def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr.DataArray:
@@ -398,8 +393,7 @@ def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
 
 def _require_rising(maps: xr.Dataset) -> xr.Dataset:
     """Refuse gains and offsets that are not finite, and gains of good pixels not positive."""
-    rising = {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}
-    for name, holds in rising.items():
+    for name, holds in {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}.items():
         if not np.all(schema.measured(maps[name]) & holds):
             found = f"Invalid {name} of the correction: not finite, or not positive"
             raise ValueError(f"{found}. Must be finite, and a gain positive.")

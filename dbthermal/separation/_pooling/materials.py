@@ -30,6 +30,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal.schema import Status
 from dbthermal.separation._pooling import feature_maps, gradients, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 from dbthermal.separation._subspace.reflection_ratio import ratio_variance
@@ -65,9 +66,7 @@ _NEEDED: Final = tuple(
     for name in ("reflection_ratio", "emissivity", "background_temperature")
     for ending in ("", "_std")
 )
-_UNUSABLE: Final = (
-    schema.Status.INVALID_SAMPLES | schema.Status.CONSTANT_SIGNAL | schema.Status.DEAD_PIXEL
-)
+_UNUSABLE: Final = Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL
 
 
 def materials(
@@ -195,15 +194,11 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
 
 
 def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    """Materials (y, x), and connected pixels of none of them as further labels.
-
-    What tells nothing by itself belongs to none: it would agree with any.
-    """
-    telling = int(_UNUSABLE | schema.Status.NO_BACKGROUND_MOTION)
+    """Materials (y, x), and connected pixels of none of them as further labels."""
+    telling = int(_UNUSABLE | Status.NO_BACKGROUND_MOTION)  # else it would agree with any
     free = (labels.values < 0) & ((result["status"].values & telling) == 0)
     others = feature_maps.connected(free.astype(np.intp)) * free
-    sizes = np.bincount(others.ravel())
-    others[sizes[others] < _SMALLEST] = 0
+    others[np.bincount(others.ravel())[others] < _SMALLEST] = 0
     numbers = np.unique(others, return_inverse=True)[1].reshape(others.shape)
     return labels.copy(data=np.where(numbers > 0, labels.values.max() + numbers, labels))
 
