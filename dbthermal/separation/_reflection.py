@@ -43,7 +43,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     Raises
     ------
     ValueError
-        If the first bands, sizes or coordinates differ.
+        If a variable is missing, emissivities are in per cent, or the first bands, dims, sizes or
+        coordinates differ.
 
     Examples
     --------
@@ -62,14 +63,18 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     schema.check_numbers(apparent, "the apparent temperature", "K")
     if not isinstance(result, xr.Dataset):
         raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
+    if apparent.dims != ("band", "time", "y", "x"):
+        rule = "Must be ('band', 'time', 'y', 'x')"
+        raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
+    schema.check(result, "separated")
+    if not float(result["emissivity"].median()) <= schema.EMISSIVITY_LIMITS[1]:
+        found = f"Invalid emissivities of the result, {float(result['emissivity'].median()):.3g}"
+        raise ValueError(f"{found} in the median. Must be shares of one, not per cent.")
     if str(apparent["band"].values[0]) != str(result["band"].values[0]):
         raise ValueError(
             f"Invalid first band '{apparent['band'].values[0]}'. "
             f"Must be '{result['band'].values[0]}', as in the result."
         )
-    for name in ("background_temperature", "emissivity"):
-        units = schema.STAGES["separated"][name].units
-        schema.check_numbers(result[name], f"'{name}' of the result", units)
     first = apparent.isel(band=0, drop=True)
     first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]

@@ -16,10 +16,10 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from dbthermal import store
+from dbthermal import _numbers, store
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
-from dbthermal.separation._solve import get_method, solve
+from dbthermal.separation._solve import get_method, require_seed, solve
 from dbthermal.separation._tiles import largest
 
 if TYPE_CHECKING:
@@ -117,6 +117,12 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     """
     if get_method(method).whole_image:
         raise ValueError(f"Invalid method '{method}' for a run. Must take each pixel alone.")
+    require_seed(seed)
+    memory = _numbers.real_number("memory [byte]", memory, _numbers.POSITIVE)
+    if not isinstance(provenance, Mapping):
+        raise TypeError(
+            f"Invalid provenance of type {type(provenance).__name__}. Must be a mapping."
+        )
     options: dict[str, Any] = {
         "settings": settings,
         "emissivity": emissivity,

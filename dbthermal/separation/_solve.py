@@ -1,7 +1,6 @@
 """The one entrance to all methods: the inputs are checked, and separated tile by tile."""
 
 import importlib
-import operator
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -185,8 +184,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     True
     """
     require_workers(workers)
-    if operator.index(seed) < 0:
-        raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
+    require_seed(seed)
     inputs = check(
         corrected,
         response,
@@ -247,9 +245,8 @@ def separated(
         _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
-    doubts = dict.fromkeys(
-        str(one) for attrs in sources for one in np.atleast_1d(attrs.get("warnings", []))
-    )
+    notes = [np.atleast_1d(attrs.get("warnings", [])) for attrs in sources]
+    doubts = dict.fromkeys(str(one) for note in notes for one in note)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
@@ -282,6 +279,12 @@ def require_workers(workers: Any) -> None:
     if type(workers) is bool or not isinstance(workers, int | np.integer) or workers < 1:
         rule = "Must be a whole number, at least 1"
         raise ValueError(f"Invalid number of workers {workers!r}. {rule}.")
+
+
+def require_seed(seed: Any) -> None:
+    """Refuse a seed that is not a whole number from 0 up."""
+    if type(seed) is bool or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"Invalid seed {seed!r}. Must be zero or positive, a whole number.")
 
 
 def get_method(name: str) -> Method:

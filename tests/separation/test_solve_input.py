@@ -1,6 +1,8 @@
 """Input of `solve`: invalid arguments, bad pixels, and their status."""
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -199,3 +201,47 @@ def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> No
     status = found.check_range(responses.curve(RIG.response(), RIG.bands[0])).status
     assert status[0] == before[0] or name is None
     assert status[0] != 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "values", "named"),
+    [
+        (separation.SubspaceSettings, {"background_drift": None}, "background_drift of method"),
+        (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift of method"),
+        (separation.CalibratedSettings, {"smooth": "false"}, "smooth of method 'calibrated'"),
+        (separation.BcpSettings, {"patch": "15"}, "patch of method 'bcp'"),
+        (separation.BcpSettings, {"patch": 15.0}, "Must be a whole number"),
+        (separation.NaiveSettings, {"starts": True}, "starts of method 'naive'"),
+        (separation.RatioSettings, {"order": 2.5}, "order of method 'ratio'"),
+        (separation.DbvtSettings, {"device": None}, "device of method 'dbvt'"),
+    ],
+)
+def test_settings_of_another_type(
+    settings: Callable[..., object], values: dict[str, object], named: str
+) -> None:
+    """A setting of a wrong type is named, with its method."""
+    with pytest.raises(TypeError, match=named):
+        settings(**values)
+
+
+def test_a_wrong_seed_leaves_nothing_of_a_run(tmp_path: Path, glass: Glass) -> None:
+    """It is refused before anything is made, and the right call then goes through."""
+    _, capture, response = glass
+    wrongs: tuple[dict[str, Any], ...] = ({"seed": "3"}, {"memory": "2e9"}, {"provenance": "x"})
+    for wrong in wrongs:
+        with pytest.raises((TypeError, ValueError), match="Invalid"):
+            separation.run(capture, tmp_path / "a.zarr", response, **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_reflected_change_of_other_results(glass: Glass) -> None:
+    """Emissivities in per cent, other dims, and missing variables are named."""
+    _, capture, response = glass
+    result = separation.solve(capture, response)
+    apparent = responses.apparent_temperature(response, capture["counts"])
+    with pytest.raises(ValueError, match="not per cent"):
+        separation.reflected_change(apparent, result.assign(emissivity=100 * result["emissivity"]))
+    with pytest.raises(ValueError, match="Invalid dims"):
+        separation.reflected_change(apparent.rename(y="row"), result)
+    with pytest.raises(ValueError, match="Missing variable 'emissivity'"):
+        separation.reflected_change(apparent, result.drop_vars("emissivity"))

@@ -286,3 +286,27 @@ def test_rate_of_full_frames() -> None:
     )
     print(f"{stream.nbytes / 1e6:.0f} MB, latency {stream.latency} s")
     assert cost < 2.0 / 60.0  # s, on two cores
+
+
+def test_frames_are_taken_by_the_names_of_their_bands_and_without_what_is_masked(
+    glass: Data,
+) -> None:
+    """Frames whose bands stand the other way, and masked samples, which are as if missing."""
+    _, capture, response = glass
+    counts, time = capture["counts"].values, capture["time"].values
+    wrong = np.random.default_rng(0).random(counts[:, 0].shape) < 0.02
+    kinds: dict[str, list[Any]] = {"plain": [], "named": [], "missing": [], "masked": []}
+    for frame in np.moveaxis(counts, 1, 0):
+        named = capture["counts"][:, 0].copy(data=frame).isel(band=[1, 0])
+        kinds["plain"].append(frame)
+        kinds["named"].append(named)
+        kinds["missing"].append(np.where(wrong, np.nan, frame))
+        kinds["masked"].append(np.ma.masked_array(np.where(wrong, frame + 3000, frame), wrong))
+    results = {}
+    for kind, frames in kinds.items():
+        stream = Stream(capture.isel(time=[0]), response, frame_rate=RATE)
+        for now, frame in zip(time, frames, strict=True):
+            stream.update(now, frame)
+        results[kind] = stream.result()
+    xr.testing.assert_identical(results["plain"], results["named"])
+    xr.testing.assert_identical(results["missing"], results["masked"])

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
+from dbthermal._numbers import check_fields
 from dbthermal.response import require_range
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
 from dbthermal.separation._inputs import Method, require
@@ -63,6 +64,7 @@ class BcpSettings:
 
     def __post_init__(self) -> None:
         """Refuse windows without a centre, and numbers outside their range."""
+        check_fields(self, "method 'bcp'")
         for name in ("patch", "window"):
             side = getattr(self, name)
             require(self, "bcp", name, side >= 1 and side % 2 == 1, "be odd")

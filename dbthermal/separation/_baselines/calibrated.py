@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 
+from dbthermal._numbers import check_fields
 from dbthermal.schema import Status
 from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation._inputs import Method
@@ -44,6 +45,10 @@ class CalibratedSettings:
     """
 
     smooth: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no truth value."""
+        check_fields(self, "method 'calibrated'")
 
 
 def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
+from dbthermal._numbers import check_fields
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
 from dbthermal.separation._inputs import Method, require
@@ -62,6 +63,7 @@ class NaiveSettings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not positive."""
+        check_fields(self, "method 'naive'")
         for name in ("starts", "iterations"):
             require(self, "naive", name, getattr(self, name) >= 1, "be at least 1")
         planck.require_positive("shift_std [K] of method 'naive'", self.shift_std)

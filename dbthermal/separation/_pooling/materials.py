@@ -26,8 +26,8 @@ import xarray as xr
 from scipy.ndimage import binary_dilation, distance_transform_cdt, find_objects
 from scipy.stats import chi2
 
+from dbthermal import _numbers, schema
 from dbthermal import response as responses
-from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
@@ -61,10 +61,11 @@ _VAGUE: Final = 0.3
 _SMALLEST: Final = 16
 # Square of the deviations by which a ratio tells two materials apart.
 _TELLING: Final = 9.0
-_NEEDED: Final = tuple(
-    name + ending
-    for name in ("reflection_ratio", "emissivity", "background_temperature")
-    for ending in ("", "_std")
+_NEEDED: Final = (
+    "status",
+    *map(
+        "".join, product(("reflection_ratio", "emissivity", "background_temperature"), ("", "_std"))
+    ),
 )
 _UNUSABLE: Final = Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL
 
@@ -253,7 +254,7 @@ def _checked(
     """Result in the capture's order of bands."""
     schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
-        if not 0 < value < 1:
+        if not 0 < _numbers.real_number(name, value) < 1:
             raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
     for name in _NEEDED:
         if name not in result:

@@ -59,6 +59,7 @@ from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import select
+from dbthermal._numbers import check_fields
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, require_device
 from dbthermal.separation._quality import status_bits
@@ -127,6 +128,7 @@ class SubspaceSettings:
 
     def __post_init__(self) -> None:
         """Refuse a drift that is negative or not finite, and a device that is not there."""
+        check_fields(self, "method 'subspace'")
         if not 0 <= self.background_drift < np.inf:
             raise ValueError(
                 f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
