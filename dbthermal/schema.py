@@ -43,6 +43,7 @@ __all__ = [
     "SEGMENT",
     "SHUTTER_CLOSED",
     "STAGES",
+    "UNMEASURED",
     "Flags",
     "Status",
     "Variable",

@@ -56,7 +56,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Left:
-    """What a polynomial leaves of the costs of pixels, or of their sums over squares (part,)."""
+    """Residual of a polynomial in the costs of pixels, or in their sums over squares (part,)."""
 
     residual: Array  # of b
     cost: Cost
