@@ -65,10 +65,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """Separate emission and reflection in a capture, with an answer at every pixel.
 
     Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
-    reflections move, with the shift between the cameras' reflections (`alignment.reflection_shift`)
-    if fewer are apart with it, or more have no flag; then with the pixels of each material pooled
-    (`materials`), except, of cameras apart, those that only alone have no flag or lie at its
-    border; last, what is still unknown is completed (`complete`).
+    reflections move, or show slow changes displaced, with the shift between the cameras'
+    reflections (`alignment.reflection_shift`) if fewer are apart with it, or more have no flag;
+    then with the pixels of each material pooled (`materials`), held to what they tell alone; last,
+    what is still unknown is completed (`complete`).
 
     Parameters
     ----------
