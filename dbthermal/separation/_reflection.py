@@ -66,19 +66,19 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     if apparent.dims != ("band", "time", "y", "x"):
         rule = "Must be ('band', 'time', 'y', 'x')"
         raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
-    for name in ("background_temperature", "emissivity", "status"):
-        if name not in result:
-            raise ValueError(f"Missing variable '{name}' in the result. Must be one of `solve`.")
-        label = f"'{name}' of the result"
-        schema.check_variable(result[name], schema.STAGES["separated"][name], label)
-    if not float(result["emissivity"].median()) <= schema.EMISSIVITY_LIMITS[1]:
-        found = f"Invalid emissivities of the result, {float(result['emissivity'].median()):.3g}"
-        raise ValueError(f"{found} in the median. Must be shares of one, not per cent.")
     if str(apparent["band"].values[0]) != str(result["band"].values[0]):
         raise ValueError(
             f"Invalid first band '{apparent['band'].values[0]}'. "
             f"Must be '{result['band'].values[0]}', as in the result."
         )
+    for name in ("background_temperature", "emissivity", "status"):
+        if name not in result:
+            raise ValueError(f"Missing variable '{name}' in the result. Must be one of `solve`.")
+        label = f"'{name}' of the result"
+        schema.check_variable(result[name], schema.STAGES["separated"][name], label)
+    if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
+        found = f"Invalid emissivities of the result, {usual:.3g} in the median"
+        raise ValueError(f"{found}. Must be shares of one, not per cent.")
     first = apparent.isel(band=0, drop=True)
     first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]
