@@ -8,6 +8,7 @@ written and read as arrays all the same. The pages of a file count as the proces
 until they are released (`release`).
 """
 
+import importlib
 import mmap
 import os
 import sys
@@ -66,6 +67,24 @@ def select(values: Any, selected: Any, axis: int = -1) -> Any:
         return values.movedim(axis, -1)[..., selected].movedim(-1, axis)
     selected = np.flatnonzero(selected) if selected.dtype == bool else selected
     return values.take(selected, axis=axis)
+
+
+def require_device(device: str, method: str) -> None:
+    """Refuse a device that torch cannot compute on here; ImportError without torch."""
+    try:
+        torch = importlib.import_module("torch")
+        torch.ones(1, dtype=torch.float64, device=device).item()
+    except ImportError as error:
+        raise ImportError(
+            f"Missing library 'torch' for device '{device}' of method '{method}'. Must be "
+            "installed: python -m pip install 'dbthermal[torch]'."
+        ) from error
+    except (AssertionError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"Invalid device '{device}' of method '{method}'. Must be one on which torch has "
+            f"double precision here: {reason}"
+        ) from error
 
 
 @contextmanager

@@ -4,9 +4,7 @@ A unit in brackets in the name, as in "temperature [K]", is the one that values 
 state one, as a DataArray does. A wrong type is a TypeError, a wrong value a ValueError.
 """
 
-from dataclasses import fields
-from types import NoneType
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -52,19 +50,3 @@ def whole_number(name: str, value: int, within: tuple[int, int]) -> int:
     if not isinstance(value, int | np.integer):
         raise TypeError(f"Invalid {name} {value}. Must be a whole number.")
     return int(value)
-
-
-def check_fields(record: Any, of: str) -> None:
-    """Refuse a field of a dataclass `of` something whose value is not of its stated type."""
-    for field in fields(record):
-        value, kinds = getattr(record, field.name), get_args(field.type) or (field.type,)
-        name = f"{field.name} of {of}"
-        if value is None and NoneType in kinds:
-            continue
-        if int in kinds and isinstance(value, float):
-            raise TypeError(f"Invalid {name} {value}. Must be a whole number.")
-        if {int, float} & {*kinds}:
-            real_number(name, value)
-        elif not isinstance(value, kinds):
-            rule = " or ".join(kind.__name__ for kind in kinds)
-            raise TypeError(f"Invalid {name} {value!r:.60}. Must be of type {rule}.")

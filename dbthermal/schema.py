@@ -271,8 +271,9 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if variable.dtype != "bool":
-        check_numbers(array, label, variable.units)
-        if variable in (STATUS, SEGMENT) and array.dtype.kind == "f":
+        flags = variable in (STATUS, SEGMENT)  # whole numbers, whose unit says nothing
+        check_numbers(array, label, None if flags else variable.units)
+        if flags and array.dtype.kind == "f":
             raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")

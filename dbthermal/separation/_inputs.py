@@ -1,9 +1,9 @@
 """Inputs of a separation: the method, a capture and all that is known of it, checked."""
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from types import NoneType
+from typing import Any, Final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -96,22 +96,18 @@ def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> Non
         raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
 
 
-def require_device(device: str, method: str) -> None:
-    """Refuse a device that torch cannot compute on here; ImportError without torch."""
-    try:
-        torch = importlib.import_module("torch")
-        torch.ones(1, dtype=torch.float64, device=device).item()
-    except ImportError as error:
-        raise ImportError(
-            f"Missing library 'torch' for device '{device}' of method '{method}'. Must be "
-            "installed: python -m pip install 'dbthermal[torch]'."
-        ) from error
-    except (AssertionError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"Invalid device '{device}' of method '{method}'. Must be one on which torch has "
-            f"double precision here: {reason}"
-        ) from error
+def check_fields(settings: Any, method: str) -> None:
+    """Refuse options of a method that are not of their stated types."""
+    for field in fields(settings):
+        value, kinds = getattr(settings, field.name), get_args(field.type) or (field.type,)
+        whole, real = isinstance(value, int | np.integer), isinstance(value, float | np.floating)
+        fits = isinstance(value, kinds) or (value is None and NoneType in kinds)
+        if {int, float} & {*kinds} and value is not None:
+            fits = (whole or (real and int not in kinds)) and type(value) is not bool
+        if not fits:
+            names = {int: "a whole number", float: "a number", bool: "a truth value", str: "text"}
+            rule = " or ".join(names[kind] for kind in kinds if kind in names)
+            raise TypeError(f"Invalid {field.name} {value!r} of method '{method}'. Must be {rule}.")
 
 
 def check(  # noqa: PLR0913 - all that the user gives, by name
@@ -189,13 +185,6 @@ def _checked_settings(method: Method, name: str, settings: Any) -> Any:
         raise TypeError(
             f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
         )
-    for field in fields(kind):
-        value = getattr(settings, field.name)
-        optional = value is None and "None" in str(field.type)
-        if type(field.default) is int and type(value) is not int and not optional:
-            raise TypeError(
-                f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
-            )
     return settings
 
 

@@ -369,5 +369,5 @@ def test_no_frames_at_all(tmp_path: Path) -> None:
     gone = Faults(unplugged=0)
     record(session(), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "a.zarr").sizes["time"] == 0
-    with pytest.raises(ValueError, match="Empty 'exposure_time'"):
+    with pytest.raises(ValueError, match="Empty 'counts' of the corrected"):
         open_capture(tmp_path / "a.zarr")

@@ -206,14 +206,24 @@ def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> No
 @pytest.mark.parametrize(
     ("settings", "values", "named"),
     [
-        (separation.SubspaceSettings, {"background_drift": None}, "background_drift of method"),
-        (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift of method"),
-        (separation.CalibratedSettings, {"smooth": "false"}, "smooth of method 'calibrated'"),
-        (separation.BcpSettings, {"patch": "15"}, "patch of method 'bcp'"),
+        (
+            separation.SubspaceSettings,
+            {"background_drift": None},
+            "Invalid background_drift",
+        ),
+        (
+            separation.SubspaceSettings,
+            {"background_drift": "3"},
+            "Invalid background_drift",
+        ),
+        (separation.CalibratedSettings, {"smooth": "false"}, "Invalid smooth 'false' of method"),
+        (separation.BcpSettings, {"patch": "15"}, "Invalid patch '15' of method"),
         (separation.BcpSettings, {"patch": 15.0}, "Must be a whole number"),
-        (separation.NaiveSettings, {"starts": True}, "starts of method 'naive'"),
-        (separation.RatioSettings, {"order": 2.5}, "order of method 'ratio'"),
-        (separation.DbvtSettings, {"device": None}, "device of method 'dbvt'"),
+        (separation.NaiveSettings, {"starts": 2.5}, "Invalid starts 2.5 of method"),
+        (separation.DbvtSettings, {"batch": 2.5}, "Must be a whole number"),
+        (separation.NaiveSettings, {"starts": True}, "Invalid starts True of method"),
+        (separation.RatioSettings, {"order": 2.5}, "Invalid order 2.5 of method"),
+        (separation.DbvtSettings, {"device": None}, "Invalid device None of method"),
     ],
 )
 def test_settings_of_another_type(

@@ -55,24 +55,6 @@ BAD: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
         TypeError,
         "Invalid settings of type RatioSettings for method 'naive'. Must be NaiveSettings",
     ),
-    "half a start": (
-        "naive",
-        {"settings": separation.NaiveSettings(starts=2.5)},  # type: ignore[arg-type]
-        TypeError,
-        r"Invalid starts 2\.5 of method 'naive'",
-    ),
-    "half a batch": (
-        "dbvt",
-        {"settings": separation.DbvtSettings(batch=2.5)},  # type: ignore[arg-type]
-        TypeError,
-        "Must be a whole number",
-    ),
-    "half an odd patch": (
-        "bcp",
-        {"settings": separation.BcpSettings(patch=5.0)},  # type: ignore[arg-type]
-        TypeError,
-        r"Invalid patch 5\.0",
-    ),
     "negative seed": ("naive", {"seed": -1}, ValueError, "Invalid seed -1. Must be zero or"),
 }
 

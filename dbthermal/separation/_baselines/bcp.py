@@ -25,10 +25,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
-from dbthermal._numbers import check_fields
 from dbthermal.response import require_range
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method, require
+from dbthermal.separation._inputs import Method, check_fields, require
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 
@@ -64,7 +63,7 @@ class BcpSettings:
 
     def __post_init__(self) -> None:
         """Refuse windows without a centre, and numbers outside their range."""
-        check_fields(self, "method 'bcp'")
+        check_fields(self, "bcp")
         for name in ("patch", "window"):
             side = getattr(self, name)
             require(self, "bcp", name, side >= 1 and side % 2 == 1, "be odd")

@@ -17,10 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal._numbers import check_fields
 from dbthermal.schema import Status
 from dbthermal.separation import _known_emissivity as known_emissivity
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
@@ -48,7 +47,7 @@ class CalibratedSettings:
 
     def __post_init__(self) -> None:
         """Refuse what is no truth value."""
-        check_fields(self, "method 'calibrated'")
+        check_fields(self, "calibrated")
 
 
 def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:

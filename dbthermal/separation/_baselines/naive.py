@@ -20,10 +20,9 @@ import numpy as np
 from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
-from dbthermal._numbers import check_fields
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method, require
+from dbthermal.separation._inputs import Method, check_fields, require
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Pixels, Tile
 
@@ -63,7 +62,7 @@ class NaiveSettings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that are not positive."""
-        check_fields(self, "method 'naive'")
+        check_fields(self, "naive")
         for name in ("starts", "iterations"):
             require(self, "naive", name, getattr(self, name) >= 1, "be at least 1")
         planck.require_positive("shift_std [K] of method 'naive'", self.shift_std)

@@ -22,11 +22,10 @@ from scipy.interpolate import CubicSpline
 
 from dbthermal import _smooth as smooth
 from dbthermal import bands, planck
-from dbthermal._numbers import check_fields
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_BACKGROUND, point_estimate
-from dbthermal.separation._inputs import Method, require
+from dbthermal.separation._inputs import Method, check_fields, require
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Tile
 
@@ -67,7 +66,7 @@ class RatioSettings:
 
     def __post_init__(self) -> None:
         """Refuse unknown kinds and orders without a function."""
-        check_fields(self, "method 'ratio'")
+        check_fields(self, "ratio")
         if self.kind not in KINDS:
             raise ValueError(
                 f"Unknown kind '{self.kind}' of method 'ratio'. Must be one of {KINDS}."

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from dbthermal import planck
-from dbthermal._numbers import check_fields
-from dbthermal.separation._inputs import require, require_device
+from dbthermal._arrays import require_device
+from dbthermal.separation._inputs import check_fields, require
 
 _CHOICES: Final = {
     "start": ("random", "subspace"),
@@ -91,7 +91,7 @@ class DbvtSettings:
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and numbers outside their range."""
-        check_fields(self, "method 'dbvt'")
+        check_fields(self, "dbvt")
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(

@@ -58,10 +58,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import select
-from dbthermal._numbers import check_fields
+from dbthermal._arrays import require_device, select
 from dbthermal.schema import Status
-from dbthermal.separation._inputs import Method, require_device
+from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import (
     clock,
@@ -128,7 +127,7 @@ class SubspaceSettings:
 
     def __post_init__(self) -> None:
         """Refuse a drift that is negative or not finite, and a device that is not there."""
-        check_fields(self, "method 'subspace'")
+        check_fields(self, "subspace")
         if not 0 <= self.background_drift < np.inf:
             raise ValueError(
                 f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
