@@ -19,12 +19,12 @@ from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
-from dbthermal.separation._apart.side_by_side import hold
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
+from dbthermal.separation._pooling.held import hold
 from dbthermal.separation._solve import get_method, separated, solve
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material

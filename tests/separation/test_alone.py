@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal.schema import Status
-from dbthermal.separation._apart.side_by_side import hold
+from dbthermal.separation._pooling.held import hold
 
 SHAPE, FRAMES = (40, 48), 30
 SINGLE, TOGETHER = 0.2, 0.03

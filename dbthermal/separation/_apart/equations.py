@@ -104,7 +104,7 @@ class Equations:
         return result
 
     def beside(self, signal: Floats, change: Floats) -> Floats:
-        """Array u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
+        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
         result = np.asarray(self.there @ signal)
         result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
         return result
@@ -269,7 +269,7 @@ def first_band(
     inputs: Inputs, loose: Whole, frames: Whole
 ) -> tuple[Array, Array, Callable[[slice | Whole], Floats], Floats]:
     """
-    Array (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
+    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
 
     Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
     frame) [K], of any frames, and its variance (loose): smoothed over time, it is that of

@@ -12,32 +12,16 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 
-from dbthermal._arrays import release
-from dbthermal.schema import Status
 from dbthermal.separation._apart import joint, neighbours
 from dbthermal.separation._inputs import Inputs, Labels
-from dbthermal.separation._tiles import Array, Mask, Material
+from dbthermal.separation._tiles import Material
 
 Each: TypeAlias = Callable[[Inputs, Material | None], object]
 """Separates each pixel alone, into the result."""
 Regroup: TypeAlias = Callable[[Material | None], Labels]
 """Labels (pixel) of materials, of what is told of those before."""
 
-# Pixels on either side of which a resampled one is made; single ones in a material are no border.
-_REACH: Final = 2
-_SINGLE: Final = 3
-# Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
-_HARDLY: Final = 0.5
-# Share of gray pixels from which their material is [1].
-_MOSTLY: Final = 0.5
-# Square of the difference in deviations that is no chance, of a pixel and of those around [1].
-_MORE: Final = 4.0
-_MORE_AROUND: Final = 1.5
-# Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
-_AROUND: Final = 1.5
-_SOME: Final = 1e-3
 # Turns of the materials and the object of each camera's own place.
 _TURNS: Final = 3
 
@@ -96,68 +80,3 @@ def regrouped(
         return inputs, material
     inputs = replace(inputs, labels=labels)
     return inputs, survey(inputs)
-
-
-def hold(
-    alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, apart: bool = True
-) -> None:
-    """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
-
-    A pixel alone has the ratio that its own changes show, with errors of how the cameras are
-    paired, or of what is mixed at an edge, in it; at the ratio of its material they are left in the
-    object. Where pooling is right, the two differ by no more than the deviation of the pixel alone.
-
-    One stays alone without a label, where only alone it has no flag, and where most pixels of its
-    material are gray, pooled, too: the others are not by chance. Of cameras `apart` also where
-    pooling hardly makes its ratio more certain, and at the border of its material. With D the mean
-    square of the difference of the objects in deviations of a pixel alone, its own or that around,
-    the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
-    that tells nothing alone, by as much as around.
-    """
-    sound, told = (one["status"].values == 0 for one in (alone, pooled))
-    stay = sound & (~told | (labels.values < 0))
-    if apart:
-        ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
-        stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
-    gray = (pooled["status"].values & np.uint32(Status.GRAY)) != 0
-    stay |= _share(labels.values, gray) > _MOSTLY
-    both, single = sound & told & ~stay, alone["object_temperature_std"].values
-    films = [one["object_temperature"].values for one in (pooled, alone)]
-    square, variance = np.zeros((2, *both.shape))
-    for row, here in enumerate(sound & told):
-        value, other, std = (film[:, row, here].astype(np.float64) for film in (*films, single))
-        square[row, here] = np.nanmean(((value - other) / std) ** 2, axis=0)
-        variance[row, here] = np.nanmean(std**2, axis=0)
-        release()
-    local = np.where(both, _around(square, both), 0.0)
-    more = both & ((square > _MORE) | (local > _MORE_AROUND))
-    square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
-    constant = np.where(told & ~sound, _around(square * variance, both | (stay & sound)), 0.0)
-    for row, (factor, offset) in enumerate(zip(square * both, constant, strict=True)):
-        film = pooled["object_temperature_std"].values[:, row]
-        film[...] = np.sqrt(film**2 + factor * np.nan_to_num(single[:, row]) ** 2 + offset)
-        for name, part in alone.data_vars.items():
-            if part.dims[-2:] == ("y", "x"):
-                pooled[name].values[..., row, stay[row]] = part.values[..., row, stay[row]]
-        release()
-
-
-def _share(labels: Array, holds: Mask) -> Array:
-    """Share (y, x) of the pixels of each one's material for which something holds; 0 without."""
-    numbers = labels + 1
-    share = np.bincount(numbers.ravel(), holds.ravel()) / np.maximum(
-        np.bincount(numbers.ravel()), 1
-    )
-    return np.where(labels >= 0, share[numbers], 0.0)
-
-
-def _border(labels: Array) -> Mask:
-    """Pixels (y, x) at the border of a material."""
-    whole, size = median_filter(labels, _SINGLE, mode="nearest"), 1 + 2 * _REACH
-    return np.asarray(minimum_filter(whole, size) < maximum_filter(whole, size))
-
-
-def _around(values: Array, known: Mask) -> Array:
-    """Mean (y, x) of the known pixels around."""
-    sums = [gaussian_filter(part, _AROUND) for part in (np.where(known, values, 0.0), known * 1.0)]
-    return np.asarray(sums[0] / np.maximum(sums[1], _SOME))
