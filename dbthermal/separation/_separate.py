@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
+from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
 
 from dbthermal import _smooth as smooth
@@ -38,9 +39,10 @@ _LOOKED_AT: Final = 2000
 # if it is that by more than so many of its standard deviations.
 _APART, _SIGMAS = 0.02, 3.0
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
-# displacement is looked for [pixel]; deviations and pixels from which it is one.
+# displacement is looked for [pixel]; deviations and pixels from which it is one, and by how many
+# times their variance has to exceed that of noise, in every direction.
 _FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 4, (8, 24), 4, 2.0
-_CERTAIN, _LEAST = 5.0, 0.3
+_CERTAIN, _LEAST, _STRONG = 5.0, 0.3, 3.0
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
@@ -250,8 +252,9 @@ def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
         normal, right = design @ design.T, design @ rapid[1].ravel()
         # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
         white = design.shape[1] * inputs.noise[inputs.bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
-        normal -= white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
-        if np.linalg.eigvalsh(normal)[0] > 0:
+        noise = white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
+        normal -= noise
+        if eigh(normal, noise, eigvals_only=True)[0] > _STRONG:
             ratio, *shift = np.linalg.solve(normal, right)
             found.append(np.array(shift) / ratio)
     if len(found) < _FEWEST:

@@ -39,16 +39,26 @@ def hold(
     pooling hardly makes its ratio more certain, and at the border of its material. With D the mean
     square of the difference of the objects in deviations of a pixel alone, its own or that around,
     the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
-    that tells nothing alone, by as much as around.
+    that tells nothing alone, by as much as around. At one place this does not hold for a material
+    most of whose moving pixels are gray alone: its others are selected by their noise.
     """
     sound, told = (one["status"].values == 0 for one in (alone, pooled))
     stay = sound & (~told | (labels.values < 0))
     if apart:
         ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
         stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
-    gray = (pooled["status"].values & np.uint32(Status.GRAY)) != 0
+    gray, gray_alone, still = (
+        (one["status"].values & np.uint32(flag)) != 0
+        for one, flag in (
+            (pooled, Status.GRAY),
+            (alone, Status.GRAY),
+            (alone, Status.NO_BACKGROUND_MOTION),
+        )
+    )
     stay |= _share(labels.values, gray) > _MOSTLY
     both, single = sound & told & ~stay, alone["object_temperature_std"].values
+    if not apart:
+        both &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
     films = [one["object_temperature"].values for one in (pooled, alone)]
     square, variance = np.zeros((2, *both.shape))
     for row, here in enumerate(sound & told):
