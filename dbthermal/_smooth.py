@@ -6,14 +6,16 @@ then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import pairwise
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from dbthermal._arrays import Array, Mask, namespace
+from dbthermal._compiled import compiled
+
+Whole = npt.NDArray[np.intp]
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 # Functions that a change point costs as much as: to choose where the polynomial changes fits noise,
@@ -102,41 +104,75 @@ def piecewise(
     time = np.asarray(time, dtype=np.float64)
     if segment is not None and segment[0] == segment[-1]:  # it only rises
         segment = None
-    edges, parts = [*np.flatnonzero(first), time.size], []
-    for start, stop in pairwise(edges):
-        events = len(camera_steps(None if segment is None else segment[start:stop]))
-        order = min(number, stop - start - events)
-        parts.append((start, stop, *_known_basis(time[start:stop].tobytes(), order)))
-    ends, counts = [part[:2] for part in parts], [part[2].shape[1] for part in parts]
-    spans = np.repeat(ends, counts, axis=0)
-    # A column after another, of which a piece fills a part: what is zero takes no memory.
-    together, column = np.zeros((len(spans), time.size)), 0
-    for start, stop, basis, _ in parts:
-        together[column : column + basis.shape[1], start:stop] = basis.T
-        column += basis.shape[1]
+    edges = np.append(np.flatnonzero(first), time.size)
+    events = np.zeros(edges.size - 1, dtype=np.intp)
+    if segment is not None:
+        rises = (np.diff(segment, prepend=segment[0]) > 0) & ~first
+        events = np.add.reduceat(rises.astype(np.intp), edges[:-1])
+    counts = np.minimum(number, np.diff(edges) - events)
+    # A column after another, of which a piece fills a part.
+    size = int(counts.sum())
+    together, spans = np.zeros((size, time.size)), np.empty((size, 2), dtype=np.intp)
+    chosen, leverage = np.empty((2, time.size, 1))
+    _polynomials(time, edges, counts, together, spans, chosen, leverage)
     plain, steps = together.T, camera_steps(segment)
-    if not steps:  # of two pieces, orthonormal as they are
-        each = [part[3] * _of_choice(part, time.size) for part in parts]
-        return Subspace(plain, plain, len(together) - 1, rising, spans, np.concatenate(each))
-    functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
-    leverage = (object_part**2).sum(axis=1, keepdims=True)
-    for part in parts:
-        leverage[part[0] : part[1]] *= _of_choice(part, time.size)
-    return Subspace(functions, object_part, functions.shape[1] - 1, rising, of_pieces=leverage)
+    if steps:
+        functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
+        leverage = chosen * (object_part**2).sum(axis=1, keepdims=True)
+        return Subspace(functions, object_part, functions.shape[1] - 1, rising, of_pieces=leverage)
+    return Subspace(plain, plain, size - 1, rising, spans, leverage)
 
 
-def _of_choice(part: tuple[int, int, Array, Array], frames: int) -> float:
-    """Leverage of a piece, its ends chosen from the data, over that of given ends."""
-    start, stop, basis, _ = part
-    ends = int(start > 0) + int(stop < frames)
-    return 1.0 + 0.5 * CHANGE_POINT * ends / basis.shape[1]
+@compiled
+def _make_orthonormal(columns: Array, own: Array) -> None:
+    """Make a function (time) orthogonal to columns (column, time) and of length 1, in place."""
+    for _ in range(2):  # once more, against rounding
+        for other in columns:
+            product = 0.0
+            for t in range(own.size):
+                product += other[t] * own[t]
+            for t in range(own.size):
+                own[t] -= product * other[t]
+    square = 0.0
+    for t in range(own.size):
+        square += own[t] ** 2
+    for t in range(own.size):
+        own[t] /= np.sqrt(square)
 
 
-@lru_cache(maxsize=4096)
-def _known_basis(time: bytes, order: int) -> tuple[Array, Array]:
-    """Basis over some times, and its leverage (time, 1): many pixels have pieces of the same."""
-    basis = polynomial_basis(np.frombuffer(time), order)
-    return basis, (basis.T**2).sum(axis=0)[:, np.newaxis]
+@compiled
+def _polynomials(
+    time: Array,
+    edges: Whole,
+    counts: Whole,
+    columns: Array,
+    spans: Whole,
+    chosen: Array,
+    leverage: Array,
+) -> None:
+    """As `_arnoldi`, so many in each piece between edges, one column (column, time) after another.
+
+    All in place, the columns of zeros; with their spans, the leverage (time, 1), and what it is
+    over that of pieces whose ends are not chosen from the data.
+    """
+    column = 0
+    for piece in range(counts.size):
+        start, stop, count = edges[piece], edges[piece + 1], counts[piece]
+        middle = 0.5 * (time[start] + time[stop - 1])
+        ends = (1.0 if piece > 0 else 0.0) + (1.0 if piece < counts.size - 1 else 0.0)
+        chosen[start:stop] = 1.0 + 0.5 * CHANGE_POINT * ends / count
+        leverage[start:stop] = 0.0
+        for degree in range(count):
+            own = columns[column + degree, start:stop]
+            for t in range(own.size):
+                own[t] = 1.0
+                if degree > 0:
+                    own[t] = (time[start + t] - middle) * columns[column + degree - 1, start + t]
+            _make_orthonormal(columns[column : column + degree, start:stop], own)
+            for t in range(own.size):
+                leverage[start + t, 0] += chosen[start + t, 0] * own[t] ** 2
+            spans[column + degree, 0], spans[column + degree, 1] = start, stop
+        column += count
 
 
 def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:

@@ -1,7 +1,6 @@
 """Equations that couple the object signals at both cameras' places, of all pixels; see `joint`."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -15,11 +14,11 @@ from scipy.sparse import csr_array, diags_array
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, release
+from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart.displaced import without
 from dbthermal.separation._inputs import BLOCK_ROWS, Inputs
-from dbthermal.separation._subspace.kernels import entered
 from dbthermal.separation._subspace.reflection_ratio import (
     HIGHEST_ORDER,
     null_combination,
@@ -42,7 +41,7 @@ _MARGIN: Final = 0.02
 _DEGREE: Final = 4
 
 
-@entered
+@compiled
 def _other_bands(shares: Floats, bends: Floats, signal: Floats, result: Floats) -> None:
     """Shares (band, pixel) times signals and their bends by Horner's rule (pixel, frame), in place.
 
@@ -57,10 +56,6 @@ def _other_bands(shares: Floats, bends: Floats, signal: Floats, result: Floats) 
                     bend = bend * value + bends[band, degree]
                 total += shares[band, p] * (value + bend)
             result[p, t] = total
-
-
-with suppress(RuntimeError):  # without a folder that may be written each process compiles
-    _other_bands.enable_caching()
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,7 @@ class Equations:
             bends=self.bends,
         )
 
-    def spread(self, values: Floats) -> Floats:
+    def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values (solved pixel, ...) over all pixels, 0 elsewhere."""
         result = np.zeros((self.first.size, *values.shape[1:]), dtype=values.dtype)
         result[self.solved] = values

@@ -40,8 +40,10 @@ from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
-_ROUNDS: Final = 20
+_ROUNDS: Final = 10
 _SETTLED: Final = 1e-3
+# Rounds that take the whole step.
+_WHOLE: Final = 3
 # Change of the object [K] below which its emissivity is not told.
 _LEAST_CHANGE: Final = 0.1
 # Frames that are solved together.
@@ -171,15 +173,15 @@ def solve(
         both = partial(_both, curve, shares[:, places])
         few = system.bridge(film[some], solved)[:, places], moved(some), change(some)
 
-        def looked_at(equations: system.Equations) -> list[Floats]:
-            """Object's signals (pixel, some frame) [K] at both places."""
-            return [equations.spread(one) for one in both(*few, equations)[:2]]
+        def looked_at(equations: system.Equations) -> tuple[Floats, Floats]:
+            """Object's signals (solved, some frame) [K] at both places."""
+            return both(*few, equations)[:2]
 
         here, beside = looked_at(equations)
         # In units of the deviation or, of a method without one, of the noise.
         std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
-        share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
-        if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
+        share = np.abs(shares[1:, places].sum(axis=0) * (beside - here).T) / std[:, places]
+        if not np.any(solved) or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
         emissivity, (of_slope, of_ratio) = system.inside(raw), np.zeros((2, solved.size))
         if material is not None:
@@ -187,7 +189,13 @@ def solve(
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, looked_at, (first, steps)
+                inputs,
+                result,
+                raw,
+                solved,
+                equations,
+                looked_at,
+                (first[:, places], steps[:, places]),
             )
             here, beside = looked_at(equations)
         system.bridge(film, solved)
@@ -204,7 +212,7 @@ def solve(
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
-        off *= np.mean((beside - here) ** 2, 1)
+        off *= equations.spread(np.mean((beside - here) ** 2, axis=1))
         size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
         factor = _factor(inputs, equations, size, variance, blur)
     return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
@@ -268,26 +276,29 @@ def _emissivities(
     raw: Floats,
     solved: Mask,
     equations: system.Equations,
-    looked_at: Callable[[system.Equations], list[Floats]],
+    looked_at: Callable[[system.Equations], tuple[Floats, Floats]],
     band: tuple[Array, Array],
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
-    for _ in range(_ROUNDS):
-        here, beside = looked_at(equations)
-        slope, variance, known = _emission((here, beside), band, emissivity[0], noise)
+    for turn in range(_ROUNDS):
+        found = _emission(looked_at(equations), band, emissivity[0, solved], noise)
+        slope, variance, known = (equations.spread(one) for one in found)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
         slope, known = np.where(known, slope, emissivity[0]), known & (variance > 0)
         slope, variance = neighbours.shared(slope, variance, known, result["status"].shape)
+        if turn >= _WHOLE:  # where a step turns round, half of it
+            slope = 0.5 * (slope + emissivity[0])
         before, emissivity = emissivity, system.inside(1.0 - system.ratio_of(raw) * (1.0 - slope))
         equations = replace(
             equations,
             first=np.where(solved, emissivity[0], 1.0),
             shares=system.coefficients(inputs, emissivity, solved),
         )
-        if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
+        change = np.abs(emissivity - before)[0, solved]
+        if np.nanquantile(change, _MOST) < _SETTLED:
             break
     return equations, emissivity, variance
 
@@ -298,8 +309,8 @@ def _emission(
     """
     Emissivity of the first band as its slope over the object, its variance, and where it is told.
 
-    Of the object's signals at both places (pixel, frame), and those of the band and the steps of
-    the camera in it (frame, pixel).
+    Of the object's signals at both places (solved, frame), and those of the band and the steps of
+    the camera in it (frame, solved).
     """
     own = places[0].T.astype(np.float64)
     line = residuals.regress(own, band[0], noise)

@@ -10,16 +10,15 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 """
 
 import itertools
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from dbthermal._arrays import Array
+from dbthermal._compiled import compiled
 from dbthermal.separation._dbvt import DbvtSettings, objective
 from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 
@@ -245,7 +244,7 @@ def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
     return torch.as_tensor(solved[2:-2], device=right.device)
 
 
-@njit(nogil=True, error_model="numpy")
+@compiled
 def _recursion(diagonal: Array, stiffness: Array, solved: Array) -> None:
     """Factors from the first frame on, then the solution from the last one back, in place.
 
@@ -273,7 +272,3 @@ def _recursion(diagonal: Array, stiffness: Array, solved: Array) -> None:
                 after = below[t + 1, c] * solved[t + 1, side, c]
                 after += further[t + 2, c] * solved[t + 2, side, c]
                 solved[t, side, c] = solved[t, side, c] / pivot[t, c] - after
-
-
-with suppress(RuntimeError):  # without a folder that may be written each process compiles
-    _recursion.enable_caching()
