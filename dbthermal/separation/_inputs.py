@@ -74,7 +74,7 @@ class Inputs:
     emissivity_covariance: Array | None  # (band, band, y, x) [1]
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
-    difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `joint.Joint`
+    difference: Callable[[slice, slice | Labels], npt.NDArray[Any]] | None = None  # `joint.Joint`
 
     @property
     def blocks(self) -> list[slice]:

@@ -277,8 +277,13 @@ def numbers(window: Window, width: int) -> Whole:
     return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
-def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterator[Cut]:
-    """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
+def cut(
+    inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
+) -> Iterator[Cut]:
+    """Read a block of rows and cut it into tiles; with the material of each pixel of the image.
+
+    Of all pixels, or of those of the image that are `wanted` (pixel).
+    """
     displacement, method = inputs.displacement, inputs.method
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
@@ -310,15 +315,19 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
         tile = _tile(inputs, counts, time, window, segment)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
+        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
         if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(window[0])
+            tile.signals[1:, :, some] -= inputs.difference(window[0], some)
+        if wanted is not None:
+            of_these = ((frames, pixels & wanted[places]) for frames, pixels in sets)
+            sets = [(frames, pixels) for frames, pixels in of_these if pixels.any()]
         parts = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
             part = tile if whole else tile.select_pixels(pixels)
             parts.append((frames, pixels, part if np.all(frames) else part.select_frames(frames)))
         if displacement is not None:
-            parts = [alike for one in parts for alike in of_one_noise(*one, gain, most)]
+            parts = [part for one in parts for part in of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
 
 

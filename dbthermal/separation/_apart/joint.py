@@ -70,14 +70,16 @@ class Joint:
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
     def difference(
-        self, rows: slice, frames: slice | Whole = slice(None), some: slice | Whole = slice(None)
+        self, rows: slice, some: slice | Whole, frames: slice | Whole = slice(None)
     ) -> Floats:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
         here, beside = (
-            self.result[f"{one}_temperature"].values[frames, rows].astype(np.float64)
+            self.result[f"{one}_temperature"].values[frames, rows]
             for one in ("object", "background")
         )
-        here, beside = (one.reshape(len(one), -1)[:, some] for one in (here, beside))
+        here, beside = (
+            one.reshape(len(one), -1)[:, some].astype(np.float64) for one in (here, beside)
+        )
         pixels = slice(rows.start * self.result.sizes["x"], rows.stop * self.result.sizes["x"])
         parts = []
         for one, place in zip(self.emissivity[1:], self.inputs.bands[1:], strict=True):
@@ -166,7 +168,7 @@ def solve(
 
         def moved(frames: slice | Whole) -> Floats:
             """Part (solved, frame) [K] of q that the inputs of the result were without."""
-            apart = 0.0 if before is None else before.difference(every, frames, places).T
+            apart = 0.0 if before is None else before.difference(every, places, frames).T
             return np.asarray(np.sum(weights.T[places, np.newaxis] * apart, axis=2))
 
         shares, places = system.coefficients(inputs, raw, solved), equations.solved

@@ -71,19 +71,16 @@ def _survey(
 ) -> list[tuple[Labels, Survey]]:
     """Survey the selected pixels of a block of rows; with their numbers in the image."""
     surveys = []
-    for cut in tiles.cut(inputs, rows, material):
+    for cut in tiles.cut(inputs, rows, material, selected):
         numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
         for _, pixels, tile in cut.parts:
-            wanted = selected[numbers[pixels]]
-            if np.any(wanted):
-                part = tile if np.all(wanted) else tile.select_pixels(wanted)
-                survey: Survey = inputs.apply(inputs.method.survey, part)
-                # Whitened by one noise for all, not by that of the tile.
-                scale = np.array(part.noise) / inputs.noise[inputs.bands]
-                square = np.multiply.outer(scale, scale)[..., np.newaxis]
-                scatters = survey.scatter * square, survey.rapid_scatter * square
-                survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
-                surveys.append((numbers[pixels][wanted], survey))
+            survey: Survey = inputs.apply(inputs.method.survey, tile)
+            # Whitened by one noise for all, not by that of the tile.
+            scale = np.array(tile.noise) / inputs.noise[inputs.bands]
+            square = np.multiply.outer(scale, scale)[..., np.newaxis]
+            scatters = survey.scatter * square, survey.rapid_scatter * square
+            survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
+            surveys.append((numbers[pixels], survey))
         if material is None:
             bar.update(cut.status.size)
     return surveys
