@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal import mixing
+from dbthermal._compiled import compiled
 from dbthermal.separation._tiles import Array, Mask, Tile
 
 _STEPS: Final = 5
@@ -66,7 +67,9 @@ def solve(
         own = own * (np.arange(len(e)) == 0)[:, np.newaxis, np.newaxis]
         variance = variance + (1.0 - own) * (1.0 - e) ** 2 * fluctuation
     for _ in range(_STEPS):
-        (emitted, slope), (behind, rate) = _bands(tile, s), _bands(tile, level + own * (r - level))
+        # Of cameras apart, the other bands see the level alone.
+        seen = [r, *[np.broadcast_to(level, (1, level.size)) if apart else r] * (len(e) - 1)]
+        (emitted, slope), (behind, rate) = _bands(tile, [s] * len(e)), _bands(tile, seen)
         by_s, by_r = e * slope, (1.0 - e) * rate * own
         ss, sr = (by_s**2 / variance).sum(axis=0), (by_s * by_r / variance).sum(axis=0)
         rr = (by_r**2 / variance).sum(axis=0) + weak
@@ -99,11 +102,15 @@ def other_band(tile: Tile, m: int, signal: Array) -> Array:
     return signal if m == 0 else np.asarray(tile.blackbody(m, tile.temperature(0, signal)))
 
 
-def _bands(tile: Tile, signal: Array) -> tuple[Array, Array]:
-    """Signals of all bands (band, ...) and their slopes, of first-band signals ([band,] ...)."""
-    each = np.broadcast_to(signal, (len(tile.noise), *tile.signals[0].shape))
+def _bands(tile: Tile, signals: list[Array]) -> tuple[Array, Array]:
+    """Signals of all bands (band, time, pixel) and their slopes, of first-band signals of each."""
     at, above = (
-        np.stack([other_band(tile, m, part + step) for m, part in enumerate(each)])
+        np.stack(
+            [
+                np.broadcast_to(other_band(tile, m, part + step), tile.signals[0].shape)
+                for m, part in enumerate(signals)
+            ]
+        )
         for step in (0.0, _STEP)
     )
     return at, (above - at) / _STEP
@@ -120,69 +127,105 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
 
     Returns the curves and the variances that are left.
     """
-    count = np.maximum(valid.sum(axis=0), 1)
-    level = np.where(valid, values, 0.0).sum(axis=0) / count
-    noise = np.where(valid, variance, 0.0).sum(axis=0) / count
-    centred = np.where(valid, values - level, 0.0)
     position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
-    powers = position[:, np.newaxis] ** np.arange(5)
-    # Sums of the samples before each place (time + 1, pixel).
-    sums, values_sums = (
-        [np.pad(np.cumsum(part * powers[:, [i]], axis=0), ((1, 0), (0, 0))) for i in range(orders)]
-        for part, orders in ((valid, 5), (centred, 3))
-    )
-    result, left = centred, variance
-    lower, upper = np.full_like(result, -np.inf), np.full_like(result, np.inf)
-    going = valid
-    narrower = (result, left)
-    half = 1
-    while half < len(values) and np.any(going):
-        estimate, share = _fit(sums, values_sums, position, half)
-        deviation = np.sqrt(share * noise)
-        lower = np.fmax(lower, estimate - AGREE * deviation)
-        upper = np.fmin(upper, estimate + AGREE * deviation)
-        going = going & (lower <= upper)
-        # One window narrower than the widest that agrees: its bias is small beside its noise.
-        better = going & (narrower[1] <= left)
-        result, left = (
-            np.where(better, *one) for one in zip(narrower, (result, left), strict=True)
-        )
-        narrower = (estimate, share * noise)
-        half = max(half + 1, int(half * _GROWTH))
-    left = np.where(left < variance, np.minimum(_BENT * left, variance), variance)
-    return np.where(valid, result + level, np.nan), left
+    rows = [np.ascontiguousarray(one.T) for one in (values, variance, valid)]
+    result, left = np.empty((2, *rows[0].shape))
+    _smooth(*rows, position, result, left)
+    return result.T, left.T
 
 
-def _fit(sums: list[Array], values: list[Array], position: Array, half: int) -> tuple[Array, Array]:
-    """Value at the centre of each window, and its variance over the noise's; NaN if not fixed."""
-    frames = len(position)
-    place = np.arange(frames)
-    low, high = np.maximum(place - half, 0), np.minimum(place + half + 1, frames)
-    width = position[np.minimum(high, frames - 1)] - position[low]
-    scale = (1.0 / np.maximum(width, 1e-300))[:, np.newaxis]
-    at = position[:, np.newaxis]
-    raw = [part[high] - part[low] for part in sums]
-    data = [part[high] - part[low] for part in values]
+@compiled
+def _smooth(
+    values: Array, variance: Array, valid: Mask, position: Array, result: Array, left: Array
+) -> None:
+    """As `smooth`, (pixel, time) in place."""
+    frames = position.size
+    sums, going = np.zeros((frames + 1, 8)), np.empty(frames, np.bool_)
+    lower, upper, narrower, narrower_left = np.empty((4, frames))
+    for p in range(len(values)):
+        level, noise = _sum_up(values[p], variance[p], valid[p], position, sums)
+        for t in range(frames):
+            result[p, t] = narrower[t] = values[p, t] - level if valid[p, t] else np.nan
+            left[p, t] = narrower_left[t] = variance[p, t]
+            lower[t], upper[t], going[t] = -np.inf, np.inf, valid[p, t]
+        half = 1
+        while half < frames and np.any(going):
+            for t in range(frames):
+                if not going[t]:
+                    continue
+                estimate, share = _centre(sums, position, t, half)
+                margin = AGREE * np.sqrt(share * noise)
+                lower[t] = np.fmax(lower[t], estimate - margin)
+                upper[t] = np.fmin(upper[t], estimate + margin)
+                going[t] = lower[t] <= upper[t]
+                # One window narrower than the widest that agrees: its bias is small beside its
+                # noise.
+                if going[t] and narrower_left[t] <= left[p, t]:
+                    result[p, t], left[p, t] = narrower[t], narrower_left[t]
+                narrower[t], narrower_left[t] = estimate, share * noise
+            half = max(half + 1, int(half * _GROWTH))
+        for t in range(frames):
+            result[p, t] += level
+            better = left[p, t] < variance[p, t]
+            left[p, t] = min(_BENT * left[p, t], variance[p, t]) if better else variance[p, t]
+
+
+@compiled
+def _sum_up(
+    values: Array, variance: Array, valid: Mask, position: Array, sums: Array
+) -> tuple[float, float]:
+    """Means of the valid values and variances of a pixel (time); what is summed up, in place.
+
+    Of the samples before each place (time + 1, 8): their number and sums of powers of their
+    positions, and the same of their values about the mean.
+    """
+    count, level, noise = 0.0, 0.0, 0.0
+    for t in range(position.size):
+        if valid[t]:
+            count, level, noise = count + 1.0, level + values[t], noise + variance[t]
+    level, noise = level / max(count, 1.0), noise / max(count, 1.0)
+    for t in range(position.size):
+        weight = 1.0 if valid[t] else 0.0
+        value = values[t] - level if valid[t] else 0.0
+        for power in range(5):
+            sums[t + 1, power] = sums[t, power] + weight
+            weight *= position[t]
+        for power in range(5, 8):
+            sums[t + 1, power] = sums[t, power] + value
+            value *= position[t]
+    return level, noise
+
+
+@compiled
+def _centre(sums: Array, position: Array, place: int, half: int) -> tuple[float, float]:
+    """Value of a parabola, or line, at the centre of a window, and its variance over the noise's.
+
+    NaN and infinite where the samples do not fix it.
+    """
+    low, high = max(place - half, 0), min(place + half + 1, position.size)
+    width = position[min(high, position.size - 1)] - position[low]
+    scale, at = 1.0 / max(width, 1e-300), position[place]
+    one, two = sums[low], sums[high]
+    a0, a1, a2 = two[0] - one[0], two[1] - one[1], two[2] - one[2]
+    b0, b1 = two[5] - one[5], two[6] - one[6]
     # Moments about the window's centre, by the binomial theorem, in units of its width.
-    s0 = raw[0]
-    s1 = (raw[1] - at * raw[0]) * scale
-    s2 = (raw[2] - 2 * at * raw[1] + at**2 * raw[0]) * scale**2
-    z0 = data[0]
-    z1 = (data[1] - at * data[0]) * scale
-    with np.errstate(all="ignore"):
-        if half < _PARABOLA:
-            determinant = s0 * s2 - s1**2
-            value, share = (s2 * z0 - s1 * z1) / determinant, s2 / determinant
-            fixed = determinant > 1e-6 * s0**2
-        else:
-            s3 = (raw[3] - 3 * at * raw[2] + 3 * at**2 * raw[1] - at**3 * raw[0]) * scale**3
-            s4 = (
-                raw[4] - 4 * at * raw[3] + 6 * at**2 * raw[2] - 4 * at**3 * raw[1] + at**4 * raw[0]
-            ) * scale**4
-            z2 = (data[2] - 2 * at * data[1] + at**2 * data[0]) * scale**2
-            # First row of the inverse of ((s0 s1 s2) (s1 s2 s3) (s2 s3 s4)).
-            c0, c1, c2 = s2 * s4 - s3**2, s2 * s3 - s1 * s4, s1 * s3 - s2**2
-            determinant = s0 * c0 + s1 * c1 + s2 * c2
-            value, share = (c0 * z0 + c1 * z1 + c2 * z2) / determinant, c0 / determinant
-            fixed = determinant > 1e-8 * s0**3
-    return np.where(fixed, value, np.nan), np.where(fixed, share, np.inf)
+    s1 = (a1 - at * a0) * scale
+    s2 = (a2 - 2 * at * a1 + at**2 * a0) * scale**2
+    z1 = (b1 - at * b0) * scale
+    if half < _PARABOLA:
+        determinant = a0 * s2 - s1**2
+        fixed = determinant > 1e-6 * a0**2
+        value, share = s2 * b0 - s1 * z1, s2
+    else:
+        a3, a4, b2 = two[3] - one[3], two[4] - one[4], two[7] - one[7]
+        s3 = (a3 - 3 * at * a2 + 3 * at**2 * a1 - at**3 * a0) * scale**3
+        s4 = (a4 - 4 * at * a3 + 6 * at**2 * a2 - 4 * at**3 * a1 + at**4 * a0) * scale**4
+        z2 = (b2 - 2 * at * b1 + at**2 * b0) * scale**2
+        # First row of the inverse of ((s0 s1 s2) (s1 s2 s3) (s2 s3 s4)).
+        c0, c1, c2 = s2 * s4 - s3**2, s2 * s3 - s1 * s4, s1 * s3 - s2**2
+        determinant = a0 * c0 + s1 * c1 + s2 * c2
+        fixed = determinant > 1e-8 * a0**3
+        value, share = c0 * b0 + c1 * z1 + c2 * z2, c0
+    if not fixed:
+        return np.nan, np.inf
+    return value / determinant, share / determinant
