@@ -7,20 +7,17 @@ much later the others show what the first shows.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
+from dbthermal.alignment._products import BORDER, ROWS, Match, Movie, products
 from dbthermal.alignment._resampling import TAPS, interpolation
 from dbthermal.noise import MAD
-
-Movie = npt.NDArray[np.float32]
 
 WINDOW: Final = 2.5
 """Deviation of the window in which neighbours share a ratio and a whole-pixel match [pixel]."""
@@ -30,14 +27,10 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
-_BORDER: Final = 4  # pixels by which they are mirrored at the border for it
-_AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
-_ROWS: Final = 32  # that are resampled at a time
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
-_TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
 _COLOUR: Final = 0.05  # least variance of coloured noise over that of white noise
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 # Rough matches count as if each were known so well [pixel].
@@ -129,71 +122,15 @@ def inside(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-@dataclass(frozen=True)
-class _Match:
-    """Ratio (y, x) of another movie to the moved first one, and its residual's variance."""
-
-    ratio: Array
-    variance: Array  # of a sample of the residual [K^2]
-
-
 def _moderate(movie: Movie) -> Movie:
     """Weight of samples (..., time), smaller where a movie changes as it seldom does."""
     usual = np.quantile(np.abs(movie), _USUAL, axis=-1, keepdims=True)
     return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
 
 
-def _resamplers(places: Array) -> list[sparse.csr_array]:
-    """Matrices from a padded movie to its values, slopes down and right, at places (2, y, x)."""
-    border = (_BORDER, _BORDER)
-    places = np.pad(places + _BORDER, ((0, 0), border, border), mode="edge")
-    halves = 0.5 * np.eye(2)[:, :, np.newaxis, np.newaxis]
-    slopes = [interpolation(places + h, TAPS) - interpolation(places - h, TAPS) for h in halves]
-    return [interpolation(places, TAPS), *slopes]
-
-
-def _moments(
-    movies: Movies, padded: Movie, places: Array, matches: Sequence[_Match | None]
-) -> Array:
-    """
-    Products (other, 14, y, x), summed over time, of moved, its slopes, and another movie.
-
-    Weighted by how well samples match; then the sum of weights, their residual's variance, and
-    the slopes' products with the residual of another time.
-    """
-    _, width, frames = padded.shape
-    resamplers, flat = _resamplers(places), padded.reshape(-1, frames)
-    result = np.zeros((len(movies.others), 14, *movies.shape))
-    for start in range(0, movies.shape[0], _ROWS):
-        rows = slice(start, min(start + _ROWS, movies.shape[0]))
-        pixels = slice((rows.start + _BORDER) * width, (rows.stop + _BORDER) * width)
-        moved = [
-            (matrix[pixels] @ flat).reshape(-1, width, frames)[:, _BORDER:-_BORDER]
-            for matrix in resamplers
-        ]
-        for other, match, out in zip(movies.others, matches, result, strict=True):
-            four = [*moved, other[rows]]
-            weight = np.ones_like(four[0])
-            if match is not None:
-                ratio = match.ratio[rows, :, np.newaxis].astype(np.float32)
-                residual = four[3] - ratio * four[0]
-                square = uniform_filter(residual**2, _AROUND)
-                most = (_TAIL * match.variance[rows, :, np.newaxis]).astype(np.float32)
-                weight = 1.0 / (1.0 + (square / most) ** 2)
-                out[11, rows] = np.median(square, axis=2)
-                other_time = weight * np.roll(weight * residual, frames // 2, axis=2)
-                for place in (1, 2):
-                    out[11 + place, rows] = np.einsum("yxt,yxt->yx", four[place], other_time)
-            out[10, rows] = weight.sum(axis=2)
-            weighted = [weight * one for one in four]
-            for place, (i, j) in enumerate(combinations_with_replacement(range(4), 2)):
-                out[place, rows] = np.einsum("yxt,yxt->yx", weighted[i], four[j])
-    return result
-
-
 def _information(
-    movies: Movies, padded: Movie, shift: Array, matches: Sequence[_Match | None]
-) -> tuple[Information, list[_Match]]:
+    movies: Movies, padded: Movie, shift: Array, matches: Sequence[Match | None]
+) -> tuple[Information, list[Match]]:
     r"""
     Information on a step of the field at each pixel, by Gauss-Newton, and how well it matches.
 
@@ -209,7 +146,7 @@ def _information(
     noise = movies.noise[0] * _VALUE_NOISE
     tensor, gradient = np.zeros((3, *used.shape)), np.zeros((2, *used.shape))
     chance, found, scatter, white = np.zeros(used.shape), [], 0.0, 0.0
-    moments = _moments(movies, padded, places, matches) * used
+    moments = products(padded, movies.others, places, matches) * used
     for parts, level, match in zip(moments, movies.noise[1:], matches, strict=True):
         mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares, *null = parts
         samples *= movies.freedom / movies.first.shape[2]
@@ -223,7 +160,7 @@ def _information(
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         misfit = np.maximum(residual / (number * floor), 1.0)
         spread = misfit * floor if match is None else gaussian_filter(squares, WINDOW)
-        found.append(_Match(ratio, np.maximum(spread, floor)))
+        found.append(Match(ratio, np.maximum(spread, floor)))
         weight = used / (misfit * variance)
         less = samples * (movies.noise[0] * SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
@@ -282,9 +219,9 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    border = (_BORDER, _BORDER)
+    border = (BORDER, BORDER)
     padded = np.pad(movies.first, (border, border, (0, 0)), mode="reflect")
-    matches: Sequence[_Match | None] = [None] * len(movies.others)
+    matches: Sequence[Match | None] = [None] * len(movies.others)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data, matches = _information(movies, padded, shift, matches)
@@ -314,8 +251,8 @@ def delay(movies: Movies, shift: Array, times: Array) -> float:
     for part in weights:  # none near the border
         used &= (np.diff(part.indptr) > 0).reshape(used.shape)
     sums = np.zeros((len(movies.others), 14, *movies.shape))
-    for start in range(0, movies.shape[0], _ROWS):
-        rows = slice(start, min(start + _ROWS, movies.shape[0]))
+    for start in range(0, movies.shape[0], ROWS):
+        rows = slice(start, min(start + ROWS, movies.shape[0]))
         pixels = slice(rows.start * width, rows.stop * width)
         moved, below, above, left, right = (
             (part[pixels] @ movies.first.reshape(-1, count)).reshape(-1, width, count)

@@ -21,6 +21,7 @@ from dbthermal.alignment import _matching as matching
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._offset import sample
+from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
@@ -174,7 +175,7 @@ class _Capture:
         penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
-    def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[matching.Movie]:
+    def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[Movie]:
         """Rapid changes of the bands (y, x, time) [K] in some of the frames."""
         smoothing = self.smoothing(period)
         result = np.empty((self.bands.size, *self.valid.shape, used.size), np.float32)

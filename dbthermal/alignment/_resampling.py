@@ -191,24 +191,29 @@ def interpolation(places: Array, taps: int) -> csr_array:
     what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
     90 %. A place without so many has no weights, but for `_BEYOND`.
     """
-    shape = places.shape[1:]
-    nodes, inside, factors = np.arange(taps), np.ones(places[0].size, dtype=bool), []
-    spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
+    shape, inside, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        first_node, last_node = taps // 2 - 1 - _BEYOND, size - taps // 2 + _BEYOND
-        inside &= (place >= first_node) & (place <= last_node)
-        here = np.where(inside, place, 0.0)
-        first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
-        away = (here - first)[:, np.newaxis] - nodes
-        others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
-        weight = np.prod(others / spacing, axis=2)
-        factors.append((weight, first[:, np.newaxis].astype(np.int32) + nodes))
+        here, first, weight = lagrange(place, size, taps)
+        inside &= here
+        factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
     (down, row), (right, column) = factors
     weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
     pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
     kept = inside[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
     ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
     return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
+
+
+def lagrange(place: Array, size: int, taps: int) -> tuple[Mask, npt.NDArray[np.int32], Array]:
+    """Places on a line of a size [pixel] with so many neighbours, the first, and all weights."""
+    nodes = np.arange(taps)
+    spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
+    inside = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
+    here = np.where(inside, place, 0.0)
+    first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
+    away = (here - first)[:, np.newaxis] - nodes
+    others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
+    return inside, first.astype(np.int32), np.prod(others / spacing, axis=2)
 
 
 def _weights(places: Array, bad: Mask) -> csr_array:
