@@ -74,10 +74,10 @@ def _weights(place: Array, size: int) -> tuple[Whole, Movie, Movie]:
     Zero for a place without so many neighbours.
     """
     parts = [lagrange(place + step, size, TAPS) for step in (0.0, _STEP, -_STEP)]
-    start = np.minimum(np.min([first for _, first, _ in parts], axis=0), size - _NEAR)
+    start = np.floor(np.clip(place - _STEP - (TAPS // 2 - 1), 0, size - _NEAR)).astype(np.int32)
     spread = np.zeros((3, place.size, _NEAR), np.float32)
     for near, (inside, first, weight) in zip(spread, parts, strict=True):
-        columns = (first - start)[:, np.newaxis] + np.arange(TAPS)
+        columns = np.where(inside, first - start, 0)[:, np.newaxis] + np.arange(TAPS)
         np.put_along_axis(near, columns, np.where(inside[:, np.newaxis], weight, 0.0), axis=1)
     return start, spread[0], spread[1] - spread[2]
 
