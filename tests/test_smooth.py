@@ -1,11 +1,13 @@
 """The smooth subspace: orthonormal, nested, and exactly the polynomials."""
 
+import itertools
 import re
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
@@ -167,3 +169,27 @@ def test_recordings_far_apart_have_each_their_curve(pause: float) -> None:
     curve = np.concatenate([np.exp(-since / 5.0), 2.0 - (since / 10.0) ** 3])
     fitted = functions @ (functions.T @ curve)
     np.testing.assert_allclose(fitted, curve, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("events", [(), (30,)])
+def test_pieces_are_the_polynomials_of_their_frames(events: tuple[int, ...]) -> None:
+    """Each piece has the basis of its own times, up to signs: five, or as many as it has frames."""
+    time = np.cumsum(np.random.default_rng(8).uniform(0.5, 1.5, 60))
+    edges = [0, 20, 23, 41, 60]
+    first, segment = np.isin(np.arange(60), edges), segmented(60, *events) if events else None
+    rising = smooth.subspace(time, 6, segment=segment).rising
+    functions = smooth.piecewise(time, first, rising, segment=segment)
+    spans = itertools.pairwise(edges)
+    parts = [smooth.polynomial_basis(time[a:b], min(5, b - a)) for a, b in spans]
+    whole = block_diag(*parts)
+    if not events:
+        np.testing.assert_allclose(np.abs(functions.functions), np.abs(whole), rtol=0, atol=1e-12)
+    left = whole - functions.functions @ (functions.functions.T @ whole)
+    np.testing.assert_allclose(left, 0.0, rtol=0, atol=1e-12)
+
+
+def test_frames_in_few_places_have_orthonormal_pieces() -> None:
+    """Bursts far apart within one piece: its functions stay orthonormal."""
+    time = np.concatenate([np.arange(8) * 1e-4, 1e3 + np.arange(8) * 1e-4])
+    functions = smooth.piecewise(time, np.arange(16) == 0, np.ones((16, 1))).functions
+    np.testing.assert_allclose(functions.T @ functions, np.eye(5), rtol=0, atol=1e-10)

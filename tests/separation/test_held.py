@@ -91,6 +91,28 @@ def test_a_hot_part_that_rests_is_told_by_its_material() -> None:
     assert silent == 0.0
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_bars_of_weak_reflections_are_those_of_their_noise(seed: int) -> None:
+    """Most pixels are gray alone; the few that are not are off by selection, and widen nothing."""
+    rng = np.random.default_rng(seed)
+    pairs = materials((0.95, 0.85), of=np.zeros(SHAPE, dtype=int))
+    scene = simulation.walkers(TIME, SHAPE, pairs, rng, temperatures=(295.0, 297.0, 310.0))
+    capture = simulation.observe(scene, RIG.response(), rng)
+    alone = separation.solve(capture, RIG.response())
+    gray = float(((alone["status"] & np.uint32(Status.GRAY)) != 0).mean())
+    result = separation.separate(capture, RIG.response(), alone=alone)
+    _, held, silent = judged(scene, result, f"weak, {gray:.2f} gray alone")
+    off = result["object_temperature"] - scene["object_temperature"]
+    square = (off / result["object_temperature_std"]).where(result["status"] == 0) ** 2
+    print(f"mean square in deviations {float(square.mean()):.2f}")
+    assert result.attrs["reflection_shift"] == "none"
+    assert "warnings" not in result.attrs
+    assert gray > 0.5
+    assert 0.92 < held < 0.98
+    assert float(square.mean()) > 0.7
+    assert silent < 0.01
+
+
 def slow_and_apart(shift: int, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Scene whose reflections change over seconds, and what cameras see of it, shifted [pixel]."""
     rng = np.random.default_rng(seed)
