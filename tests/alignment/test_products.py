@@ -14,9 +14,9 @@ SHAPE, FRAMES = (9, 12), 40
 def test_products_are_those_of_interpolated_movies(matched: bool) -> None:
     """All 14 sums, also of places near the border, beyond it, and on whole pixels."""
     rng = np.random.default_rng(4)
-    padded = rng.standard_normal((SHAPE[0] + 2 * BORDER, SHAPE[1] + 2 * BORDER, FRAMES))
-    padded, other = padded.astype(np.float32), rng.standard_normal((*SHAPE, FRAMES))
-    other = other.astype(np.float32)
+    larger = (SHAPE[0] + 2 * BORDER, SHAPE[1] + 2 * BORDER, FRAMES)
+    padded = rng.standard_normal(larger, dtype=np.float32)
+    other = rng.standard_normal((*SHAPE, FRAMES), dtype=np.float32)
     places = np.indices(SHAPE) + rng.uniform(-4.0, 4.0, (2, *SHAPE))
     places[:, 0, 0], places[:, 1, 1], places[:, 2, 2] = (3.0, 5.0), (-30.0, 2.0), (4.0, 90.0)
     match = Match(rng.uniform(0.5, 1.0, SHAPE), rng.uniform(0.5, 2.0, SHAPE)) if matched else None
@@ -28,7 +28,7 @@ def test_products_are_those_of_interpolated_movies(matched: bool) -> None:
         large = np.full((2, *padded.shape[:2]), -99.0)
         large[:, : SHAPE[0], : SHAPE[1]] = places + BORDER + step
         moved = interpolation(large, TAPS) @ padded.reshape(-1, FRAMES)
-        return moved.reshape(padded.shape)[: SHAPE[0], : SHAPE[1]]
+        return np.asarray(moved.reshape(padded.shape)[: SHAPE[0], : SHAPE[1]])
 
     four = [at(0, 0), at(0.5, 0) - at(-0.5, 0), at(0, 0.5) - at(0, -0.5), other]
     weight, expected = np.ones_like(other), [np.zeros(SHAPE)] * 3

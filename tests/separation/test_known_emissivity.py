@@ -48,5 +48,5 @@ def test_samples_that_are_not_valid_are_nan_and_count_nothing() -> None:
     valid[:, 2] = False
     wrong = np.where(valid, values, np.nan), np.where(valid, values, 1e9)
     curves = [smooth(one, np.ones(values.shape), valid, TIME)[0] for one in wrong]
-    np.testing.assert_array_equal(*curves)
+    np.testing.assert_array_equal(curves[0], curves[1])
     np.testing.assert_array_equal(np.isnan(curves[0]), ~valid)

@@ -40,10 +40,8 @@ from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
-_ROUNDS: Final = 10
+_ROUNDS: Final = 20
 _SETTLED: Final = 1e-3
-# Rounds that take the whole step.
-_WHOLE: Final = 3
 # Change of the object [K] below which its emissivity is not told.
 _LEAST_CHANGE: Final = 0.1
 # Frames that are solved together.
@@ -284,15 +282,17 @@ def _emissivities(
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
-    for turn in range(_ROUNDS):
+    step = np.zeros(solved.size)
+    for _ in range(_ROUNDS):
         found = _emission(looked_at(equations), band, emissivity[0, solved], noise)
         slope, variance, known = (equations.spread(one) for one in found)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
         slope, known = np.where(known, slope, emissivity[0]), known & (variance > 0)
         slope, variance = neighbours.shared(slope, variance, known, result["status"].shape)
-        if turn >= _WHOLE:  # where a step turns round, half of it
-            slope = 0.5 * (slope + emissivity[0])
+        last, step = step, slope - emissivity[0]
+        step[step * last < 0] *= 0.5  # it swings to and fro
+        slope = emissivity[0] + step
         before, emissivity = emissivity, system.inside(1.0 - system.ratio_of(raw) * (1.0 - slope))
         equations = replace(
             equations,
