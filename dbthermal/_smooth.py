@@ -152,7 +152,7 @@ def _polynomials(
 ) -> None:
     """As `_arnoldi`, so many in each piece between edges, one column (column, time) after another.
 
-    All in place, the columns of zeros; with their spans, the leverage (time, 1), and what it is
+    In place, where the columns are zero: these, their spans, the leverage (time, 1), and what it is
     over that of pieces whose ends are not chosen from the data.
     """
     column = 0
