@@ -188,14 +188,9 @@ def solve(
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
+            band = first[:, places], steps[:, places]
             equations, emissivity, of_slope = _emissivities(
-                inputs,
-                result,
-                raw,
-                solved,
-                equations,
-                looked_at,
-                (first[:, places], steps[:, places]),
+                inputs, result, raw, solved, equations, looked_at, band
             )
             here, beside = looked_at(equations)
         system.bridge(film, solved)
