@@ -109,18 +109,36 @@ def piecewise(
     if segment is not None:
         rises = (np.diff(segment, prepend=segment[0]) > 0) & ~first
         events = np.add.reduceat(rises.astype(np.intp), edges[:-1])
-    counts = np.minimum(number, np.diff(edges) - events)
+    counts, steps = np.minimum(number, np.diff(edges) - events), camera_steps(segment)
     # A column after another, of which a piece fills a part.
     size = int(counts.sum())
-    together, spans = np.zeros((size, time.size)), np.empty((size, 2), dtype=np.intp)
+    together = np.zeros((size + len(steps), time.size))
+    spans = np.empty((len(together), 2), dtype=np.intp)
     chosen, leverage = np.empty((2, time.size, 1))
     _polynomials(time, edges, counts, together, spans, chosen, leverage)
-    plain, steps = together.T, camera_steps(segment)
+    functions = object_part = together.T
     if steps:
-        functions, object_part = _without_steps(plain, steps, np.empty((time.size, 0)))
-        leverage = chosen * (object_part**2).sum(axis=1, keepdims=True)
-        return Subspace(functions, object_part, functions.shape[1] - 1, rising, of_pieces=leverage)
-    return Subspace(plain, plain, size - 1, rising, spans, leverage)
+        # The pieces' polynomials P are orthonormal: [P, C] = Q R with Q = [P, S], of the camera's
+        # steps C. What P leaves of these, C - P P^T C = S R, lies in the pieces with an event. The
+        # object's part of S is that less the camera's, S - C R^-1.
+        uneven = np.flatnonzero(events)
+        inside = slice(edges[uneven[0]], edges[uneven[-1] + 1])
+        places = np.append(0, np.cumsum(counts))
+        plain = functions[inside, places[uneven[0]] : places[uneven[-1] + 1]]
+        camera = np.stack(steps)
+        rest = camera[:, inside].T - plain @ (plain.T @ camera[:, inside].T)
+        rest -= plain @ (plain.T @ rest)  # once more, against rounding
+        own, triangle = np.linalg.qr(rest)
+        together[size:, inside] = own.T
+        with_object = together.copy()
+        with_object[size:] -= np.linalg.solve(triangle.T, camera)
+        leverage += chosen * (with_object[size:].T ** 2).sum(axis=1, keepdims=True)
+        # Four columns are taken together, from the first one's begin to the last one's end.
+        last = spans[max(size - 3, 0) :]
+        last[len(last) - len(steps) :] = inside.start
+        last[:, 0], last[:, 1] = np.minimum(last[:, 0], inside.start), time.size
+        object_part = with_object.T
+    return Subspace(functions, object_part, len(together) - 1, rising, spans, leverage)
 
 
 @compiled

@@ -19,6 +19,7 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
@@ -274,6 +275,6 @@ def _unflagged(result: xr.Dataset) -> float:
 def _pixels_apart(result: xr.Dataset) -> tuple[int, int]:
     """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1."""
     status = result["status"].values
-    moving = (status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0
+    moving = ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0) & ~quality.unusable(status)
     apart = (status & np.uint32(Status.BANDS_APART)) != 0
     return int((apart & moving).sum()), max(int(moving.sum()), 1)
