@@ -27,6 +27,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 _LEAST: Final = 2**20  # bytes of an array that is worth a file
+_PART: Final = 2**25  # bytes of a film that are held at once
 _FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
 _MAPS: WeakSet[mmap.mmap] = WeakSet()
 
@@ -119,10 +120,17 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
 def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Copy an array."""
     result = empty(values.shape, values.dtype)
-    for part, own in zip(result, values, strict=True):
-        part[...] = own
-        release()
+    for part in parts(values):
+        result[part] = values[part]
     return result
+
+
+def parts(film: npt.NDArray[Any]) -> Iterator[slice]:
+    """Yield places along the first axis of a film, whose pages are given back after each."""
+    step = max(1, _PART * len(film) // max(1, film.nbytes))
+    for start in range(0, len(film), step):
+        yield slice(start, start + step)
+        release()
 
 
 def release() -> None:

@@ -8,6 +8,7 @@ emissivity needs a quiet ordinate.
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any, Final, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ import xarray as xr
 
 from dbthermal import mixing
 from dbthermal._arrays import namespace, select
+from dbthermal._samples import Grain
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -243,6 +245,7 @@ class Cut:
     """A window of the image, its data quality, and a tile by set of frames."""
 
     window: Window
+    places: Whole  # numbers of the pixels in the image (pixel)
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
     parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
@@ -286,7 +289,7 @@ def cut(
     """
     displacement, method = inputs.displacement, inputs.method
     source = rows if displacement is None else displacement.source(rows)
-    block = inputs.capture.isel(y=source).load()
+    block = inputs.capture.isel(y=source)
     width = block.sizes["x"]
     most = largest(method, inputs.settings, block)
     size = most if displacement is None else max(width, _TOGETHER // block.sizes["time"])
@@ -294,33 +297,39 @@ def cut(
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
-    grains = None
+
+    @cache
+    def load() -> tuple[xr.Dataset, list[Grain]]:
+        """Read the block, unless all of it is kept, and how its samples are rounded."""
+        loaded = block.load()
+        return loaded, quality.grains(loaded, inputs.noise * slopes)
+
     for window in windows(rows, width, size):
         places = numbers(window, width)
-        grains = grains or quality.grains(block, inputs.noise * slopes)
+        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        places = places[some]
         gain = np.ones((2, places.size))
         if displacement is None:
+            loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
-            view = block.isel(y=local, x=window[1])
+            view = loaded.isel(y=local, x=window[1])
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
+            counts, usable, valid = counts[..., some], usable[:, some], valid[:, some]
+            status = status[some]
         else:
             counts, usable, valid, status, gain = displaced.paired(
-                block, displacement, window[0], source, method.minimum_frames, grains
+                load, displacement, window[0], source, some, method.minimum_frames
             )
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        tile = _tile(inputs, counts, time, window, segment)
+        tile = _tile(inputs, counts, time, window, segment, some)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
-        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
         if inputs.difference is not None:
-            tile.signals[1:, :, some] -= inputs.difference(window[0], some)
-        if wanted is not None:
-            of_these = ((frames, pixels & wanted[places]) for frames, pixels in sets)
-            sets = [(frames, pixels) for frames, pixels in of_these if pixels.any()]
+            tile.signals[1:] -= inputs.difference(window[0], some)
         parts = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
@@ -328,21 +337,27 @@ def cut(
             parts.append((frames, pixels, part if np.all(frames) else part.select_frames(frames)))
         if displacement is not None:
             parts = [part for one in parts for part in of_one_noise(*one, gain, most)]
-        yield Cut(window, status, valid, parts)
+        yield Cut(window, places, status, valid, parts)
 
 
 def _tile(
-    inputs: Inputs, counts: Array, time: Array, window: Window, segment: Whole | None
+    inputs: Inputs,
+    counts: Array,
+    time: Array,
+    window: Window,
+    segment: Whole | None,
+    some: slice | Whole,
 ) -> Tile:
-    """Tile of the counts (band, time, pixel) [count] of a window, the quietest band first."""
+    """Tile of counts (band, time, pixel) [count], the quietest band first, of some of a window."""
     bands = inputs.bands
     curves = tuple(inputs.curves[band] for band in bands)
     emissivity, covariance = (
-        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
+        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)[..., some]
         for known in (inputs.emissivity, inputs.emissivity_covariance)
     )
     if emissivity is not None and covariance is not None:
         emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
+    height = window[0].stop - window[0].start if isinstance(some, slice) else 1
     # The linearised signals (see `response`), less the reference temperature.
     signals = counts if bands == sorted(bands) else counts[bands]
     for signal, curve in zip(signals, curves, strict=True):
@@ -353,7 +368,7 @@ def _tile(
         time=time,
         curves=curves,
         noise=tuple(float(inputs.noise[band]) for band in bands),
-        shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
+        shape=(height, counts.shape[2] // height),
         rng=generator(inputs.seed, window),
         pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
         segment=segment,

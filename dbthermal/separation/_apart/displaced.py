@@ -9,7 +9,8 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, NamedTuple
+from itertools import chain
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, select
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -46,14 +47,9 @@ _KEPT: Final = 2**29
 TAIL: Final = 3.0
 
 
-class Paired(NamedTuple):
-    """Some rows as `read` and `quality.bridge` give them."""
-
-    counts: Array  # (band, time, pixel) [count]
-    usable: Mask  # valid samples, and those that are bridged (time, pixel)
-    valid: Mask
-    status: Bits  # (pixel)
-    gain: Array  # (2, pixel) [1]
+Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
+"""Counts (band, time, pixel) [count], samples that are valid or bridged (time, pixel), those that
+are valid, status (pixel), and the noise (2, pixel) [1] over that of a sample, see `read`."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ class Displacement:
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
     found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
-    read: dict[Hashable, "Paired"] = field(default_factory=dict)  # see `paired`
+    read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
 
     def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
         """Return what was computed for a key before: a capture is read many times."""
@@ -201,25 +197,36 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
 
 
 def paired(
-    block: xr.Dataset,
+    load: Callable[[], tuple[xr.Dataset, list[samples.Grain]]],
     displacement: Displacement,
     rows: slice,
     source: slice,
+    some: slice | npt.NDArray[np.intp],
     fewest: int,
-    grains: list[samples.Grain],
 ) -> Paired:
-    """Some rows as `read`, with their short gaps bridged; kept for the next time."""
-    key, films = (rows.start, rows.stop, displacement.blur), displacement.read
-    if key not in films:
-        time = block["time"].values.astype(np.float64)
-        counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
-        counts, usable = quality.bridge(counts, valid, time)
-        found = Paired(counts, usable, valid, status, gain)
-        if sum(one.nbytes for film in (found, *films.values()) for one in film) > _KEPT:
+    """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
+
+    If they are not kept, the rows of the source are read, and how they are rounded. All pixels are
+    kept of a small capture alone.
+    """
+    films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
+    chosen = (*key, b"" if isinstance(some, slice) else some.tobytes())
+    if chosen not in films:
+        found = films.get((*key, b""))
+        if found is None:
+            block, grains = load()
+            counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
+            counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+            found = counts, usable, valid, status, gain
+        share = (rows.stop - rows.start) / displacement.shape[0]
+        if not isinstance(some, slice):
+            share, found = 1.0, tuple(select(film, some) for film in found)
+        size, held = (sum(film.nbytes for film in one) for one in (found, chain(*films.values())))
+        if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
             return found
-        films[key] = found
-    kept = films[key]  # the tile is made of the counts, in place
-    return kept._replace(counts=kept.counts.copy(), status=kept.status.copy())
+        films[chosen] = found
+    counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
+    return counts.copy(), usable, valid, status.copy(), gain
 
 
 def read(

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, release
+from dbthermal._arrays import Array, parts
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
@@ -243,21 +243,38 @@ def _bends(curves: list[Curve]) -> Floats:
 def told(film: Floats) -> tuple[Mask, Mask]:
     """Pixels of a film (frame, pixel) with a number in some frame, and in every one."""
     some, every = np.zeros(film.shape[1], dtype=bool), np.ones(film.shape[1], dtype=bool)
-    for frame in film:
-        known = np.isfinite(frame)
-        some, every = some | known, every & known
-        release()
+    for part in parts(film):
+        known = np.isfinite(film[part])
+        some |= known.any(axis=0)
+        every &= known.all(axis=0)
     return some, every
 
 
 def bridge(film: Floats, solved: Mask) -> Floats:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
-    frames = np.arange(len(film))
-    for pixel in np.flatnonzero(solved & ~told(film)[1]):
-        known = np.isfinite(film[:, pixel])
-        if known.any():
-            film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
+    last = np.full(solved.size, -1)
+    for part in parts(film):
+        _bridge(film, part.start, min(part.stop, len(film)), solved, last)
+    for pixel in np.flatnonzero(solved & (last >= 0) & (last < len(film) - 1)):
+        film[last[pixel] + 1 :, pixel] = film[last[pixel], pixel]
     return film
+
+
+@compiled
+def _bridge(film: Floats, start: int, stop: int, solved: Mask, last: Whole) -> None:
+    """Bridge the gaps of pixels that end in some frames, in place; the last frame with a number."""
+    for frame in range(start, stop):
+        for pixel in range(solved.size):
+            if not solved[pixel] or not np.isfinite(film[frame, pixel]):
+                continue
+            before = last[pixel]
+            if before < frame - 1:
+                # A curve begins as its first number.
+                first = film[before if before >= 0 else frame, pixel]
+                slope = (np.float64(film[frame, pixel]) - first) / (frame - before)
+                for between in range(before + 1, frame):
+                    film[between, pixel] = slope * (between - before) + first
+            last[pixel] = frame
 
 
 def first_band(

@@ -72,7 +72,6 @@ def _survey(
     """Survey the selected pixels of a block of rows; with their numbers in the image."""
     surveys = []
     for cut in tiles.cut(inputs, rows, material, selected):
-        numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
         for _, pixels, tile in cut.parts:
             survey: Survey = inputs.apply(inputs.method.survey, tile)
             # Whitened by one noise for all, not by that of the tile.
@@ -80,9 +79,9 @@ def _survey(
             square = np.multiply.outer(scale, scale)[..., np.newaxis]
             scatters = survey.scatter * square, survey.rapid_scatter * square
             survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
-            surveys.append((numbers[pixels], survey))
-        if material is None:
-            bar.update(cut.status.size)
+            surveys.append((cut.places[pixels], survey))
+    if material is None:
+        bar.update((rows.stop - rows.start) * inputs.capture.sizes["x"])
     return surveys
 
 
