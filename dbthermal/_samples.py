@@ -29,6 +29,8 @@ _QUIET: Final = 0.8
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
 PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
 
+_AT_ONCE: Final = 2**17  # samples that are compared together, to stay in the cache
+
 # Share of the stillest groups of frames, and how many there must be: noise is then known to 3 %.
 _STILLEST: Final = 0.1
 _FEWEST_STILL: Final = 1000
@@ -101,16 +103,13 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     if _STILLEST * (groups - 4) * signals.shape[2] < _FEWEST_STILL:
         return np.full(bands, np.nan)
     three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
-    means = three.mean(axis=2)
-    rapid = (three[:, :, 1] - 0.5 * (three[:, :, 0] + three[:, :, 2])) / np.sqrt(1.5)
-    slope = (three[:, :, 2] - three[:, :, 0]) / np.sqrt(2.0)
-    change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
-    third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
-    # A mean of three has a third of the noise's variance, their third difference 10 times that.
-    around = 0.3 * third**2
-    for first in (0, 1, 3, 4):
-        around += rapid[:, first : first + groups - 4] ** 2
-    rapid, change, around = (part.reshape(bands, -1) for part in (rapid[:, 2:-2], change, around))
+    rapid, change, around = np.empty((3, bands, groups - 4, signals.shape[2]))
+    step = max(16, _AT_ONCE // three[:, 0].size)
+    for start in range(0, groups - 4, step):  # a few at a time, which stay in the cache
+        stop = min(start + step, groups - 4)
+        differences = _differences(three[:, start : stop + 4])
+        rapid[:, start:stop], change[:, start:stop], around[:, start:stop] = differences
+    rapid, change, around = (part.reshape(bands, -1) for part in (rapid, change, around))
     valid = np.all(np.isfinite(rapid) & (around > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))
     if number < _FEWEST_STILL:
@@ -130,6 +129,21 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     return np.where(alike & np.any(alike & proved), noise, np.nan)
 
 
+def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
+    """Second difference of groups (band, group, 3, pixel), of their slopes, and what surrounds."""
+    inner = three.shape[1] - 4
+    means = three.mean(axis=2)
+    rapid = (three[:, :, 1] - 0.5 * (three[:, :, 0] + three[:, :, 2])) / np.sqrt(1.5)
+    slope = (three[:, :, 2] - three[:, :, 0]) / np.sqrt(2.0)
+    change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
+    third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
+    # A mean of three has a third of the noise's variance, their third difference 10 times that.
+    around = 0.3 * third**2
+    for first in (0, 1, 3, 4):
+        around += rapid[:, first : first + inner] ** 2
+    return rapid[:, 2:-2], change, around
+
+
 def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
     """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
     step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / pixels)))
@@ -145,12 +159,26 @@ def rounding_std(counts: npt.NDArray[Any]) -> Array:
     """
     if counts.shape[1] < MINIMUM_FRAMES:
         return np.zeros(len(counts))
-    counts = np.where(np.isfinite(counts), counts, np.nan).astype(np.float64)
-    change = np.abs(np.diff(counts, axis=1))
-    step = np.min(change, axis=1, initial=np.inf, where=change > 0, keepdims=True)
-    off = np.abs(change / step - np.rint(change / step))
-    rounded = np.isfinite(step[:, 0]) & ~np.any(off > _OFF_MULTIPLE, axis=1)  # (band, pixel)
-    return np.asarray(np.median(np.where(rounded, step[:, 0], 0.0), axis=1) / np.sqrt(12.0))
+    size = max(16, _AT_ONCE // counts[:, 0].size)
+    parts = [slice(start, start + size + 1) for start in range(0, counts.shape[1] - 1, size)]
+    step = np.full((len(counts), counts.shape[2]), np.inf)
+    with np.errstate(invalid="ignore"):  # infinite counts are no rounded ones
+        for part in parts:
+            change = _changes(counts[:, part])
+            step = np.minimum(step, np.where(change > 0, change, np.inf).min(axis=1))
+        rounded = np.isfinite(step)  # (band, pixel)
+        for part in parts:
+            if not rounded.any():  # as soon as is known
+                break
+            change = _changes(counts[:, part]) / step[:, np.newaxis]
+            rounded &= ~np.any(np.abs(change - np.rint(change)) > _OFF_MULTIPLE, axis=1)
+    return np.asarray(np.median(np.where(rounded, step, 0.0), axis=1) / np.sqrt(12.0))
+
+
+def _changes(counts: npt.NDArray[Any]) -> Array:
+    """Magnitude of the changes between frames of counts (band, time, pixel), which may hold NaN."""
+    change = np.diff(counts.astype(np.float64), axis=1)
+    return np.abs(change, out=change)
 
 
 @dataclass(frozen=True)

@@ -64,22 +64,27 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
     """Variance of the slope by a linear drift, as `emission._linear_variance`."""
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
-    emitted, residual, weights = work.emitted, work.residual, work.weights
-    kernel, again = work.kernel, work.spare
-    kept, slope, size, length = weights, 0.0, 0.0, 0.0
+    emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
+    slope, level, _ = regression.moments(emitted, drift, weights)
+    size, length = 0.0, 0.0
+    for t in range(frames):
+        part = weights[t] * (drift[t] - level - slope * emitted[t])
+        length += part * drift[t]
+        size += part * residual[t]
+    size /= length
+    # Once more, with the weights of the residual less that drift.
+    inverse, kept = 1.0 / (residuals.TUNING * line.scale), work.variance
+    for t in range(frames):
+        off = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
+        inside = max(1.0 - off * off, 0.0)
+        kept[t] = inside * inside
     slope, level, _ = regression.moments(emitted, drift, kept)
-    for last in range(2):
-        length, size = 0.0, 0.0
-        for t in range(frames):
-            kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
-            length += kernel[t] * drift[t]
-            size += kernel[t] * residual[t]
-        size /= length
-        if last == 0:
-            for t in range(frames):
-                again[t] = residual[t] - size * (drift[t] - level - slope * emitted[t])
-            kept = work.variance
-            slope, level, _ = regression.reweighted(emitted, drift, again, line.scale, kept)
+    size, length = 0.0, 0.0
+    for t in range(frames):
+        kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
+        length += kernel[t] * drift[t]
+        size += kernel[t] * residual[t]
+    size /= length
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
     variance = (variance + line.emissivity[0] ** 2 * curve) / length**2

@@ -12,13 +12,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
-from dbthermal.separation._subspace import kernels, pieces
+from dbthermal.separation._subspace import joining, kernels, pieces
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._tiles import Whole
 
-_ROUNDED: Final = 1e-9  # an energy, or a part of one, that is rounding
+# Samples that are turned at once, to stay in the cache, and the fewest pixels.
+_TURNED: Final = 2**13
+_BLOCK: Final = 8
+_WITHIN: Final = 8  # levels of pieces whose costs by all axes stay in it
 
 
 class Tree(NamedTuple):
@@ -28,7 +30,8 @@ class Tree(NamedTuple):
     columns: Whole  # number of its functions (piece)
     chosen: Whole  # of these, by which is chosen (piece)
     places: Whole  # of its first function among the values (piece)
-    values: Array  # of all functions of all pieces
+    values: Array  # of functions: at the frames, or their products with those of both halves
+    held: Whole  # of its first product among those of a pixel, and the last one's end (piece)
     starts: Whole  # pieces that give the axes to start from
     time: Array  # [s]
     event: Mask  # whether a shutter event comes before a frame (time)
@@ -37,19 +40,21 @@ class Tree(NamedTuple):
 class Scratch(NamedTuple):
     """Work space of one pixel."""
 
-    white: Array  # whitened signals (2, time)
+    white: Array  # whitened signals of some pixels (pixel, 2, time)
     across: Array  # (time)
-    scatter: Array  # outside the functions by which is chosen (piece, 3), and those that are fitted
+    products: Array  # with all functions of the pieces (2, product)
+    energy: Array  # first, mixed and last element of the scatter of each piece (3, piece)
+    scatter: Array  # outside the functions by which is chosen, and those that are fitted
     fitted: Array
-    axes: Array  # to start from (2, axis)
-    least: Array  # cost of the best division of a piece (piece, axis)
+    axes: Array  # to start from (2, axis), and the weights of the elements of a scatter (3, axis)
+    weights: Array
+    least: Array  # cost of the best division of a piece (piece, axis), of some, and of those in one
+    within: Array
     halved: Mask  # (piece)
     starting: Array  # cost of the best division (axis)
-    basis: Array  # functions of a joined piece (function, time), and their squared lengths
-    lengths: Array
-    joined: Whole  # first frames of pieces, and the end; costs, and the piece before
-    cheapest: Array
-    before: Whole
+    joined: joining.Scratch
+    reached: Whole  # pieces whose halves may be used
+    cheapest: Array  # costs of pieces
     taken: Array  # axes of divisions (division, 2), costs, and the frames that pieces begin with
     costs: Array
     begins: Mask  # (division, time)
@@ -62,50 +67,70 @@ def divide(
     tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = signals.shape[1:]
     count, axes = len(tree.edges), len(tree.starts) + (known is not None)
-    functions = smooth.PIECE_ORDER + int(tree.event.sum())
     scratch = Scratch(
-        white=np.empty((2, frames)),
+        white=np.empty((max(_BLOCK, _TURNED // frames), 2, frames)),
         across=np.empty(frames),
-        scatter=np.empty((count, 3)),
-        fitted=np.empty((count, 3)),
+        products=np.empty((2, tree.held[-1])),
+        energy=np.empty((3, count)),
+        scatter=np.empty((3, count)),
+        fitted=np.empty((3, count)),
         axes=np.empty((2, axes)),
-        least=np.empty((count, axes)),
+        weights=np.empty((3, axes)),
+        least=np.empty((max(1, count >> (_WITHIN - 1)), axes)),
+        within=np.empty((2**_WITHIN, axes)),
         halved=np.empty(count, dtype=bool),
         starting=np.empty(axes),
-        basis=np.empty((functions, frames)),
-        lengths=np.empty(functions),
-        joined=np.empty(frames + 1, np.intp),
-        cheapest=np.empty(max(count, frames + 1)),
-        before=np.empty(frames + 1, np.intp),
+        joined=joining.scratch(count // 2 + 1, tree.event),
+        reached=np.empty(count, np.intp),
+        cheapest=np.empty(count),
         taken=np.empty((pieces.AXES, 2)),
         costs=np.empty(pieces.AXES),
         begins=np.empty((pieces.AXES, frames), dtype=bool),
     )
     ratio = np.full(pixels, np.nan) if known is None else np.ascontiguousarray(known[1])
-    first, cost = np.zeros((2, frames, pixels), dtype=bool), np.empty((2, pixels))
+    first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
     _divide(tree, np.ascontiguousarray(signals), noise, ratio, scratch, first, cost)
-    return [pieces.Division(*one) for one in zip(first, cost, strict=True)]
+    return [pieces.Division(*one) for one in zip(first.mT, cost, strict=True)]
 
 
 @lru_cache(maxsize=4)
 def _packed(times: bytes, events: bytes | None) -> Tree:
     levels, time = pieces.tree(times, events)[1], np.frombuffer(times)
     every = [piece for level in levels for piece in level]
-    sizes = np.array([basis.size for _, basis, _ in every])
+    bases = [basis for _, basis, _ in every]
+    values = [_functions(bases, i) for i in range(len(bases))]
+    sizes = np.array([one.size for one in values])
+    columns = np.array([basis.shape[1] for basis in bases])
+    own = np.where(np.arange(len(bases)) < len(bases) // 2, columns, 0)
     begun = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
     event = np.zeros(time.size, dtype=bool)
     if events is not None:
         event[1:] = np.diff(np.frombuffer(events, dtype=np.intp)) > 0
     return Tree(
         edges=np.array([(inside.start, inside.stop) for inside, _, _ in every]),
-        columns=np.array([basis.shape[1] for _, basis, _ in every]),
+        columns=columns,
         chosen=np.array([chosen for _, _, chosen in every]),
         places=np.cumsum(sizes) - sizes,
-        values=np.concatenate([basis.T.ravel() for _, basis, _ in every]),
+        values=np.concatenate(values),
+        held=np.append(0, np.cumsum(own)),
         starts=np.concatenate([one for one in begun if one[-1] < len(every)]),
         time=time,
         event=event,
     )
+
+
+def _functions(bases: list[Array], i: int) -> Array:
+    """Functions (time, function) of a piece, one after another, as `_scatters` takes them.
+
+    On its halves they are combinations of theirs, but on the shortest.
+    """
+    basis, inner = bases[i], len(bases) // 2
+    if i >= inner and basis.shape[0] == basis.shape[1]:  # any curve
+        return np.empty(0)
+    if 2 * i + 1 < inner:
+        left, right = bases[2 * i + 1 : 2 * i + 3]
+        basis = np.concatenate([left.T @ basis[: len(left)], right.T @ basis[len(left) :]])
+    return basis.T.ravel()
 
 
 @compiled
@@ -120,58 +145,92 @@ def _axis(a: float, b: float, d: float) -> tuple[float, float, float]:
 
 
 @compiled
-def _scatters(tree: Tree, scratch: Scratch) -> None:
-    """Scatter of each piece, first, mixed and last element, in place."""
-    for i in range(len(tree.edges)):
+def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
+    """Scatter of each piece of whitened signals (2, time), in place.
+
+    From the shortest upwards: energies and products follow from those of a piece's halves.
+    """
+    inner, energy, products = len(tree.edges) // 2, scratch.energy, scratch.products
+    for i in range(len(tree.edges) - 1, -1, -1):
         start, stop = tree.edges[i]
-        size = stop - start
-        one, two = scratch.white[0, start:stop], scratch.white[1, start:stop]
-        a, b, d = 0.0, 0.0, 0.0
-        if tree.columns[i] < size:  # or they are any curve
-            a, b, d = kernels.dot(one, one), kernels.dot(one, two), kernels.dot(two, two)
-        for j in range(tree.columns[i]):
+        columns, free = tree.columns[i], tree.columns[i] < stop - start
+        one, two = white[0, start:stop], white[1, start:stop]
+        if 2 * i + 1 < inner:
+            first, last = tree.held[2 * i + 1], tree.held[2 * i + 3]
+            one, two = products[0, first:last], products[1, first:last]
+            for k in range(3):
+                energy[k, i] = energy[k, 2 * i + 1] + energy[k, 2 * i + 2]
+        else:
+            energy[0, i], energy[2, i] = kernels.dot(one, one), kernels.dot(two, two)
+            energy[1, i] = kernels.dot(one, two)
+        a, b, d = energy[0, i], energy[1, i], energy[2, i]
+        for j in range(columns if free or i < inner else 0):
             if j == tree.chosen[i]:
-                scratch.scatter[i, 0], scratch.scatter[i, 1], scratch.scatter[i, 2] = a, b, d
-            if tree.columns[i] < size:
-                place = tree.places[i] + j * size
-                column = tree.values[place : place + size]
-                held, other = kernels.dot(column, one), kernels.dot(column, two)
-                a, b, d = a - held * held, b - held * other, d - other * other
-        scratch.fitted[i, 0], scratch.fitted[i, 1], scratch.fitted[i, 2] = a, b, d
-        if tree.chosen[i] >= tree.columns[i]:
-            kernels.copy(scratch.fitted[i], scratch.scatter[i])
+                scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i] = a, b, d
+            column = tree.values[tree.places[i] + j * one.size :]
+            held, other = 0.0, 0.0
+            for t in range(one.size):
+                held += column[t] * one[t]
+                other += column[t] * two[t]
+            a, b, d = a - held * held, b - held * other, d - other * other
+            if i < inner:
+                products[0, tree.held[i] + j], products[1, tree.held[i] + j] = held, other
+        if not free:  # any curve
+            a, b, d = 0.0, 0.0, 0.0
+        if tree.chosen[i] >= columns or not free:
+            scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i] = a, b, d
+        scratch.fitted[0, i], scratch.fitted[1, i], scratch.fitted[2, i] = a, b, d
 
 
 @compiled
 def _best(tree: Tree, scratch: Scratch) -> None:
     """Least cost of all divisions of each piece, by axis to start from."""
-    least, axes, inner = scratch.least, scratch.axes, len(tree.edges) // 2
-    for i in range(len(tree.edges) - 1, -1, -1):
-        a, b, d = scratch.scatter[i]
-        price = pieces.COST * tree.chosen[i]
-        result = least[i]
-        for j in range(result.size):
-            one, two = axes[0, j], axes[1, j]
-            result[j] = two * two * a - 2.0 * one * two * b + one * one * d + price
-        if i < inner:
-            left, right = least[2 * i + 1], least[2 * i + 2]
+    axes, weights = scratch.axes, scratch.weights
+    for j in range(axes.shape[1]):
+        one, two = axes[0, j], axes[1, j]
+        weights[0, j], weights[1, j], weights[2, j] = two * two, -2.0 * one * two, one * one
+    # The lowest levels are taken a part at a time, whose costs stay in the cache.
+    upper = max(1, (len(tree.edges) + 1) >> _WITHIN)
+    for root in range(upper - 1, 2 * upper - 1):
+        _best_within(tree, scratch, root, (len(tree.edges) + 1) // upper, scratch.within)
+        kernels.copy(scratch.within[0], scratch.least[root])
+    _best_within(tree, scratch, 0, upper, scratch.least)
+
+
+@compiled
+def _best_within(tree: Tree, scratch: Scratch, root: int, pieces_: int, least: Array) -> None:
+    """As `_best`, of the levels from a piece downwards that have less than so many pieces."""
+    weights, inner, level = scratch.weights, len(tree.edges) // 2, pieces_ // 2
+    while level > 0:
+        for k in range(level):
+            i, here = (root + 1) * level - 1 + k, level - 1 + k
+            a, b, d = scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i]
+            price, result = pieces.COST * tree.chosen[i], least[here]
             for j in range(result.size):
-                halves = left[j] + right[j]
-                result[j] = min(result[j], halves)
+                result[j] = weights[0, j] * a + weights[1, j] * b + weights[2, j] * d + price
+            if i < inner:
+                left, right = least[2 * here + 1], least[2 * here + 2]
+                for j in range(result.size):
+                    result[j] = min(result[j], left[j] + right[j])
+        level //= 2
 
 
 @compiled
 def _halve(tree: Tree, scratch: Scratch, one: float, two: float) -> None:
     """Find the pieces that are halved in the best division, by one axis."""
-    least, scatter, inner = scratch.cheapest, scratch.scatter, len(tree.edges) // 2
+    least, (a, b, d) = scratch.cheapest, scratch.scatter
     for i in range(len(tree.edges)):
-        least[i] = two * two * scatter[i, 0] - 2.0 * one * two * scatter[i, 1]
-        least[i] += one * one * scatter[i, 2] + pieces.COST * tree.chosen[i]
-        scratch.halved[i] = False
-    for i in range(inner - 1, -1, -1):
-        halves = least[2 * i + 1] + least[2 * i + 2]
-        scratch.halved[i] = halves < least[i] + pieces.TIE
-        least[i] = min(halves, least[i])
+        least[i] = two * two * a[i] - 2.0 * one * two * b[i] + one * one * d[i]
+        least[i] += pieces.COST * tree.chosen[i]
+    end = len(tree.edges) // 2
+    while end > 0:  # level by level
+        begin = end // 2
+        own, below, halved = least[begin:end], least[end : 2 * end + 1], scratch.halved[begin:end]
+        for i in range(own.size):
+            halves = below[2 * i] + below[2 * i + 1]
+            halved[i] = halves < own[i] + pieces.TIE
+            own[i] = min(halves, own[i])
+        end = begin
 
 
 @compiled
@@ -179,99 +238,21 @@ def _chosen(tree: Tree, scratch: Scratch, begins: Mask) -> tuple[float, float, f
     """Sum of the fitted scatters of the best division's pieces, and the frames they begin with."""
     begins[:] = False
     a, b, d = 0.0, 0.0, 0.0
-    used = scratch.halved
-    for i in range(len(tree.edges)):
-        parent = (i - 1) // 2
-        # A piece is looked at if all that hold it are halved.
-        looked_at = i == 0 or used[parent]
-        if looked_at and not used[i]:
-            a += scratch.fitted[i, 0]
-            b += scratch.fitted[i, 1]
-            d += scratch.fitted[i, 2]
+    reached, count = scratch.reached, 1
+    reached[0] = 0
+    inner, n = len(tree.edges) // 2, 0
+    while n < count:
+        i = reached[n]
+        if i < inner and scratch.halved[i]:
+            reached[count], reached[count + 1] = 2 * i + 1, 2 * i + 2
+            count += 2
+        else:
+            a += scratch.fitted[0, i]
+            b += scratch.fitted[1, i]
+            d += scratch.fitted[2, i]
             begins[tree.edges[i, 0]] = True
-        used[i] = looked_at and used[i]
+        n += 1
     return a, b, d
-
-
-@compiled
-def _piece(tree: Tree, scratch: Scratch, start: int, stop: int) -> tuple[float, float]:
-    """Energy across the axis that one piece leaves, and the price, as `pieces._cost`."""
-    size, steps = stop - start, 0
-    for t in range(start + 1, stop):
-        steps += 1 if tree.event[t] else 0
-    order = max(1, min(smooth.PIECE_ORDER, size - steps))
-    chosen = steps + (pieces.FUNCTIONS if size > smooth.PIECE_ORDER else order)
-    across, basis, lengths = scratch.across[start:stop], scratch.basis, scratch.lengths
-    degrees = min(chosen - steps, order)
-    if degrees + steps >= size:
-        return 0.0, pieces.COST * chosen
-    middle = 0.5 * (tree.time[start] + tree.time[stop - 1])
-    scale = 1.0 / (tree.time[stop - 1] - middle)
-    # Orthogonal polynomials: p_k = (x - a) p_k-1 - b p_k-2.
-    energy, a, b = kernels.dot(across, across), 0.0, 0.0
-    for k in range(degrees):
-        one, before = basis[max(k - 1, 0), :size], basis[max(k - 2, 0), :size]
-        length, first, held = 0.0, 0.0, 0.0
-        for t in range(size):
-            x = (tree.time[start + t] - middle) * scale
-            value = (x - a) * one[t] - b * before[t] if k > 0 else 1.0
-            basis[k, t] = value
-            length += value * value
-            first += value * value * x
-            held += value * across[t]
-        energy -= held * held / length
-        a, b = first / length, length / lengths[k - 1] if k > 0 else 0.0
-        lengths[k] = length
-    count = degrees
-    for event in range(start + 1, stop):
-        if tree.event[event]:
-            energy -= _step(scratch, event - start, size, count, across)
-            count += 1
-    return energy, pieces.COST * chosen
-
-
-@compiled
-def _step(scratch: Scratch, event: int, size: int, count: int, across: Array) -> float:
-    """Energy of a signal along a step of the camera, beside functions that are there before it."""
-    column = scratch.basis[count, :size]
-    column[:event], column[event:] = 0.0, 1.0
-    for k in range(count):
-        other = scratch.basis[k, :size]
-        part = kernels.dot(other, column) / scratch.lengths[k]
-        for t in range(size):
-            column[t] -= part * other[t]
-    length = kernels.dot(column, column)
-    scratch.lengths[count] = length if length > _ROUNDED * size else np.inf
-    return float(kernels.dot(column, across) ** 2 / scratch.lengths[count])
-
-
-@compiled
-def _join(tree: Tree, scratch: Scratch, begins: Mask) -> float:
-    """Keep the best of the first frames of pieces, in place; the cost, as `pieces._joined`."""
-    edges, least, before = scratch.joined, scratch.cheapest, scratch.before
-    count = 0
-    for t in range(begins.size):
-        if begins[t]:
-            edges[count] = t
-            count += 1
-    edges[count], least[0] = begins.size, 0.0
-    for stop in range(1, count + 1):
-        least[stop], before[stop] = np.inf, 0
-        for start in range(stop - 1, -1, -1):
-            energy, price = _piece(tree, scratch, edges[start], edges[stop])
-            total = least[start] + energy + price
-            if total < least[stop] + pieces.TIE:
-                least[stop], before[stop] = min(total, least[stop]), start
-            # A longer piece leaves more than this one and the best before it. It costs no less, but
-            # for the one function that the shortest pieces have more.
-            if least[start] + energy > least[stop] + 1.5 * pieces.COST:
-                break
-    begins[:] = False
-    at = count
-    while at > 0:
-        at = before[at]
-        begins[edges[at]] = True
-    return float(least[count])
 
 
 @compiled
@@ -287,12 +268,12 @@ def _refine(
 
 
 @compiled
-def _pixel(tree: Tree, scratch: Scratch, ratio: float, begins: Mask) -> None:
+def _pixel(tree: Tree, scratch: Scratch, white: Array, ratio: float, begins: Mask) -> None:
     """Divisions by four axes, and their costs, in place; infinite for none."""
     axes, costs, taken, across = scratch.axes, scratch.costs, scratch.taken, scratch.across
-    _scatters(tree, scratch)
+    _scatters(tree, scratch, white)
     for i in range(len(tree.starts)):
-        a, b, d = scratch.scatter[tree.starts[i]]
+        a, b, d = scratch.scatter[:, tree.starts[i]]
         axes[0, i], axes[1, i], _ = _axis(a, b, d)
     if axes.shape[1] > len(tree.starts):
         length = sqrt(1.0 + ratio * ratio)
@@ -313,8 +294,10 @@ def _pixel(tree: Tree, scratch: Scratch, ratio: float, begins: Mask) -> None:
         costs[number] = np.inf
         if not again and lowest < np.inf:
             for t in range(across.size):
-                across[t] = two * scratch.white[0, t] - one * scratch.white[1, t]
-            costs[number] = _join(tree, scratch, begins[number])
+                across[t] = two * white[0, t] - one * white[1, t]
+            costs[number] = joining.join(
+                tree.time, tree.event, across, scratch.joined, begins[number]
+            )
         # An axis with an energy E along it, in units of the noise, is known to 1 / sqrt(E).
         apart = pieces.APART / sqrt(energy)
 
@@ -327,6 +310,15 @@ def _near(axis: Array, taken: Array, count: int, apart: float) -> bool:
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])
         near |= acos(min(product, 1.0)) < apart
     return near
+
+
+@compiled
+def _turn(signals: Array, noise: Array, white: Array) -> None:
+    """Whitened signals (band, time, pixel) of a few pixels as (pixel, band, time), in place."""
+    for band in range(2):
+        for t in range(signals.shape[1]):
+            for p in range(signals.shape[2]):
+                white[p, band, t] = signals[band, t, p] / noise[band]
 
 
 def _compiled(digest: str) -> Callable[..., None]:
@@ -344,20 +336,19 @@ def _compiled(digest: str) -> Callable[..., None]:
     ) -> None:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
-        frames, begins = signals.shape[1], scratch.begins
-        for p in range(signals.shape[2]):
-            for band in range(2):
-                for t in range(frames):
-                    scratch.white[band, t] = signals[band, t, p] / noise[band]
-            _pixel(tree, scratch, ratio[p] * noise[0] / noise[1], begins)
-            for rank in range(2):
-                best = 0
-                for number in range(1, pieces.AXES):
-                    if scratch.costs[number] < scratch.costs[best]:
-                        best = number
-                cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
-                for t in range(frames):
-                    first[rank, t, p] = begins[best, t]
+        begins, block = scratch.begins, len(scratch.white)
+        for start in range(0, signals.shape[2], block):
+            _turn(signals[:, :, start : start + block], noise, scratch.white)
+            for p in range(start, min(start + block, signals.shape[2])):
+                white = scratch.white[p - start]
+                _pixel(tree, scratch, white, ratio[p] * noise[0] / noise[1], begins)
+                for rank in range(2):
+                    best = 0
+                    for number in range(1, pieces.AXES):
+                        if scratch.costs[number] < scratch.costs[best]:
+                            best = number
+                    cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
+                    kernels.copy(begins[best], first[rank, p])
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
         divide.enable_caching()

@@ -27,6 +27,7 @@ from dbthermal.separation._tiles import Tile, Whole
 _TURNED: Final = 2**14
 _BLOCK: Final = 8
 _VECTOR: Final = 64  # numbers that a loop takes at once, at most
+_PAGE, _APART = 512, 24  # numbers of a page, and of three lines of the cache
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
@@ -270,11 +271,13 @@ def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
 
 def _work_space(frames: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
-    curves = {name: np.empty(frames) for name in Work._fields}
+    # Places of one frame that lie a multiple of a page apart would drive each other from the cache.
+    apart = -(-frames // _PAGE) * _PAGE + _APART
+    curves = dict(zip(Work._fields, np.empty((len(Work._fields), apart))[:, :frames], strict=True))
     block = max(_BLOCK, _TURNED // frames)
     return curves | {
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
-        "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
+        "few": np.full((5, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
         "spectra": np.empty((2, degrees)),
         "material": np.empty(6),
         "inside": np.empty((block, 2, frames)),

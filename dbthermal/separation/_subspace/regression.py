@@ -72,14 +72,24 @@ def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
         return slope, centre - slope * middle, energy
 
     @compiled
-    def reweighted(x: Any, y: Any, residual: Any, scale: float, weights: Any) -> Any:
-        """As `moments`, with Tukey's bisquare weights of residuals, in place."""
+    def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
+        """As `moments`, with Tukey's bisquare weights of the residuals of another line."""
         inverse = real(1.0 / (residuals.TUNING * scale))
+        total, first, second, square, product = zero, zero, zero, zero, zero
         for t in range(x.size):
-            r = residual[t] * inverse
+            r = (y[t] - intercept - slope * x[t]) * inverse
             kept = max(one - r * r, zero)
-            weights[t] = kept * kept
-        return moments(x, y, weights)
+            w = kept * kept
+            wx = w * x[t]
+            total += w
+            first += wx
+            second += w * y[t]
+            square += wx * x[t]
+            product += wx * y[t]
+        middle, centre = first / total, second / total
+        energy = square - total * middle * middle
+        slope = (product - total * middle * centre) / energy
+        return slope, centre - slope * middle, energy
 
     return moments, reweighted
 
@@ -89,12 +99,12 @@ _moments, _reweighted = _of(np.float32)
 
 
 @compiled
-def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> None:
-    """Residual from the best of three starts, in place; see `residuals.regress`."""
+def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
+    """Slope and intercept of the best of three starts; see `residuals.regress`."""
     middle, centre = kernels.mean(x), kernels.mean(y)
     count = min(x.size, residuals.STARTING_POINTS)
-    xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]
-    weights, plain, magnitude = few[3, :count], few[4, :count], few[5, :count]
+    xs, ys, weights = few[0, :count], few[1, :count], few[2, :count]
+    plain, magnitude = few[3, :count], few[4, :count]
     for i in range(count):
         t = i if count == x.size else i * x.size // residuals.STARTING_POINTS
         xs[i], ys[i], weights[i] = x[t] - middle, y[t] - centre, 1.0
@@ -112,18 +122,16 @@ def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> Non
         for turn in range(residuals.STARTING_STEPS):
             if turn > 0:
                 scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
-                slope, intercept, _ = _reweighted(xs, ys, rest, scale, weights)
+                slope, intercept, _ = _reweighted(xs, ys, slope, intercept, scale)
             total = zero
             for i in range(count):
-                rest[i] = ys[i] - intercept - slope * xs[i]
-                magnitude[i] = abs(rest[i])
+                magnitude[i] = abs(ys[i] - intercept - slope * xs[i])
                 total += magnitude[i]
             guess = deviation if turn > 0 else 0.5 * total / count
             deviation = ranked(magnitude, rank, max(guess, noise / residuals.TO_STD))
         if deviation < best:
             best, best_slope, best_intercept = deviation, slope, intercept
-    for t in range(x.size):
-        residual[t] = y[t] - centre - best_intercept - best_slope * (x[t] - middle)
+    return float(best_slope), float(centre + best_intercept - best_slope * middle)
 
 
 @compiled
@@ -136,22 +144,26 @@ def regress(
     Slope, its variance, the scale, and the energy of the abscissa.
     """
     if again:
-        slope, intercept, _ = moments(x, y, weights)
-        for t in range(x.size):
-            residual[t] = y[t] - intercept - slope * x[t]
+        slope, intercept, energy = moments(x, y, weights)
     else:
-        _started(x, y, noise, residual, few)
-    magnitude, rank = few[5], int(residuals.SHARE * x.size)
-    deviation = 0.0
-    for t in range(x.size):
-        magnitude[t] = abs(residual[t])
+        slope, intercept = _started(x, y, noise, few)
+        energy = 0.0
+    magnitude, rank, last = few[4], int(residuals.SHARE * x.size), (slope, intercept)
+    deviation, scale = 0.0, noise
+    # Residuals and weights are made anew where they are used: a long capture's leave the cache.
     for _ in range(residuals.STEPS):
+        last = slope, intercept
+        for t in range(x.size):
+            magnitude[t] = abs(y[t] - intercept - slope * x[t])
         deviation = ranked(magnitude, rank, max(deviation, noise / residuals.TO_STD))
         scale = max(noise, residuals.TO_STD * deviation)
-        slope, intercept, energy = reweighted(x, y, residual, scale, weights)
-        for t in range(x.size):
-            residual[t] = y[t] - intercept - slope * x[t]
-            magnitude[t] = abs(residual[t])
+        slope, intercept, energy = reweighted(x, y, slope, intercept, scale)
+    inverse = 1.0 / (residuals.TUNING * scale)
+    for t in range(x.size):
+        residual[t] = y[t] - intercept - slope * x[t]
+        off = (y[t] - last[1] - last[0] * x[t]) * inverse
+        inside = max(1.0 - off * off, 0.0)
+        weights[t] = inside * inside
     kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
     for t in range(1, x.size):
         one = residual[t] * weights[t]
