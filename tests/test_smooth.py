@@ -94,6 +94,25 @@ def test_steps_and_pieces_are_in_the_subspace() -> None:
     np.testing.assert_allclose(identity, np.eye(functions.steps + 1), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("events", [(30,), (5, 8), (5, 50), (23, 30, 58)])
+def test_columns_of_pieces_have_the_length_of_these(events: tuple[int, ...]) -> None:
+    """With steps of the camera in one piece or several they are zero outside of their spans."""
+    time = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
+    first, segment = np.isin(np.arange(60), [0, 20, 41]), segmented(60, *events)
+    functions = smooth.piecewise(time, first, time[:, np.newaxis], segment=segment)
+    for columns in (functions.functions, functions.object_part):
+        for column, (start, stop) in zip(columns.T, functions.spans, strict=True):
+            assert np.count_nonzero(column) == np.count_nonzero(column[start:stop])
+    # The projection of a dense basis, and what of it is the object's.
+    plain = [time**power * (np.cumsum(first) == piece) for power in range(5) for piece in (1, 2, 3)]
+    dense = np.stack([*plain, *smooth.camera_steps(segment)], axis=1)
+    signal = np.random.default_rng(4).standard_normal(60)
+    fit = np.linalg.lstsq(dense, signal, rcond=None)[0]
+    own = functions.object_part @ (functions.functions.T @ signal)
+    expected = dense[:, : len(plain)] @ fit[: len(plain)]
+    np.testing.assert_allclose(own, expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("events", [(), (30,)])
 def test_leverage_of_chosen_pieces(events: tuple[int, ...]) -> None:
     """A change point adds as much leverage as three functions do, one piece alone has its own."""

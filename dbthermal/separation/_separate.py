@@ -210,13 +210,30 @@ def cameras_apart(
     Of some pixels, for all would take long; and the share of them without a flag. Slow reflections
     are simultaneous within a frame though they are apart: then the share of windows displaced.
     """
-    pixels = corrected.sizes["y"] * corrected.sizes["x"]
-    every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
+    corrected, every = _measured(corrected, _every(corrected))
     some = solve(corrected.isel(y=every, x=every).load(), response, workers=workers)
     apart, moving = _pixels_apart(some)
     chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
     share = apart / moving if apart / moving > _APART + chance else 0.0
     return share or _displaced(corrected, response), _unflagged(some)
+
+
+def _every(corrected: xr.Dataset) -> slice:
+    """Rows and columns of some pixels, spread over the image."""
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    return slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
+
+
+def _measured(corrected: xr.Dataset, every: slice) -> tuple[xr.Dataset, slice]:
+    """Rows and columns with samples, as of an object in a part of the image; some pixels of it."""
+    counts = corrected["counts"].isel(y=every, x=every).values
+    known = schema.measured(counts).all(axis=0).any(axis=0)
+    places = [np.flatnonzero(known.any(axis=axis)) * every.step for axis in (1, 0)]
+    if not known.any():
+        return corrected, every
+    rows, columns = (slice(one[0], one[-1] + every.step) for one in places)
+    inside = corrected.isel(y=rows, x=columns)
+    return inside, _every(inside)
 
 
 def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:

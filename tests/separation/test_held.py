@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.ndimage import gaussian_filter
+from test_displaced import SMALL, film
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
 from dbthermal.separation._separate import cameras_apart
+from reproduction.experiments.pictures import smooth_shift
 
 RIG = simulation.Rig()
 TIME = np.arange(240) / 15.0
@@ -170,3 +172,17 @@ def test_a_result_in_per_cent_is_not_completed() -> None:
     wrong = result.assign(emissivity=100.0 * result["emissivity"])
     with pytest.raises(ValueError, match=r"Invalid emissivity \d+.* of the result"):
         separation.complete(wrong, capture, response)
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_what_has_no_samples_hides_no_displacement(slow: bool) -> None:
+    """Cameras are told apart by the measured pixels, however few of the image these are."""
+    if slow:
+        capture = slow_and_apart(4, 1)[1]
+    else:
+        capture = film(SMALL, smooth_shift(SMALL.shape, 2.4, 1.2), 4)[1]
+    around = {dim: (capture.sizes[dim], 5 * capture.sizes[dim]) for dim in ("y", "x")}
+    padded = capture.drop_vars(["y", "x"], errors="ignore").pad(around, constant_values=np.nan)
+    shares = [cameras_apart(one, RIG.response())[0] for one in (capture, padded)]
+    print(f"{shares[0]:.2f} of the pixels apart, {shares[1]:.2f} in a part of the image")
+    assert min(shares) > 0.3

@@ -9,7 +9,7 @@ from test_displaced import GLASS, RIG, SMALL, TIME, field, film
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation._apart import displaced, joint
+from dbthermal.separation._apart import displaced, equations, joint
 from dbthermal.separation._inputs import Inputs, Labels, check
 from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._tiles import Material
@@ -148,3 +148,21 @@ def test_a_rapid_object_does_not_hide_that_cameras_are_apart() -> None:
     assert result.attrs["reflection_shift"] == "found"
     assert good.mean() > 0.3
     assert inside.mean() > 0.9
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_gaps_of_a_film_are_bridged_by_lines(dtype: type[np.floating]) -> None:
+    """As by NumPy's interpolation pixel by pixel, at the ends too; what has no number stays."""
+    rng = np.random.default_rng(0)
+    film = rng.normal(300.0, 1.0, (90, 40)).astype(dtype)
+    film[rng.random(film.shape) < 0.3] = np.nan
+    film[[0, 1, 50, -1]] = np.nan
+    film[:, 7] = np.nan
+    solved, frames, expected = rng.random(40) < 0.8, np.arange(90), film.copy()
+    solved[7] = True
+    for pixel in np.flatnonzero(solved):
+        known = np.isfinite(film[:, pixel])
+        if known.any():
+            line = np.interp(frames[~known], frames[known], film[known, pixel])
+            expected[~known, pixel] = line
+    np.testing.assert_array_equal(equations.bridge(film, solved), expected)
