@@ -210,9 +210,9 @@ def paired(
     kept of a small capture alone.
     """
     films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
-    chosen = (*key, b"" if isinstance(some, slice) else some.tobytes())
+    chosen = (*key, None if isinstance(some, slice) else some.tobytes())
     if chosen not in films:
-        found = films.get((*key, b""))
+        found = films.get((*key, None))
         if found is None:
             block, grains = load()
             counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
