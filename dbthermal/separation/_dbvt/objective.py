@@ -188,14 +188,16 @@ def system(
         h2, pull2 = _huber_force(second, scale, weights, 1, share)
         pull1, pull2 = own1 - pull1 + k2 * error, own2 - pull2 - error
         a, c, one, two, inverse = _block(q[0] + h1, q[1] + h2, w, k2)
-        # What is left of the quadratic form: with K = N - diag(q), diag(q) N^-1 K in x and y.
-        yy = q[1] * (h2 * one + w * a) * inverse
-        xx = q[0] * (h1 * two + w * k2**2 * c) * inverse
-        xy = -q[0] * q[1] * k2 * w * inverse
-        xz, yz, zz = -q[0] * k2 * c * w * inverse, q[1] * a * w * inverse, a * c * w * inverse
-        with_y = xy + k1 * yy
-        form[t, 0], form[t, 1], form[t, 2] = xx + k1 * (xy + with_y), with_y, xz + k1 * yz
-        form[t, 3], form[t, 4], form[t, 5] = yy, yz, zz
+        # What is left of the quadratic form: with K = N - diag(q), diag(q) N^-1 K in x and y,
+        # written so that nothing cancels where both ratios are alike.
+        apart = w * q[0] * q[1] * (k1 - k2)
+        own = q[0] * h1 * two + k1**2 * q[1] * h2 * one
+        shared = w * (k2**2 * q[0] * h2 + k1**2 * q[1] * h1)
+        form[t, 0] = (own + shared + apart * (k1 - k2)) * inverse
+        form[t, 1] = (k1 * q[1] * (h2 * one + w * h1) + apart) * inverse
+        form[t, 2] = (w * (k1 * q[1] * h1 - k2 * q[0] * h2) + apart) * inverse
+        form[t, 3] = q[1] * (h2 * one + w * a) * inverse
+        form[t, 4], form[t, 5] = q[1] * a * w * inverse, a * c * w * inverse
         n1 = (two * pull1 + w * k2 * pull2) * inverse
         n2 = (w * k2 * pull1 + one * pull2) * inverse
         force_y = own2 - q[1] * n2
