@@ -6,6 +6,7 @@ linearised signal :math:`z = T_r + (I - U(T_r)) / a`, in kelvin, and the blackbo
 :math:`u(T)`, with :math:`u(T_r) = T_r` and slope 1 there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -25,6 +26,7 @@ __all__ = [
     "apparent_temperature",
     "counts",
     "curve",
+    "curves",
     "noise",
     "require_range",
 ]
@@ -199,12 +201,32 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
         If the band is missing, the kind unknown, a coefficient not finite, the slope not positive,
         or the calibrated range does not increase or lies more than 100 K off the reference.
     """
+    return curves(response, [band], kind)[0]
+
+
+def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> list[Curve]:
+    """Curves of some bands, as `curve` makes that of one; the response is checked once.
+
+    Parameters
+    ----------
+    response, kind : Dataset, str
+        As for `curve`.
+    bands : sequence of str
+        Names of the bands, in the order of the result.
+    """
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
     schema.check(response, "response")
-    (place,) = schema.band_positions(response, [band], "the response")
-    here = response.isel(band=place)
-    number = {str(name): float(here[name]) for name in schema.STAGES["response"]}
+    places = schema.band_positions(response, list(bands), "the response")
+    values = {str(name): response[name].values for name in schema.STAGES["response"]}
+    return [
+        _curve({name: float(v[place] if v.ndim else v) for name, v in values.items()}, band, kind)
+        for band, place in zip(bands, places, strict=True)
+    ]
+
+
+def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
+    """Curve of one band, of the numbers of its response."""
     bad = [name for name, value in number.items() if not np.isfinite(value)]
     if bad:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")
@@ -264,9 +286,9 @@ def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     """
     schema.check_numbers(temperature, "the temperature", "K")
     names = [str(name) for name in schema.check(response, "response")["band"].values]
-    curves = [curve(response, name) for name in names]
-    values = require_range(temperature.values, curves[0], "temperature")
-    parts = [temperature.copy(data=one.counts(values)) for one in curves]
+    of_bands = curves(response, names)
+    values = require_range(temperature.values, of_bands[0], "temperature")
+    parts = [temperature.copy(data=one.counts(values)) for one in of_bands]
     result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
@@ -296,8 +318,7 @@ def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataA
     if counts.dims[:1] != ("band",):
         raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
-    values = [
-        curve(response, name).inverse(part) for name, part in zip(names, counts.values, strict=True)
-    ]
+    both = zip(curves(response, names), counts.values, strict=True)
+    values = [one.inverse(part) for one, part in both]
     result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
     return result.assign_attrs(units="K", long_name="apparent temperature")

@@ -333,8 +333,8 @@ def _bands(
     """Response, noise and counts (measurement) of each band."""
     names = [str(name) for name in measured["band"].values]
     noises, bands = responses.noise(response, names), []
-    for name, noise, counts in zip(names, noises, measured["counts"].values, strict=True):
-        curve = responses.curve(response, name)
+    curves = responses.curves(response, names)
+    for curve, noise, counts in zip(curves, noises, measured["counts"].values, strict=True):
         require_range(warm, curve, "object temperature")
         bands.append((curve, float(noise), counts.astype(np.float64)))
     return bands

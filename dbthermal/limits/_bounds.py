@@ -162,7 +162,7 @@ def bounds(
         raise TypeError(f"Invalid resting {resting!r}. Must be True or False.")
     truth = _truth(scene, resting=resting)
     names = [str(name) for name in scene["band"].values]
-    curves = [responses.curve(response, name, response_kind) for name in names]
+    curves = responses.curves(response, names, response_kind)
     for name in TEMPERATURES:
         for curve in curves:
             require_range(getattr(truth, name), curve, name)

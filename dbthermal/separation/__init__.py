@@ -44,7 +44,7 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-# These are imported when they are first used: one needs torch, others compile.
+# These are imported when they are first used: some compile.
 _LATER: Final = {
     "BcpSettings": "_baselines.bcp",
     "CalibratedSettings": "_baselines.calibrated",

@@ -83,7 +83,7 @@ class Rig:
         )
         noiseless = calibration.fit_response(counts)
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
-        slopes = [responses.curve(noiseless, name).reference_slope for name in self.bands]
+        slopes = [one.reference_slope for one in responses.curves(noiseless, self.bands)]
         noise = xr.DataArray(np.array(self.noise) * slopes, {"band": list(self.bands)}, "band")
         return calibration.fit_response(counts, noise).assign_attrs(origin="simulated")
 
@@ -95,7 +95,7 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
     if "band" in temperature.dims:
         places = schema.band_positions(temperature, names, str(temperature.name))
         parts = [temperature.isel(band=place) for place in places]
-    curves = [responses.curve(response, name) for name in names]
+    curves = responses.curves(response, names)
     return [
         curve.counts(require_range(part.values, curve, str(temperature.name)))
         for part, curve in zip(parts, curves, strict=True)

@@ -124,7 +124,7 @@ def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sam
     """With errors of zero, noise of a billionth and a perfect mirror both give the truth."""
     quiet, rng = known.assign(noise=1e-9 * known["noise"]), np.random.default_rng(0)
     mirror = replace(sample, stray=0.0)
-    true = band_emissivity(mirror, ["8-14", "9.5"])
+    true = band_emissivity(mirror, ("8-14", "9.5"))
     series = bench_series(quiet, mirror, NO_ERRORS, rng)
     foil = reflector_series(quiet, mirror, NO_ERRORS, rng)
     for found in (
@@ -183,10 +183,10 @@ def test_its_failure_is_the_mirrored_direction(
 def test_other_bands_follow_the_kin() -> None:
     """Metals by the ratio of emissivities, dielectrics by that of reflectances, all in (0, 1)."""
     for sample in OBJECTS:
-        value = band_emissivity(sample, ["8-14", "9.5"])
+        value = band_emissivity(sample, ("8-14", "9.5"))
         assert float(value[0]) == pytest.approx(sample.emissivity, abs=1e-12)
         assert 0 < float(value[1]) < 1
-    glass = band_emissivity(OBJECTS[-1], ["9.5"])
+    glass = band_emissivity(OBJECTS[-1], ("9.5",))
     assert float(glass[0]) == pytest.approx(1 - 0.05 * (1 - 0.7180) / (1 - 0.8605), abs=1e-9)
 
 

@@ -74,10 +74,8 @@ def test_slope_is_the_closed_form() -> None:
 @pytest.mark.slow
 def test_pooling_falls_as_the_root() -> None:
     """The bound falls as 1/sqrt(n), and the error follows it."""
-    found = [limits.pooled(size, GLASS, pixels=800, seed=7, **COMMON) for size in (1, 16)]
-    errors, limit = (
-        [float(one[f"reflection_ratio_{kind}"]) for one in found] for kind in ("error", "bound")
-    )
+    found = limits.pooled([1, 16], GLASS, pixels=800, seed=7, **COMMON)
+    errors, limit = (found[f"reflection_ratio_{kind}"].values for kind in ("error", "bound"))
     print(f"1 and 16 pixels: errors {np.round(errors, 4)}, bounds {np.round(limit, 4)}")
     assert limit[0] / limit[1] == pytest.approx(4.0, rel=1e-6)
     assert errors[0] / errors[1] > 3.0
@@ -86,7 +84,7 @@ def test_pooling_falls_as_the_root() -> None:
 def test_groups_are_whole() -> None:
     """A number of pixels that is not a multiple of the group raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid size 3 of a group. Must divide the 400 pixels"):
-        limits.pooled(3, GLASS, pixels=400, seed=1, **COMMON)
+        limits.pooled([3], GLASS, pixels=400, seed=1, **COMMON)
 
 
 def test_truth_on_another_clock() -> None:

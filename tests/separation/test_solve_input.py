@@ -223,7 +223,7 @@ def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> No
         (separation.DbvtSettings, {"batch": 2.5}, "Must be a whole number"),
         (separation.NaiveSettings, {"starts": True}, "Invalid starts True of method"),
         (separation.RatioSettings, {"order": 2.5}, "Invalid order 2.5 of method"),
-        (separation.DbvtSettings, {"device": None}, "Invalid device None of method"),
+        (separation.DbvtSettings, {"start": None}, "Invalid start None of method"),
     ],
 )
 def test_settings_of_another_type(

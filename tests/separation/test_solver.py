@@ -67,12 +67,6 @@ def test_bad_settings_are_named(capture: xr.Dataset, case: str) -> None:
         separation.solve(capture, Rig().response(), method, **arguments)
 
 
-def test_a_missing_device_is_named() -> None:
-    """A graphics processor that does not exist raises a ValueError with its name."""
-    with pytest.raises(ValueError, match="Invalid device 'cuda:9'"):
-        separation.DbvtSettings(device="cuda:9")
-
-
 def test_a_dead_pixel_harms_no_neighbour() -> None:
     """A pixel marked as dead, however hot, does not change the channel prior's other pixels."""
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})

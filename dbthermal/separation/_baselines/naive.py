@@ -76,6 +76,7 @@ class _State(Pixels):
     logits: Array  # (2, column)
     logarithms: Array  # of object and background temperature / K, (2, time, column)
     damping: Array  # (column,)
+    residual: Array  # see `_residual` (band, time, column)
     objective: Array  # (column,)
     active: Mask  # (column,)
 
@@ -104,9 +105,9 @@ def _search(tile: Tile, settings: NaiveSettings) -> _State:
     logits = logit(tile.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
     shifts = settings.shift_std * tile.rng.standard_normal((2, 1, columns))
     logarithms = np.log(tile.temperature(0, signals[0]) + shifts)
-    _, objective = _residual(tile, signals, logits, logarithms)
+    residual, objective = _residual(tile, signals, logits, logarithms)
     damping = np.full(columns, _FIRST_DAMPING)
-    state = _State(logits, logarithms, damping, objective, np.isfinite(objective))
+    state = _State(logits, logarithms, damping, residual, objective, np.isfinite(objective))
     for _ in range(settings.iterations):
         active = state.active.copy()
         if not np.any(active):
@@ -126,9 +127,9 @@ def _residual(tile: Tile, signals: Array, logits: Array, logarithms: Array) -> t
 
 def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State:
     """One damped step of every column; it is taken where it lowers the objective."""
-    logits_step, logarithms_step = _solve(tile, signals, state)
+    logits_step, logarithms_step = _solve(tile, state)
     logits, logarithms = state.logits + logits_step, state.logarithms + logarithms_step
-    _, objective = _residual(tile, signals, logits, logarithms)
+    residual, objective = _residual(tile, signals, logits, logarithms)
     better = objective < state.objective  # false where it is NaN
     better &= np.all(np.abs(logits_step) < _LONGEST, axis=0)
     smallest, largest = _DAMPING
@@ -140,19 +141,19 @@ def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State
         logits=np.where(better, logits, state.logits),
         logarithms=np.where(better, logarithms, state.logarithms),
         damping=damping,
+        residual=np.where(better, residual, state.residual),
         objective=np.where(better, objective, state.objective),
         active=~done & (damping < largest),
     )
 
 
-def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
+def _solve(tile: Tile, state: _State) -> tuple[Array, Array]:
     """Steps of the logits and of the logarithms, from the damped normal equations.
 
     With T the 2x2 block of a frame's temperatures, S its columns of the border and B the border's
     own block, the logits solve :math:`(B - S^T T^{-1} S) l = b - S^T T^{-1} f`.
     """
     inner, border = _jacobian(tile, state)
-    residual, _ = _residual(tile, signals, state.logits, state.logarithms)
     # Marquardt's damping, in proportion to the diagonal, and Levenberg's, of every logarithm and
     # logit alike: without it an emissivity of 0 or 1 within rounding is a singular system.
     harder, damping = 1.0 + state.damping, state.damping
@@ -160,7 +161,7 @@ def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
     a, c = (np.sum(inner[:, part] ** 2, axis=0) * harder + damping for part in (0, 1))
     b = np.sum(inner[:, 0] * inner[:, 1], axis=0)
     blocks = (a, b, c)
-    forces = np.einsum("mktp,mtp->ktp", inner, residual)
+    forces = np.einsum("mktp,mtp->ktp", inner, state.residual)
     sides = [inner[band] * border[band] for band in (0, 1)]
     solved = [_symmetric(blocks, side) for side in sides]
     force = _symmetric(blocks, forces)
@@ -168,7 +169,7 @@ def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
     right = np.stack([-np.sum(side * force, axis=(0, 1)) for side in sides])
     for band in (0, 1):
         schur[band, band] += np.sum(border[band] ** 2, axis=0) * harder + damping
-        right[band] += np.sum(border[band] * residual[band], axis=0)
+        right[band] += np.sum(border[band] * state.residual[band], axis=0)
     logits = _symmetric((schur[0, 0], schur[0, 1], schur[1, 1]), right)
     return logits, force - logits[0] * solved[0] - logits[1] * solved[1]
 

@@ -1,16 +1,14 @@
-"""Settings of the paper's optimiser, algorithm DBVT; they need no torch, its modules do."""
+"""The paper's optimiser, algorithm DBVT: its settings."""
 
 from dataclasses import dataclass
 from typing import Final
 
 from dbthermal import planck
-from dbthermal._arrays import require_device
 from dbthermal.separation._inputs import check_fields, require
 
 _CHOICES: Final = {
     "start": ("random", "subspace"),
     "temperatures_from": ("corrected", "measured"),
-    "precision": ("float64", "float32"),
 }
 
 
@@ -60,8 +58,6 @@ class DbvtSettings:
         Signals without their estimated noise, or as measured.
     batch : int
         Pixels in a tile.
-    device, precision : str, {"float64", "float32"}
-        Where to compute, in torch's words ("cpu", "cuda"), and floating-point type.
     """
 
     smoothness: float = 1.0
@@ -86,8 +82,6 @@ class DbvtSettings:
     bend_updates: int = 1
     temperatures_from: str = "corrected"
     batch: int = 512
-    device: str = "cpu"
-    precision: str = "float64"
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and numbers outside their range."""
@@ -108,5 +102,3 @@ class DbvtSettings:
         for name in (*positive, "first_share", "tolerance", "largest_step"):
             planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
         require(self, "dbvt", "margin", 0 < self.margin < 0.5, "lie in (0, 0.5)")
-        if self.device.startswith("cuda"):
-            require_device(self.device, "dbvt")

@@ -3,7 +3,7 @@ r"""The paper's optimiser, algorithm DBVT: smooth signals, noise and emissivitie
 The smooth signal :math:`\tilde I_1(t)`, the offset :math:`\tilde I_2(0)`, both emissivities and the
 noise of every frame minimise five losses (`objective`); the temperatures follow in closed form
 (`calibrated`). The objective is that of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334; the
-search (`newton`) is ours.
+steps of the search are ours.
 
 A random start lies on the wrong side of equal emissivities half of the time, behind a ridge that
 only the reconstruction makes: the other losses have one valley, that of the emission ratio. So a
@@ -12,21 +12,16 @@ doi:10.1137/1.9780898719154). The paper's identities are linear in the temperatu
 nonlinearity of an exact response is taken out of the second band, and the search goes on.
 """
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import torch
-from torch import Tensor
+import numpy.typing as npt
 
 from dbthermal import mixing
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_STD, calibrated
-from dbthermal.separation._dbvt import DbvtSettings, newton, objective
-from dbthermal.separation._dbvt.objective import Images, Unknowns
+from dbthermal.separation._dbvt import DbvtSettings, objective
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
@@ -34,87 +29,16 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5
-# Interval at which finished columns are removed from the search [step].
-_SWEEP: Final = 10
-# Number of torch's threads, which is the process's, before the first of several tiles.
-_THREADS: Final = threading.Lock()
-_BEFORE: Final[list[int]] = []
 
 
 def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
     """Point estimate of one tile; `not_converged` where the kept start was still improving."""
-    ignored = np.errstate(invalid="ignore", divide="ignore", over="ignore")
-    with ignored, torch.inference_mode(), _one_thread():
-        minimum = _search(tile, settings)
-        kept = _least(minimum.loss, tile.signals.shape[-1])
-        return _report(tile, minimum, kept, settings)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Keep torch to the calling thread: tiles run side by side, and its threads would contend."""
-    with _THREADS:
-        _BEFORE.append(torch.get_num_threads())
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        with _THREADS:  # the first tile to begin stored the number that the last to end restores
-            first = _BEFORE[0] if len(_BEFORE) == 1 else 1
-            _BEFORE.pop()
-            torch.set_num_threads(first)
-
-
-@dataclass(frozen=True)
-class Minimum:
-    """End of a search: unknowns, objective (column,) [1], and columns that stopped improving."""
-
-    unknowns: Unknowns
-    loss: Tensor
-    converged: Tensor
-
-
-def homotopy(unknowns: Unknowns, images: Images, settings: DbvtSettings, stages: int) -> Minimum:
-    """Minimise the objective from starts, the reconstruction's weight growing over the stages."""
-    for stage in range(stages - 1):
-        images = _weighted(unknowns, images, settings, stage / (stages - 1))
-        search = newton.begin(unknowns, images, settings)
-        for _ in range(settings.stage_steps):
-            unknowns, search = newton.step(unknowns, search, images, settings)
-    return _last_stage(unknowns, _weighted(unknowns, images, settings, 1.0), settings)
-
-
-def _weighted(
-    unknowns: Unknowns, images: Images, settings: DbvtSettings, progress: float
-) -> Images:
-    """Images with their deviation for the present noise, and the reconstruction's share."""
-    deviation = objective.deviation(
-        images.signals, unknowns.noise, images.sigma, settings.deviation_floor
-    )
-    # share = first^(1 - progress), first = first_share (sigma_2 / deviation_2)^2
-    first = settings.first_share * (images.sigma[1] / deviation[1]) ** 2
-    return replace(images, deviation=deviation, share=first.clamp(max=1.0) ** (1.0 - progress))
-
-
-def _last_stage(unknowns: Unknowns, images: Images, settings: DbvtSettings) -> Minimum:
-    """Steps until no column improves; finished columns are removed at intervals."""
-    search = newton.begin(unknowns, images, settings)
-    columns = torch.arange(search.loss.numel(), device=search.loss.device)
-    state, progress, part = unknowns, search, images
-    for count in range(1, settings.steps + 1):
-        state, progress = newton.step(state, progress, part, settings)
-        last = count == settings.steps
-        if last or count % _SWEEP == 0:
-            unknowns = unknowns.put(columns, state)
-            search = search.put(columns, progress)
-            active = progress.stalled < settings.patience
-            columns = columns[active]
-            if last or not bool(active.any()):
-                break
-            state, progress = state.select(active), progress.select(active)
-            part = part.select(active)
-    converged = (search.stalled >= settings.patience) & torch.isfinite(search.loss)
-    return Minimum(unknowns, search.loss, converged)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        search = Search(tile, settings)
+        loss, converged = search.run()
+        kept = _least(loss, tile.signals.shape[-1])
+        lost = ~np.isfinite(loss[kept])
+        return _report(tile, search, kept, lost, lost | ~converged[kept])
 
 
 def _even(time: Array) -> float:
@@ -128,37 +52,6 @@ def _even(time: Array) -> float:
             f"'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
         )
     return interval
-
-
-def tensors(tile: Tile, columns: int, settings: DbvtSettings) -> Images:
-    """Signals of a tile on the device, for every start; columns are pixels times starts."""
-    one = _tensor(np.ones(columns), settings)
-    signals = _tensor(tile.signals, settings).repeat(1, 1, columns // tile.signals.shape[-1])
-    sigma = torch.stack([noise * one for noise in tile.noise])
-    noise = torch.zeros_like(signals)
-    deviation = objective.deviation(signals, noise, sigma, settings.deviation_floor)
-    return Images(signals, deviation, sigma, one * _even(tile.time), one)
-
-
-def _starts(tile: Tile, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
-    """Starts, and those of them (column,) that are the subspace separator's.
-
-    Columns are the pixels of the first start, of the second, and so on.
-    """
-    frames, pixels = tile.signals.shape[1:]
-    columns = pixels * settings.starts
-    emissivity = tile.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
-    smooth = np.tile(tile.signals[0] * (not settings.smooth_from_zero), settings.starts)
-    informed = np.zeros(columns, dtype=bool)
-    if settings.start == "subspace":
-        informed[:pixels] = _inform(tile, emissivity[:, :pixels], smooth[:, :pixels])
-    # Mean over time of I_2 - k_1 [I1~(t) - I1~(0)]
-    second = np.tile(tile.signals[1], settings.starts)
-    rise = emissivity[1] / emissivity[0] * (smooth - smooth[0])
-    offset = np.mean(second - rise, axis=0) * (not settings.smooth_from_zero)
-    noise = np.zeros((2, frames, columns))
-    parts = (smooth, offset, emissivity, noise)
-    return Unknowns(*(_tensor(part, settings) for part in parts)), informed
 
 
 def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
@@ -175,83 +68,112 @@ def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
     return np.asarray(known)
 
 
-def _tensor(values: Array, settings: DbvtSettings) -> Tensor:
-    dtype: torch.dtype = getattr(torch, settings.precision)
-    return torch.as_tensor(values, dtype=dtype, device=settings.device)
+class Search:
+    """Unknowns of all starts of a tile, see `objective`: those of the first one, and so on."""
+
+    def __init__(self, tile: Tile, settings: DbvtSettings) -> None:
+        """Start at random emissivities, or at the subspace separator's solution."""
+        self.tile, self.settings = tile, settings
+        frames, pixels = tile.signals.shape[1:]
+        columns = pixels * settings.starts
+        emissivity = tile.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
+        smooth = np.tile(tile.signals[0] * (not settings.smooth_from_zero), settings.starts)
+        self.informed = np.zeros(columns, dtype=bool)
+        if settings.start == "subspace":
+            self.informed[:pixels] = _inform(tile, emissivity[:, :pixels], smooth[:, :pixels])
+        # Mean over time of I_2 - k_1 [I1~(t) - I1~(0)]
+        signals = np.tile(tile.signals, settings.starts)
+        rise = emissivity[1] / emissivity[0] * (smooth - smooth[0])
+        offset = np.mean(signals[1] - rise, axis=0) * (not settings.smooth_from_zero)
+        self.rest = np.stack([offset, *emissivity], axis=1)
+        self.signals = np.moveaxis(signals, -1, 0).copy()
+        self.films = np.zeros((columns, 3, frames))
+        self.films[:, 0] = smooth.T
+        values = {name: float(getattr(settings, name)) for name in objective.Weights._fields}
+        values["curvature"] *= _even(tile.time) ** 2
+        self.weights = objective.Weights(**values)
+
+    def run(self) -> tuple[Array, Mask]:
+        """Objective (column,) [1], and columns that stopped improving."""
+        self._minimise(np.where(self.informed, 1, self.settings.stages))
+        once = np.ones(self.informed.size, dtype=np.int64)
+        end, bend = self._minimise(once), np.zeros(self.films[:, 0].shape)
+        for _ in range(self.settings.bend_updates):
+            update = self._nonlinearity()
+            if np.array_equal(update, bend):
+                break
+            self.signals[:, 1] += bend - update
+            bend, end = update, self._minimise(once)
+        return end
+
+    def _minimise(self, stages: npt.NDArray[np.int64]) -> tuple[Array, Mask]:
+        """As `run`, of the images as they are, in a number of stages of each column."""
+        loss, converged = np.empty(len(stages)), np.zeros(len(stages), dtype=bool)
+        for column, number in enumerate(stages):
+            for stage in range(number):
+                progress = stage / (number - 1) if number > 1 else 1.0
+                loss[column], converged[column] = self._descend(column, progress)
+        return loss, converged
+
+    def _descend(self, column: int, progress: float) -> tuple[float, bool]:
+        """Minimise the objective of a column, with the reconstruction's weight of that progress."""
+        settings, sigma, last = self.settings, self.tile.noise, progress == 1.0
+        images, films, rest = self.signals[column], self.films[column], self.rest[column]
+        deviation = [
+            objective.deviation(*band, settings.deviation_floor)
+            for band in zip(images, films[1:], sigma, strict=True)
+        ]
+        # share = first^(1 - progress), first = first_share (sigma_2 / deviation_2)^2
+        first = min(settings.first_share * (sigma[1] / deviation[1]) ** 2, 1.0)
+        scale = objective.Scale(sigma, tuple(deviation), first ** (1.0 - progress))
+        steps = settings.steps if last else settings.stage_steps
+        patience = settings.patience if last else steps + 1
+        found = objective.descend(films, rest, images, scale, self.weights, steps, patience)
+        self.films[column], self.rest[column], loss, converged = found
+        return loss, converged
+
+    def _nonlinearity(self) -> Array:
+        r"""Departure of the second band from the linear identities (column, time) [K].
+
+        .. math:: e_2 [u_2(x) - u_1(x)] + (1 - e_2) [u_2(y) - u_1(y)]
+
+        Zero where a temperature leaves the range of the response, and for a linear one.
+        """
+        tile, (_, one, other) = self.tile, self.rest.T[..., np.newaxis]
+        first, second = np.moveaxis(self.signals - self.films[:, 1:], 1, 0)
+        inside, departures = np.ones(len(first), dtype=bool), []
+        # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
+        for ratio in ((1 - other) / (1 - one), other / one):
+            signal = (second - ratio * first) / (1 - ratio)
+            temperature = tile.temperature(0, signal)
+            curve = tile.curves[0]
+            inside &= np.all((temperature >= curve.lowest) & (temperature <= curve.highest), axis=1)
+            departures.append(tile.blackbody(1, temperature) - signal)
+        return np.where(inside[:, np.newaxis], mixing.mixed(other, *departures), 0.0)
 
 
-def _search(tile: Tile, settings: DbvtSettings) -> Minimum:
-    """Minimum of every start: random ones by homotopy, informed ones without."""
-    unknowns, informed = _starts(tile, settings)
-    images = tensors(tile, informed.size, settings)
-    for mask, stages in ((~informed, settings.stages), (informed, 1)):
-        columns = torch.as_tensor(np.flatnonzero(mask), device=images.share.device)
-        if columns.numel():
-            part = homotopy(unknowns.select(columns), images.select(columns), settings, stages)
-            unknowns = unknowns.put(columns, part.unknowns)
-    minimum = homotopy(unknowns, images, settings, 1)
-    bend = np.zeros(unknowns.smooth.shape)
-    for _ in range(settings.bend_updates):
-        update = _nonlinearity(tile, minimum.unknowns, images, bend)
-        if np.array_equal(update, bend):
-            break
-        bend = update
-        signals = torch.stack([images.signals[0], images.signals[1] - _tensor(bend, settings)])
-        minimum = homotopy(minimum.unknowns, replace(images, signals=signals), settings, 1)
-    return minimum
-
-
-def _nonlinearity(tile: Tile, unknowns: Unknowns, images: Images, bend: Array) -> Array:
-    r"""Departure of the second band from the linear identities (time, column) [K].
-
-    .. math:: e_2 [u_2(x) - u_1(x)] + (1 - e_2) [u_2(y) - u_1(y)]
-
-    Zero where a temperature leaves the range of the response, and for a linear one.
-    """
-    emissivity = _array(unknowns.emissivity)
-    first, second = _array(images.signals - unknowns.noise)
-    second = second - bend
-    emission, reflection = emissivity[1] / emissivity[0], (1 - emissivity[1]) / (1 - emissivity[0])
-    inside, departures = np.ones(bend.shape[1], dtype=bool), []
-    # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
-    for ratio in (reflection, emission):
-        signal = (second - ratio * first) / (1 - ratio)
-        temperature = tile.temperature(0, signal)
-        curve = tile.curves[0]
-        inside &= np.all((temperature >= curve.lowest) & (temperature <= curve.highest), axis=0)
-        departures.append(tile.blackbody(1, temperature) - signal)
-    return np.where(inside, mixing.mixed(emissivity[1], *departures), 0.0)
-
-
-def _least(loss: Tensor, pixels: int) -> Tensor:
+def _least(loss: Array, pixels: int) -> npt.NDArray[np.intp]:
     """Column of the start of least objective, for each pixel."""
-    finite = torch.where(torch.isfinite(loss), loss, torch.inf).reshape(-1, pixels)
-    place = torch.arange(pixels, device=loss.device)
-    return finite.argmin(dim=0) * pixels + place
+    finite = np.where(np.isfinite(loss), loss, np.inf).reshape(-1, pixels)
+    return np.asarray(finite.argmin(axis=0) * pixels + np.arange(pixels))
 
 
-def _report(tile: Tile, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Estimate:
+def _report(
+    tile: Tile, search: Search, kept: npt.NDArray[np.intp], lost: Mask, unfinished: Mask
+) -> Estimate:
     """Temperatures at the emissivities of the kept columns, by the calibrated closed form."""
-    unknowns = minimum.unknowns.select(kept)
-    emissivity = _array(unknowns.emissivity)
-    lost = ~np.isfinite(_array(minimum.loss[kept]))
-    signals = tile.signals
-    if settings.temperatures_from == "corrected":
-        signals = signals - _array(unknowns.noise)
+    emissivity, signals = search.rest[kept, 1:].T, tile.signals
+    if search.settings.temperatures_from == "corrected":
+        signals = signals - np.moveaxis(search.films[kept, 1:], 0, -1)
     solution = calibrated.separate(
         replace(tile, signals=signals, emissivity=emissivity, emissivity_covariance=None),
         calibrated.CalibratedSettings(smooth=False),
     )
-    unfinished: Mask = lost | ~minimum.converged[kept].cpu().numpy()
     return replace(
         solution,
         **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
         status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
     ).undefine(lost, lost, lost)
-
-
-def _array(values: Tensor) -> Array:
-    return np.asarray(values.cpu().numpy(), dtype=np.float64)
 
 
 METHOD: Final = Method(

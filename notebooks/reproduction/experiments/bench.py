@@ -10,6 +10,7 @@ temperature the method is right within 0.01.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -47,7 +48,8 @@ OBJECTS: Final = (
 its reference values for 8-14 um; the rest is this project's choice."""
 
 
-def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
+@cache
+def band_emissivity(sample: Sample, names: tuple[str, ...]) -> xr.DataArray:
     """True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
 
     The sample's own value for 8-14 um times the ratio of its kin's: of the emissivities where the
@@ -55,10 +57,11 @@ def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
     result stays between 0 and 1.
     """
     kin = embedded_table()["emissivity"].sel(material=sample.kin, drop=True)
+    own = kin.sel(band=list(names))
     if sample.emissivity < 0.5:
-        value = sample.emissivity * kin.sel(band=names) / float(kin.sel(band=_CAMERA_BAND))
+        value = sample.emissivity * own / float(kin.sel(band=_CAMERA_BAND))
     else:
-        ratio = (1.0 - kin.sel(band=names)) / (1.0 - float(kin.sel(band=_CAMERA_BAND)))
+        ratio = (1.0 - own) / (1.0 - float(kin.sel(band=_CAMERA_BAND)))
         value = 1.0 - (1.0 - sample.emissivity) * ratio
     return value.assign_attrs(units="1")
 
@@ -140,7 +143,7 @@ def bench_series(
     stray = rng.uniform(0.0, sample.stray)
     room = _blackbody(curves, np.full_like(cold, bench.air_temperature))
     reflected = (1.0 - stray) * _blackbody(curves, cold) + stray * room
-    share = band_emissivity(sample, [curve.band for curve in curves]).values[:, np.newaxis]
+    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
     counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
     shown = cold + rng.uniform(-1, 1) * bench.blackbody_tolerance
     read = {
@@ -186,7 +189,7 @@ def reflector_series(
     stray = rng.uniform(0.0, sample.stray)
     mirrored = _blackbody(curves, air + rng.uniform(*bench.mirrored_excess))
     reflected = (1.0 - stray) * mirrored + stray * _blackbody(curves, air)
-    share = band_emissivity(sample, [curve.band for curve in curves]).values[:, np.newaxis]
+    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
     counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
     uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
     emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
@@ -201,7 +204,7 @@ def reflector_series(
 
 def _curves(response: xr.Dataset) -> list[Curve]:
     """Response curve of each band."""
-    return [responses.curve(response, str(name)) for name in response["band"].values]
+    return responses.curves(response, [str(name) for name in response["band"].values])
 
 
 def _blackbody(curves: list[Curve], temperature: Array) -> Array:

@@ -16,6 +16,9 @@ MOVING: Final = 0.5
 WRONG: Final = 0.1
 """Error of an emissivity from which it is called wrong [1]."""
 
+EVERY: Final = 5
+"""A method that looks at whole images, each by itself, gets the first of so many frames."""
+
 Options = Mapping[str, Any]
 
 
@@ -47,8 +50,9 @@ def compare(
     The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
     variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
     same number of pixels, drawn from those in which the reflection varies by more than `MOVING`;
-    methods that treat each pixel alone get these only. The noise of the two bands [K] is known to
-    all, the emissivities [1] to "calibrated" alone. Variables of `judge` over (variant, ...).
+    methods that treat each pixel alone get these only, the others every fifth frame (`EVERY`). The
+    noise of the two bands [K] is known to all, the emissivities [1] to "calibrated" alone.
+    Variables of `judge` over (variant, ...).
     """
     rng, settings = np.random.default_rng(seed), Plate(**plate)
     rig = Rig(bands=settings.bands, noise=tuple(noise))
@@ -60,7 +64,8 @@ def compare(
     capture = simulation.observe(scene, response, rng)
     chosen = _choose(scene, pixels, rng)
     truth = _strip(scene, chosen)
-    images, strips = (scene, capture), (truth, _strip(capture, chosen))
+    images = [part.isel(time=slice(None, None, EVERY)) for part in (scene, capture)]
+    strips = [truth, _strip(capture, chosen)]
     rows = []
     for options in variants.values():
         whole = separation.get_method(options["method"]).whole_image

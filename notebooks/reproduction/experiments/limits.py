@@ -118,7 +118,7 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
 
 
 def pooled(
-    size: int,
+    sizes: Sequence[int],
     emissivity: Sequence[float],
     *,
     ends: Sequence[float],
@@ -128,7 +128,7 @@ def pooled(
 ) -> xr.Dataset:
     r"""Error of the reflection ratio in groups of pixels that are known to be of one material.
 
-    All pixels are of one material, in whole groups of a size that share their ratio; 1 is no
+    All pixels are of one material, in whole groups of each `size` that share their ratio; 1 is no
     pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
     share. Other parameters as for `near_bound`, of the default `Rig`.
 
@@ -140,17 +140,28 @@ def pooled(
         `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
         separation's own standard deviation of the ratio, root mean square; `flagged` [1].
     """
-    if size < 1 or pixels % size:
-        raise ValueError(f"Invalid size {size} of a group. Must divide the {pixels} pixels.")
+    uneven = [size for size in sizes if size < 1 or pixels % size]
+    if uneven:
+        raise ValueError(f"Invalid size {uneven[0]} of a group. Must divide the {pixels} pixels.")
     rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
     truth, capture, response = cases.simulate(case, rig, _times(clock), pixels, seed)
-    labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
-    result = separation.solve(capture, response, pool=None if size == 1 else labels)
     linear = _as_line(response, rig)
     bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
+    single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
+    ratio, parts = limits.reflection_ratio(list(emissivity)).item(), []
+    for size in sizes:
+        labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
+        result = separation.solve(capture, response, pool=None if size == 1 else labels)
+        parts.append(_of_groups(size, truth, result, ratio))
+        parts[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+    groups = xr.concat(parts, xr.DataArray(list(sizes), dims="size", name="size"))
+    return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
+
+
+def _of_groups(size: int, truth: xr.Dataset, result: xr.Dataset, ratio: float) -> xr.Dataset:
+    """Errors of `pooled` in groups of one size, of a material with a reflection ratio."""
     of_groups = {
-        "reflection_ratio_error": result["reflection_ratio"]
-        - limits.reflection_ratio(list(emissivity)).item(),
+        "reflection_ratio_error": result["reflection_ratio"] - ratio,
         "stated": result["reflection_ratio_std"],
     }
     # The median, for a pixel that the separation excludes from its group keeps a separate ratio.
@@ -158,14 +169,12 @@ def pooled(
         name: _rms(_row(part.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
         for name, part in of_groups.items()
     }
-    single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
     error = result["object_temperature"] - truth["object_temperature"]
-    measured["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
     measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
         units="K"
     )
     measured["flagged"] = (result["status"] != 0).mean().assign_attrs(units="1")
-    return xr.Dataset(measured).drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
+    return xr.Dataset(measured)
 
 
 def stressed(

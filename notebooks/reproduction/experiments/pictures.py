@@ -102,15 +102,18 @@ class Picture:
         def mirrored(rows: Array, columns: Array) -> Array:
             result = np.full((time.size, *rows.shape), ROOM)
             for x, y, half, tall, warmer in people:
-                u = (columns - x[:, None, None]) / half
-                v = (rows - y[:, None, None]) / tall
+                # Frames in which it is near enough to be more than rounding.
+                away = np.maximum(columns.min() - x, x - columns.max()) / half - 1.0
+                seen = np.flatnonzero(away * min(half, tall) < 50.0 * self.sharpness)
+                u = (columns - x[seen, None, None]) / half
+                v = (rows - y[seen, None, None]) / tall
                 # Distance from the outline of an ellipse, to first order [pixel].
                 radius = np.hypot(u, v) + 1e-9
                 slope = np.hypot(u / half, v / tall) / radius
                 outside = (radius - 1.0) / slope
                 inside = 1.0 / (1.0 + np.exp(np.clip(outside / self.sharpness, -50.0, 50.0)))
                 warmth = warmer * (1.0 + 0.3 * np.sin(3.0 * u + 1.0) * np.cos(4.0 * v))
-                result += (warmth + ROOM - result) * inside
+                result[seen] += (warmth + ROOM - result[seen]) * inside
             if edge:
                 result = ROOM + (result - ROOM) / (1.0 + np.exp((edge - columns) / 0.7))
             return result

@@ -91,10 +91,10 @@ def _true(response: xr.Dataset, repeats: int) -> xr.DataArray:
         raise ValueError(
             f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. Must be twice or more."
         )
-    names = [str(name) for name in response["band"].values]
+    names = tuple(str(name) for name in response["band"].values)
     return xr.DataArray(
         [band_emissivity(sample, names).values for sample in OBJECTS],
-        coords={"object": [sample.name for sample in OBJECTS], "band": names},
+        coords={"object": [sample.name for sample in OBJECTS], "band": list(names)},
         attrs={"units": "1"},
     )
 

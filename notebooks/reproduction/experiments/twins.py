@@ -44,22 +44,22 @@ def judge_twin(
     shape: Sequence[int],
     clock: Sequence[float],
     baseline: float = 0.0,
-    registration: Registration = "perfect",
+    registrations: Sequence[Registration] = ("perfect",),
 ) -> xr.Dataset:
     """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
     One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, a
     number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are
-    registered perfectly or as found (`twins.registered`), and by two at the first one's place. Of
+    registered in some ways (`twins.registered`), and by two at the first one's place. Of
     the variants (see `at_thermocouple`), "calibrated" gets the emissivities that the bench finds
     for a piece of the same material, with their deviations.
 
     Returns
     -------
     Dataset
-        Over `cameras`, "side by side" (with a baseline) and "one place": variables of
+        Over `cameras`, the registrations (with a baseline) and "one place": variables of
         `at_thermocouple`; over the `way`, "alone" by `solve`, "pooled" and "completed" by
-        `separate` (side by side only), those of `over_the_image`; `resting` [1], the share of the
+        `separate` (with a baseline), those of `over_the_image`; `resting` [1], the share of the
         pixels whose object changes by less than `RESTING`, where two bands leave the emissivity
         open; `emissivity_difference` (band) [1], mean magnitude of the default method's emissivity
         less the calibrated one over the pixels without a flag.
@@ -74,8 +74,8 @@ def judge_twin(
     }
     views = {"one place": simulation.observe(scene, response, rng)}
     if baseline:
-        apart = twins.registered(scene, twins.observe(scene, response, rng), registration)
-        views = {"side by side": apart} | views
+        apart = twins.observe(scene, response, rng)
+        views = {how: twins.registered(scene, apart, how) for how in registrations} | views
     parts = []
     for cameras, corrected in views.items():
         shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None

@@ -146,7 +146,7 @@ def _rendered(
 
     def pixels(values: Array) -> Array:
         grid = values.reshape(-1, rows * rays, columns * rays)
-        parts = (down[:, n::rays] @ grid[:, n::rays] @ right[n].T for n in range(rays))
+        parts = (down[:, n::rays] @ (grid[:, n::rays] @ right[n].T) for n in range(rays))
         return np.asarray(sum(parts))
 
     warm, cold = np.empty((2, capture.time.size, *camera.shape))
