@@ -142,10 +142,12 @@ def piecewise(
 
 
 @compiled
-def _make_orthonormal(columns: Array, own: Array) -> None:
-    """Make a function (time) orthogonal to columns (column, time) and of length 1, in place."""
+def _make_orthonormal(columns: Array, degree: int, start: int, stop: int) -> None:
+    """Make a column (column, time) orthogonal to those before it and of length 1, in place."""
+    own = columns[degree, start:stop]
     for _ in range(2):  # once more, against rounding
-        for other in columns:
+        for k in range(degree):
+            other = columns[k, start:stop]
             product = 0.0
             for t in range(own.size):
                 product += other[t] * own[t]
@@ -154,8 +156,9 @@ def _make_orthonormal(columns: Array, own: Array) -> None:
     square = 0.0
     for t in range(own.size):
         square += own[t] ** 2
+    length = np.sqrt(square)
     for t in range(own.size):
-        own[t] /= np.sqrt(square)
+        own[t] /= length
 
 
 @compiled
@@ -178,17 +181,18 @@ def _polynomials(
         start, stop, count = edges[piece], edges[piece + 1], counts[piece]
         middle = 0.5 * (time[start] + time[stop - 1])
         ends = (1.0 if piece > 0 else 0.0) + (1.0 if piece < counts.size - 1 else 0.0)
-        chosen[start:stop] = 1.0 + 0.5 * CHANGE_POINT * ends / count
-        leverage[start:stop] = 0.0
+        factor = 1.0 + 0.5 * CHANGE_POINT * ends / count
+        chosen[start:stop] = factor
+        at, over = time[start:stop], leverage[start:stop, 0]
+        over[:] = 0.0
         for degree in range(count):
             own = columns[column + degree, start:stop]
+            before = columns[column + max(degree - 1, 0), start:stop]
             for t in range(own.size):
-                own[t] = 1.0
-                if degree > 0:
-                    own[t] = (time[start + t] - middle) * columns[column + degree - 1, start + t]
-            _make_orthonormal(columns[column : column + degree, start:stop], own)
+                own[t] = (at[t] - middle) * before[t] if degree > 0 else 1.0
+            _make_orthonormal(columns[column:], degree, start, stop)
             for t in range(own.size):
-                leverage[start + t, 0] += chosen[start + t, 0] * own[t] ** 2
+                over[t] += factor * own[t] ** 2
             spans[column + degree, 0], spans[column + degree, 1] = start, stop
         column += count
 

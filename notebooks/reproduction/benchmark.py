@@ -91,7 +91,9 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     glass: dict[str, Any] = {"emissivity": list(EMISSIVITY[:bands]), "start": 20, "stop": 60}
     row = experiments.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
     rng, counts = np.random.default_rng(1), row["counts"].values.reshape(bands, frames, few)
-    movie = np.stack([counts[..., rng.permutation(few)] for _ in range(pixels // few)], axis=2)
+    # Frames as a store gives them: an index of NumPy would leave pixels the slowest axis.
+    some = [counts.take(rng.permutation(few), axis=2) for _ in range(pixels // few)]
+    movie = np.stack(some, axis=2)
     films = {"counts": (("band", "time", "y", "x"), movie, row["counts"].attrs)}
     return xr.Dataset(films, coords={"band": row["band"], "time": row["time"]})
 

@@ -243,13 +243,18 @@ def test_rank_without_sorting() -> None:
             assert value == pytest.approx(np.sort(single)[rank], rel=1e-6)
 
 
-@pytest.mark.parametrize("way", ["plain", "uneven", "steps", "known", "short"])
+@pytest.mark.parametrize("way", ["plain", "uneven", "steps", "known", "short", "long"])
 def test_compiled_divisions_are_those_of_arrays(way: str) -> None:
     """Objects that change rapidly, beside walkers: the same pieces, and costs but for rounding."""
     tile, rng = tile_of(), np.random.default_rng(4)
-    frames = 60 if way == "short" else TIME.size
-    time = TIME[:frames] if way != "uneven" else np.sort(rng.choice(4 * frames, frames, False)) / 40
-    signals = tile.signals[:, :frames].copy()
+    frames = {"short": 60, "long": 3000}.get(way, TIME.size)
+    time = np.arange(frames) / 10.0
+    if way == "uneven":
+        time = np.sort(rng.choice(4 * frames, frames, False)) / 40
+    signals = np.resize(tile.signals.swapaxes(0, 1), (frames, 2, 48)).swapaxes(0, 1).copy()
+    if way == "long":  # pieces of more frames than are summed up together
+        noise = np.array(tile.noise)[:, np.newaxis, np.newaxis]
+        signals = signals.mean(axis=1, keepdims=True) + noise * rng.normal(size=signals.shape)
     for pixel in range(48):
         at = rng.integers(5, frames - 5)
         rise = 1.0 - np.exp(-np.arange(frames - at) / rng.uniform(1.0, 40.0))

@@ -223,7 +223,8 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     films = {name: getattr(solution, name) for name in FILMS}
     for name, film in films.items():
         without = undefined if name.startswith("object") else no_background
-        np.copyto(film, np.nan, where=without)
+        if without.any():
+            np.copyto(film, np.nan, where=without)
     covariance = np.where(unidentified, np.nan, solution.emissivity_covariance)
     result = Estimate(
         **films,

@@ -229,11 +229,13 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     # A clock of bursts has a median far below its mean.
     frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * AROUND / usual))))
     step = np.abs(np.diff(curve, axis=0))
-    size = (frames, 1)
-    around = maximum_filter(curve, size)[1:] - minimum_filter(curve, size)[1:]
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
-    jumps = (step > CHANGE * noise) & (step > _MOST * around)
-    return np.asarray(np.any(jumps[interval < 2.0 * usual], axis=0))
+    jumps = (step > CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
+    result = np.any(jumps, axis=0)
+    some, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
+    around = maximum_filter(some, size)[1:] - minimum_filter(some, size)[1:]
+    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * around), axis=0)
+    return np.asarray(result)
 
 
 def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
