@@ -298,9 +298,8 @@ def cut(
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
 
-    @cache
+    @cache  # and never read where all that is wanted of it is kept
     def load() -> tuple[xr.Dataset, list[Grain]]:
-        """Read the block, unless all of it is kept, and how its samples are rounded."""
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
@@ -315,8 +314,9 @@ def cut(
             view = loaded.isel(y=local, x=window[1])
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
-            counts, usable, valid = counts[..., some], usable[:, some], valid[:, some]
-            status = status[some]
+            if wanted is not None:
+                samples = (counts, usable, valid, status)
+                counts, usable, valid, status = (select(one, some) for one in samples)
         else:
             counts, usable, valid, status, gain = displaced.paired(
                 load, displacement, window[0], source, some, method.minimum_frames
