@@ -80,7 +80,7 @@ def divide(
         within=np.empty((2**_WITHIN, axes)),
         halved=np.empty(count, dtype=bool),
         starting=np.empty(axes),
-        joined=joining.scratch(count // 2 + 1, tree.event),
+        joined=_joining(count // 2 + 1, tree.event),
         reached=np.empty(count, np.intp),
         cheapest=np.empty(count),
         taken=np.empty((pieces.AXES, 2)),
@@ -91,6 +91,30 @@ def divide(
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
     _divide(tree, np.ascontiguousarray(signals), noise, ratio, scratch, first, cost)
     return [pieces.Division(*one) for one in zip(first.mT, cost, strict=True)]
+
+
+def _joining(most: int, event: Mask) -> joining.Scratch:
+    """Work space for pieces that may begin with so many frames, at most."""
+    parts = most + int(event.sum()) + event.size // joining.LONGEST
+    functions = pieces.FUNCTIONS + int(event.sum())
+    degrees = (parts, pieces.FUNCTIONS)
+    return joining.Scratch(
+        begins=np.empty(parts + 1, np.intp),
+        edges=np.empty(most + 1, np.intp),
+        middle=np.empty(parts),
+        half=np.empty(parts),
+        beside=np.empty(parts),
+        products=np.empty(degrees),
+        centre=np.empty(degrees),
+        length=np.empty(degrees),
+        basis=np.empty((pieces.FUNCTIONS, joining.LONGEST)),
+        equations=np.empty((functions, functions)),
+        right=np.empty(functions),
+        powers=np.empty((pieces.FUNCTIONS, pieces.FUNCTIONS)),
+        row=np.empty(functions),
+        least=np.empty(most + 1),
+        before=np.empty(most + 1, np.intp),
+    )
 
 
 @lru_cache(maxsize=4)

@@ -18,7 +18,8 @@ from dbthermal.separation._subspace import kernels, pieces
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._tiles import Whole
 
-_LONGEST: Final = 1024  # frames of a part, whose polynomials stay in the cache
+LONGEST: Final = 1024
+"""Frames of a part, at most, whose polynomials stay in the cache."""
 
 
 class Scratch(NamedTuple):
@@ -39,30 +40,6 @@ class Scratch(NamedTuple):
     row: Array  # equation that is added (function)
     least: Array  # least cost up to each edge, and the edge before it
     before: Whole
-
-
-def scratch(most: int, event: Mask) -> Scratch:
-    """Work space for pieces that may begin with so many frames, at most."""
-    parts = most + int(event.sum()) + event.size // _LONGEST
-    functions = pieces.FUNCTIONS + int(event.sum())
-    degrees = (parts, pieces.FUNCTIONS)
-    return Scratch(
-        begins=np.empty(parts + 1, np.intp),
-        edges=np.empty(most + 1, np.intp),
-        middle=np.empty(parts),
-        half=np.empty(parts),
-        beside=np.empty(parts),
-        products=np.empty(degrees),
-        centre=np.empty(degrees),
-        length=np.empty(degrees),
-        basis=np.empty((pieces.FUNCTIONS, _LONGEST)),
-        equations=np.empty((functions, functions)),
-        right=np.empty(functions),
-        powers=np.empty((pieces.FUNCTIONS, pieces.FUNCTIONS)),
-        row=np.empty(functions),
-        least=np.empty(most + 1),
-        before=np.empty(most + 1, np.intp),
-    )
 
 
 @compiled
@@ -154,7 +131,7 @@ def _split(event: Mask, scratch: Scratch, begins: Mask) -> tuple[int, int]:
         if begins[t]:
             edges[count] = parts
             count += 1
-        if begins[t] or event[t] or t - begun[max(parts - 1, 0)] == _LONGEST:
+        if begins[t] or event[t] or t - begun[max(parts - 1, 0)] == LONGEST:
             begun[parts] = t
             parts += 1
     edges[count], begun[parts] = parts, begins.size
