@@ -26,6 +26,8 @@ Labels = npt.NDArray[np.intp]
 
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
+# Samples of a band in these rows, at most: of a long capture they are fewer.
+_TOGETHER: Final = 2**24
 
 # Pixels from which the noise is estimated, and a clock is judged.
 _NOISE_PIXELS, _CLOCK_PIXELS = 4096, 256
@@ -80,7 +82,9 @@ class Inputs:
     def blocks(self) -> list[slice]:
         """Rows that are read at once."""
         height = self.capture.sizes["y"]
-        rows = height if self.method.whole_image else BLOCK_ROWS
+        row = self.capture.sizes["time"] * self.capture.sizes["x"]
+        fitting = max(1, min(BLOCK_ROWS, _TOGETHER // row))
+        rows = height if self.method.whole_image else fitting
         return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
     def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:

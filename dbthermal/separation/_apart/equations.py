@@ -18,7 +18,7 @@ from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart.displaced import without
-from dbthermal.separation._inputs import BLOCK_ROWS, Inputs
+from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.reflection_ratio import (
     HIGHEST_ORDER,
     null_combination,
@@ -297,10 +297,9 @@ def first_band(
     first, steps = np.empty((2, frames.size, height * width))
     change, unknown = np.zeros((loose.size, basis.shape[1])), np.zeros(loose.size, dtype=bool)
     (energy, lagged), largest = np.zeros((2, loose.size)), 0.0
-    for top in range(0, height, BLOCK_ROWS):
-        rows = slice(top, min(top + BLOCK_ROWS, height))
-        source, chosen = displacement.source(rows), (loose // width >= top)
-        chosen &= loose // width < rows.stop
+    for rows in inputs.blocks:
+        top, source = rows.start, displacement.source(rows)
+        chosen = (loose // width >= top) & (loose // width < rows.stop)
         counts = capture["counts"].isel(band=displacement.reference, y=source).values
         counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
         signal = curve.linearise(counts) - curve.reference

@@ -34,7 +34,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours
 from dbthermal.separation._apart.equations import Floats, Mask, Whole
-from dbthermal.separation._inputs import BLOCK_ROWS, Inputs
+from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Material
@@ -100,9 +100,8 @@ class Joint:
         time, std = self.inputs.capture["time"].values, self.result["object_temperature_std"].values
         background = self.result["background_temperature"].values
         basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
-        parts = [slice(top, top + BLOCK_ROWS) for top in range(0, len(status), BLOCK_ROWS)]
         every = []
-        for part in parts:
+        for part in self.inputs.blocks:
             film = background[:, part].reshape(time.size, -1).astype(np.float64)
             every.append(basis.T @ system.bridge(film, np.ones(film.shape[1], dtype=bool)))
             release()
@@ -121,7 +120,7 @@ class Joint:
             for axis, one in zip((1, 2), off, strict=True)
         ]
         factor = self.factor.reshape(status.shape)
-        for part in parts:
+        for part in self.inputs.blocks:
             squares = [np.tensordot(basis, one[:, part], 1) ** 2 for one in slopes]
             std[:, part] = np.sqrt(factor[part] * std[:, part] ** 2 + sum(squares))
             release()
