@@ -102,7 +102,7 @@ def peak(folder: Path, fitted: xr.Dataset, response: xr.Dataset, options: dict[s
 def test_memory_of_long_captures(tmp_path: Path) -> None:
     """Rows of 640 pixels at 60 Hz for 35 s, cameras apart, from raw counts: at most 6 GB.
 
-    Blocks of 32 rows are held, and a few hundred bytes of each pixel: 512 rows add some 0.2 GB.
+    Of these rows; more of them add some 4 kB a pixel.
     """
     rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (3, -2), "late": 1, "shutter": (0.4,)}
     recording = whole.record(
