@@ -19,7 +19,6 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
@@ -39,6 +38,8 @@ _LOOKED_AT: Final = 2000
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought,
 # if it is that by more than so many of its standard deviations.
 _APART, _SIGMAS = 0.02, 3.0
+# Bits of pixels around an object, which a registration leaves without samples.
+_UNMEASURED: Final = np.uint32(schema.UNMEASURED)
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
 # displacement is looked for [pixel]; deviations and pixels from which it is one, and by how many
 # times their variance has to exceed that of noise, in every direction.
@@ -210,30 +211,34 @@ def cameras_apart(
     Of some pixels, for all would take long; and the share of them without a flag. Slow reflections
     are simultaneous within a frame though they are apart: then the share of windows displaced.
     """
-    corrected, every = _measured(corrected, _every(corrected))
-    some = solve(corrected.isel(y=every, x=every).load(), response, workers=workers)
+    corrected, some = _measured(corrected)
+    some = solve(some, response, workers=workers)
     apart, moving = _pixels_apart(some)
     chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
     share = apart / moving if apart / moving > _APART + chance else 0.0
     return share or _displaced(corrected, response), _unflagged(some)
 
 
-def _every(corrected: xr.Dataset) -> slice:
-    """Rows and columns of some pixels, spread over the image."""
-    pixels = corrected.sizes["y"] * corrected.sizes["x"]
-    return slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
-
-
-def _measured(corrected: xr.Dataset, every: slice) -> tuple[xr.Dataset, slice]:
+def _measured(corrected: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Rows and columns with samples, as of an object in a part of the image; some pixels of it."""
-    counts = corrected["counts"].isel(y=every, x=every).values
-    known = schema.measured(counts).all(axis=0).any(axis=0)
-    places = [np.flatnonzero(known.any(axis=axis)) * every.step for axis in (1, 0)]
+    step = _step(corrected)
+    some = corrected.isel(y=slice(None, None, step), x=slice(None, None, step)).load()
+    known = schema.measured(some["counts"].values).all(axis=0).any(axis=0)
     if not known.any():
-        return corrected, every
-    rows, columns = (slice(one[0], one[-1] + every.step) for one in places)
-    inside = corrected.isel(y=rows, x=columns)
-    return inside, _every(inside)
+        return corrected, some
+    places = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
+    (top, left), (bottom, right) = ([one[0] for one in places], [one[-1] + 1 for one in places])
+    inside = corrected.isel(y=slice(top * step, bottom * step), x=slice(left * step, right * step))
+    if (finer := _step(inside)) == step:
+        return inside, some.isel(y=slice(top, bottom), x=slice(left, right))
+    every = slice(None, None, finer)
+    return inside, inside.isel(y=every, x=every).load()
+
+
+def _step(corrected: xr.Dataset) -> int:
+    """Rows and columns from one to the next of some pixels that are looked at."""
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    return max(1, int(np.sqrt(pixels / _LOOKED_AT)))
 
 
 def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
@@ -285,13 +290,15 @@ def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
 
 
 def _unflagged(result: xr.Dataset) -> float:
-    """Share of the pixels without a flag."""
-    return float((result["status"].values == 0).mean())
+    """Share of the pixels with samples that have no flag."""
+    status = result["status"].values
+    measured = (status & _UNMEASURED) == 0
+    return float((status == 0).sum() / max(int(measured.sum()), 1))
 
 
 def _pixels_apart(result: xr.Dataset) -> tuple[int, int]:
     """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1."""
     status = result["status"].values
-    moving = ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0) & ~quality.unusable(status)
+    moving = (status & (_UNMEASURED | np.uint32(Status.NO_BACKGROUND_MOTION))) == 0
     apart = (status & np.uint32(Status.BANDS_APART)) != 0
     return int((apart & moving).sum()), max(int(moving.sum()), 1)

@@ -8,7 +8,7 @@ from test_displaced import SMALL, film
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation._separate import cameras_apart
+from dbthermal.separation._separate import _unflagged, cameras_apart
 from reproduction.experiments.pictures import smooth_shift
 
 RIG = simulation.Rig()
@@ -183,6 +183,11 @@ def test_what_has_no_samples_hides_no_displacement(slow: bool) -> None:
         capture = film(SMALL, smooth_shift(SMALL.shape, 2.4, 1.2), 4)[1]
     around = {dim: (capture.sizes[dim], 5 * capture.sizes[dim]) for dim in ("y", "x")}
     padded = capture.drop_vars(["y", "x"], errors="ignore").pad(around, constant_values=np.nan)
-    shares = [cameras_apart(one, RIG.response())[0] for one in (capture, padded)]
+    shares, good = zip(
+        *(cameras_apart(one, RIG.response()) for one in (capture, padded)), strict=True
+    )
     print(f"{shares[0]:.2f} of the pixels apart, {shares[1]:.2f} in a part of the image")
     assert min(shares) > 0.3
+    # What a shift leaves without a flag is compared with this, of other pixels of the same scene.
+    every = _unflagged(separation.solve(padded, RIG.response()))
+    np.testing.assert_allclose(good, every, rtol=0, atol=0.05)
