@@ -134,8 +134,7 @@ def piecewise(
         with_object[size:] -= np.linalg.solve(triangle.T, camera)
         leverage += chosen * (with_object[size:].T ** 2).sum(axis=1, keepdims=True)
         # Four columns are taken together, from the first one's begin to the last one's end.
-        last = spans[max(size - 3, 0) :]
-        last[len(last) - len(steps) :] = inside.start
+        spans[size:, 0], last = inside.start, spans[max(size - 3, 0) :]
         last[:, 0], last[:, 1] = np.minimum(last[:, 0], inside.start), time.size
         object_part = with_object.T
     return Subspace(functions, object_part, len(together) - 1, rising, spans, leverage)

@@ -48,8 +48,7 @@ TAIL: Final = 3.0
 
 
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
-"""Counts (band, time, pixel) [count], samples that are valid or bridged (time, pixel), those that
-are valid, status (pixel), and the noise (2, pixel) [1] over that of a sample, see `read`."""
+"""Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
 
 
 @dataclass(frozen=True)
@@ -206,8 +205,7 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    If they are not kept, the rows of the source are read, and how they are rounded. All pixels are
-    kept of a small capture alone.
+    The source is read if they are not kept; all pixels are kept of a small capture alone.
     """
     films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
     chosen = (*key, None if isinstance(some, slice) else some.tobytes())

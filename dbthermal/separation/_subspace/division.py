@@ -222,9 +222,9 @@ def _best(tree: Tree, scratch: Scratch) -> None:
 
 
 @compiled
-def _best_within(tree: Tree, scratch: Scratch, root: int, pieces_: int, least: Array) -> None:
+def _best_within(tree: Tree, scratch: Scratch, root: int, end: int, least: Array) -> None:
     """As `_best`, of the levels from a piece downwards that have less than so many pieces."""
-    weights, inner, level = scratch.weights, len(tree.edges) // 2, pieces_ // 2
+    weights, inner, level = scratch.weights, len(tree.edges) // 2, end // 2
     while level > 0:
         for k in range(level):
             i, here = (root + 1) * level - 1 + k, level - 1 + k
