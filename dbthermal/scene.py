@@ -4,7 +4,8 @@
 step. With a target on disk its films are there, too, and it works in the memory of some rows.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -14,7 +15,8 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import _rows, schema, store
-from dbthermal._arrays import made_on_disk, on_disk, release
+from dbthermal._arrays import Mask, made_on_disk, on_disk, release
+from dbthermal._warnings import warned
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
@@ -30,10 +32,10 @@ __dir__ = __all__.copy
 # image.
 _PIXELS: Final = 20_000
 _FRAMES: Final = 400
-# Times that clock and shift of the reflections are estimated in turn, at most, the step of the
-# clock at which that ends [frame], the least share of a delay that is taken to be seen [1], and
-# trials in a row, at most, that are no better than one before.
-_ROUNDS, _LATE, _FLAT, _VAIN = 6, 0.02, 0.125, 2
+# Clocks that are tried, at most, the step at which that ends [frame], the least share of a delay
+# that is taken to be seen [1], and trials in a row, at most, that are no better than one before.
+_ROUNDS, _LATE, _FLAT, _VAIN = 8, 0.02, 0.125, 2
+_PRECISION: Final = 0.1  # of the clocks, from which they pass as known [frame]
 SAMPLE: Final = 220
 """Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
 
@@ -149,7 +151,7 @@ def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Capture on one clock, and the shift of its reflections; None where they are not apart."""
-    names, tried = corrected["band"].values, list[tuple[float, xr.DataArray, xr.Dataset]]()
+    names, tried = corrected["band"].values, list[_Trial]()
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
 
     def at(**how: Any) -> tuple[xr.Dataset, xr.Dataset | None]:
@@ -157,7 +159,7 @@ def _aligned(
         field = _shift(aligned, response)
         if field is not None and np.isfinite(field.attrs["delay"]):
             offset = together.copy(data=aligned.attrs["time_offset"])
-            tried.append((abs(field.attrs["delay"]), offset, field))
+            tried.append(_Trial(offset, names != field.attrs["reference_band"], field))
         return aligned, field
 
     aligned, field = at(**({} if "offset" in options else {"offset": together}))
@@ -165,31 +167,61 @@ def _aligned(
         # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
         aligned, field = at(reflection_shift=field)
-        # Newton's steps are short beside noise: from the second on they are a secant's.
-        frame, slope, step, last = np.median(np.diff(aligned["time"].values)), 1.0, 0.0, 0.0
-        for _ in range(_ROUNDS):
-            vain = len(tried) - int(np.argmin([one[0] for one in tried])) if tried else 0
-            if field is None or vain > _VAIN:
-                break
-            late = field.attrs["delay"]
-            if step:
-                slope = float(np.clip((last - late) / step, _FLAT, 1.0))
-            step, last = late / slope, late
-            if not abs(step) >= _LATE * frame:  # or not known
-                break
-            behind = step * (names != field.attrs["reference_band"])
-            offset = aligned.attrs["time_offset"] + behind - behind[0]
-            aligned, field = at(offset=together.copy(data=offset))
-        # Interpolation has a part in the delay that is seen: beside whole frames it may jump.
-        near = [
-            one for one in tried if field is not None and np.all(abs(one[1] - tried[-1][1]) < frame)
-        ]
-        if near and (best := min(near, key=lambda one: one[0])) is not tried[-1]:
-            aligned, field = align(corrected, **{**options, "offset": best[1]}), best[2]
+        frame = float(np.median(np.diff(aligned["time"].values)))
+        while tried and (offset := _better(tried, frame)) is not None:
+            aligned, field = at(offset=offset)
+        if tried:
+            best = min(tried, key=lambda one: abs(one.late))
+            if best is not tried[-1]:
+                aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
+            if abs(best.late) > _PRECISION * frame:
+                aligned = warned(
+                    aligned,
+                    f"The cameras' clocks are known within {abs(best.late) / frame:.2g} frames "
+                    f"only, more than {_PRECISION:g}: what moves fast may be wrong without a flag. "
+                    "Give their offset [s] if it is known.",
+                )
     if field is None:
         return aligned, None
     apart = seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0
     return aligned, field if apart else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Offsets of the bands' clocks [s], and the shift of the reflections that is found with them."""
+
+    offset: xr.DataArray
+    others: Mask  # bands but the reference of the shift
+    field: xr.Dataset
+
+    @property
+    def late(self) -> float:
+        """Time by which the others are seen late [s]."""
+        return float(self.field.attrs["delay"])
+
+    @property
+    def clock(self) -> float:
+        """Offset of the others from the reference [s]."""
+        offset = self.offset.values
+        return float(offset[self.others].mean() - offset[~self.others].mean())
+
+
+def _better(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
+    """Offsets of the clocks by which nothing would be late; None where no trial would be better."""
+    best, *rest = sorted(tried, key=lambda one: abs(one.late))
+    if len(tried) > _ROUNDS or len(tried) - 1 - tried.index(best) > _VAIN:
+        return None
+    slope = 1.0
+    if rest:  # Newton's steps are short beside noise: from the second on they are a secant's
+        beyond = [one for one in rest if one.late * best.late < 0.0]
+        near = min(beyond or rest, key=lambda one: abs(one.clock - best.clock))
+        slope = (near.late - best.late) / (best.clock - near.clock or np.inf)
+    step = best.late / float(np.clip(slope, _FLAT, 1.0))
+    if min(abs(best.clock + step - one.clock) for one in tried) < _LATE * frame:
+        return None
+    behind = step * best.others
+    return best.offset + behind - behind[0]
 
 
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:

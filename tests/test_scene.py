@@ -1,6 +1,7 @@
 """From raw counts of two cameras to temperatures in one call, in memory and by rows."""
 
 import re
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _arrays, _rows, simulation, store
+from dbthermal import _arrays, _rows, scene, simulation, store
+from dbthermal.alignment import align
+from dbthermal.correction import correct_capture
 from dbthermal.scene import separate_capture
 from dbthermal.simulation import Rig
 from reproduction.experiments import whole
@@ -79,6 +82,60 @@ def test_cameras_apart_have_the_same_result_on_disk(
     assert [one.name for one in tmp_path.iterdir()] == ["all.zarr"]
     for name in at_once.data_vars:
         np.testing.assert_allclose(on_disk[name], at_once[name], rtol=1e-3, err_msg=str(name))
+
+
+def clocks_tried(
+    plate: tuple[xr.Dataset, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    start: float,
+    seen: Callable[[float], float],
+) -> tuple[xr.Dataset, int]:
+    """Capture on the clocks that are found, and the number of them that were tried.
+
+    The second camera is seen late by a function of its offset [frame]; what moves one way tells a
+    start.
+    """
+    _, raw, fitted, response = plate
+    corrected, frame, tried = correct_capture(raw, fitted), 0.1, list[float]()
+
+    def started(capture: xr.Dataset, offset: xr.DataArray | None = None, **_: Any) -> xr.Dataset:
+        return align(capture, offset=start * frame if offset is None else offset)
+
+    def shift(aligned: xr.Dataset, _: xr.Dataset) -> xr.Dataset:
+        tried.append(aligned.attrs["time_offset"][1] / frame)
+        attrs = {"reference_band": RIG.bands[0], "delay": seen(tried[-1]) * frame}
+        return xr.Dataset(attrs=attrs)
+
+    monkeypatch.setattr(scene, "align", started)
+    monkeypatch.setattr(scene, "_shift", shift)
+    monkeypatch.setattr(scene, "seen_apart", lambda field: False)
+    return scene._aligned(corrected, response, {})[0], len(tried)
+
+
+@pytest.mark.parametrize("start", [-3.6, -0.25, 0.3])
+def test_clocks_are_found_from_a_poor_start(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, start: float
+) -> None:
+    """A delay that is seen too short, and with an error, leads to the clock by which it is none."""
+    true = 0.55
+
+    def seen(clock: float) -> float:
+        return (true - clock) * (0.8 if clock < true else 0.5) + 0.08 * np.sin(5.0 * clock)
+
+    aligned, number = clocks_tried(plate, monkeypatch, start, seen)
+    found = aligned.attrs["time_offset"][1] / 0.1
+    print(f"from {start} frames, in {number} trials: {found:.3f}, true {true}")
+    assert abs(found - true) < 0.15  # the error of the delay that is seen over its slope
+    assert "warnings" not in aligned.attrs
+
+
+def test_clocks_that_nothing_tells_are_doubted(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the reflections are seen late by every clock, the result says so."""
+    with pytest.warns(UserWarning, match=r"clocks are known within 0.3 frames only"):
+        aligned, _ = clocks_tried(plate, monkeypatch, 0.0, lambda _: 0.3)
+    assert "0.3 frames" in aligned.attrs["warnings"][-1]
 
 
 def test_a_target_is_refused_before_the_work(plate: tuple[xr.Dataset, ...], tmp_path: Path) -> None:
