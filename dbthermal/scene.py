@@ -189,7 +189,7 @@ def _aligned(
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Offsets of the bands' clocks [s], and the shift of the reflections that is found with them."""
+    """Offsets of the bands' clocks [s], and the shift of the reflections found with them."""
 
     offset: xr.DataArray
     others: Mask  # bands but the reference of the shift

@@ -108,7 +108,7 @@ def clocks_tried(
 
     monkeypatch.setattr(scene, "align", started)
     monkeypatch.setattr(scene, "_shift", shift)
-    monkeypatch.setattr(scene, "seen_apart", lambda field: False)
+    monkeypatch.setattr(scene, "seen_apart", lambda _: False)
     return scene._aligned(corrected, response, {})[0], len(tried)
 
 

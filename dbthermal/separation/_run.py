@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from multiprocessing import parent_process
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -21,6 +22,7 @@ from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
 from dbthermal.separation._solve import get_method, require_seed, solve
 from dbthermal.separation._tiles import largest
+from dbthermal.store._datasets import chunks_in_turn
 
 if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings
@@ -225,6 +227,8 @@ def _separate_rows(
     provenance: Mapping[str, Any],
 ) -> None:
     """Read rows of a capture on disk or in hand; write each block of them whole or not."""
+    if parent_process() is not None:
+        chunks_in_turn()
     part = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
     # What is dask's is computed here: its own threads, or the cluster's, would hold more blocks.
     part = part.load(scheduler="synchronous")
