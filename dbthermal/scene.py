@@ -221,7 +221,7 @@ def _better(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
     if min(abs(best.clock + step - one.clock) for one in tried) < _LATE * frame:
         return None
     behind = step * best.others
-    return best.offset + behind - behind[0]
+    return best.offset.copy(data=best.offset.values + behind - behind[0])
 
 
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:

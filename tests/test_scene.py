@@ -1,5 +1,6 @@
 """From raw counts of two cameras to temperatures in one call, in memory and by rows."""
 
+import math
 import re
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -120,7 +121,7 @@ def test_clocks_are_found_from_a_poor_start(
     true = 0.55
 
     def seen(clock: float) -> float:
-        return (true - clock) * (0.8 if clock < true else 0.5) + 0.08 * np.sin(5.0 * clock)
+        return (true - clock) * (0.8 if clock < true else 0.5) + 0.08 * math.sin(5.0 * clock)
 
     aligned, number = clocks_tried(plate, monkeypatch, start, seen)
     found = aligned.attrs["time_offset"][1] / 0.1
