@@ -5,10 +5,11 @@ from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
+from scipy.ndimage import gaussian_filter, median_filter, spline_filter
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
+from dbthermal._compiled import compiled
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._resampling import TRANSFORM, positions
@@ -29,14 +30,12 @@ _READ: Final = 200
 _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
 # Numbers of a homography that each model changes.
 _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography": list(range(8))}
-# Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel]; degree
-# of the polynomial from view to view, and scales of the residual from which a pixel does not count.
-_NEWTON, _STEP, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-3, 1e-4, 4, 2, 3.0
+# Gauss-Newton: steps, length of the last step and border left out [pixel]; degree of the polynomial
+# from view to view, and scales of the residual from which a pixel does not count.
+_NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
 # Deviation of rotation, scale, and perspective over the image, of equal cameras side by side [1].
 _RIGID: Final = 0.01
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
-# A place, and half a pixel above, below, to the left and right of it.
-_AROUND: Final = np.array([[0, 0], [-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])[..., np.newaxis]
 # Steps, and relative change of the correlation, at which the maximisation stops.
 _STEPS, _TOLERANCE = 200, 1e-7
 _LEAST_CORRELATION: Final = 0.5
@@ -219,11 +218,11 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
     By Gauss-Newton steps, of splines: the enhanced correlation interpolates by lines, and is off by
     some hundredths of a pixel.
     """
-    shape = pair[0].shape[1:]
-    count, splines = len(pair[0]), [spline_filter(image) for image in pair[1]]
+    shape, count = pair[0].shape[1:], len(pair[0])
+    splines = np.stack([spline_filter(image) for image in pair[1]], axis=-1)
     span = np.array([*shape[::-1], 1, *shape[::-1], 1, *shape[::-1]], dtype=float)[free]
     unit = span ** -np.array([1, 1, 1, 1, 1, 1, 2, 2])[free]
-    steps = _STEP * unit[:, np.newaxis] * np.eye(9)[free]
+    rows, columns = np.divmod(free, 3)
     # Residuals are alike over the blur, and at all times: one for each 4 pi blur^2 pixels.
     alike = 4.0 * np.pi * blur**2
     weights, variance = np.ones(shape), alike * count  # at first of images without a transform
@@ -231,20 +230,13 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
     for _ in range(_NEWTON):
         places = positions(matrix, shape)
         inside = _inside(places, band)
-        first, seen = pair[0][:, inside], places[:, inside]
-        values, *around = (
-            np.stack([map_coordinates(spline, seen + step, prefilter=False) for spline in splines])
-            for step in _AROUND
-        )
-        slopes = np.stack([around[1] - around[0], around[3] - around[2]])
-        motion = [
-            positions(matrix + step, shape)[:, inside] - positions(matrix - step, shape)[:, inside]
-            for step in steps.reshape(-1, 3, 3)
-        ]
+        first = pair[0][:, inside]
+        values, *slopes = _sampled(splines, places[:, inside])
         # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
+        motion = _motion(matrix, places, inside)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = np.concatenate(
             [
-                np.einsum("atp,nap->ntp", slopes, np.array(motion) / (-2.0 * _STEP)),
+                -np.einsum("atp,nap->ntp", slopes, motion),
                 [first**power for power in range(1, _DEGREE + 1)],
                 np.repeat(np.eye(count)[:, :, np.newaxis], first.shape[1], axis=2),
             ]
@@ -257,7 +249,7 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         right[: len(free)] -= variance * prior * moved
         found = np.linalg.pinv(normal, hermitian=True) @ right
         residual = values - np.tensordot(found, design, axes=1)
-        square, texture = np.sum(residual**2, axis=0), np.sum(slopes**2, axis=(0, 1))
+        square, texture = np.sum(residual**2, axis=0), np.sum(np.square(slopes), axis=(0, 1))
         # Scale of the residual of the texture's quarter that matches best: an edge is no outlier
         # of what is flat, and much may mirror other things.
         order = np.argsort(square)
@@ -265,11 +257,59 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         limit = _CUT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
         weights[inside] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
         variance = alike * np.average(square, weights=weights[inside])
-        matrix = matrix + (found[: len(free)] @ steps / _STEP).reshape(3, 3)
-        matrix = matrix / matrix[2, 2]
+        matrix = matrix.copy()
+        matrix[rows, columns] += found[: len(free)] * unit
+        matrix /= matrix[2, 2]
         if np.max(np.abs(found[: len(free)])) < _CONVERGED:
             break
     return matrix
+
+
+@compiled
+def _sampled(splines: Array, places: Array) -> Array:
+    """Values, and slopes over a pixel down and right (3, time, pixel), of splines (y, x, time)."""
+    pixels, times = places.shape[1], splines.shape[2]
+    result, first = np.zeros((3, times, pixels)), np.empty(2, np.intp)
+    weight, steep = np.empty((2, 5)), np.empty((2, 5))  # of a value and a slope, down and right
+    for p in range(pixels):
+        for axis in range(2):
+            first[axis] = int(np.floor(places[axis, p] - 0.5)) - 1
+            for i in range(5):
+                away = first[axis] + i - places[axis, p]
+                weight[axis, i] = _cubic(away)
+                steep[axis, i] = _cubic(away - 0.5) - _cubic(away + 0.5)
+        for t in range(times):
+            for i in range(5):
+                value = slope = 0.0
+                for j in range(5):
+                    part = splines[first[0] + i, first[1] + j, t]
+                    value += weight[1, j] * part
+                    slope += steep[1, j] * part
+                result[0, t, p] += weight[0, i] * value
+                result[1, t, p] += steep[0, i] * value
+                result[2, t, p] += weight[0, i] * slope
+    return result
+
+
+@compiled
+def _cubic(away: float) -> float:
+    """Cubic B-spline at a distance from its middle [pixel]."""
+    far = abs(away)
+    if far < 1.0:
+        return 2.0 / 3.0 - far**2 + 0.5 * far**3
+    return (2.0 - far) ** 3 / 6.0 if far < 2.0 else 0.0
+
+
+def _motion(matrix: Array, places: Array, inside: Mask) -> Array:
+    """Derivatives (3, 3, axis, pixel) of the places of some pixels by the numbers of a transform.
+
+    The row and column of H p = (a, b, c), c the scale, are b / c and a / c.
+    """
+    row, column = places[:, inside]
+    point = np.stack([*np.indices(places.shape[1:])[::-1, inside], np.ones_like(row)])
+    scale, none = matrix[2] @ point, np.zeros_like(row)
+    of_product = np.stack([[none, none + 1.0], [none + 1.0, none], [-row, -column]]) / scale
+    return np.asarray(of_product[:, np.newaxis] * point[:, np.newaxis])
 
 
 def _inside(places: Array, band: str) -> Mask:
