@@ -24,6 +24,7 @@ _COMPARED: Final = (
     *("turbo", "jet", "hot", "coolwarm", "gray"),
 )
 _SAMPLE, _STEP = 4096, 1.0
+_LEAF: Final = 64  # colours in a leaf of the tree: of a curve fewer are slower
 
 _YCC: Final = np.array(
     [
@@ -231,7 +232,7 @@ def _ycc(colours: Array) -> Array:
 
 def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
-    distance, nearest = KDTree(_ycc(palette)).query(_ycc(colours))
+    distance, nearest = KDTree(_ycc(palette), leafsize=_LEAF).query(_ycc(colours))
     position = (nearest / (len(palette) - 1)).astype(np.float32)
     return position, distance, np.linalg.norm(colours - palette[nearest], axis=1)
 

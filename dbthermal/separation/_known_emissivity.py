@@ -23,7 +23,8 @@ from dbthermal import mixing
 from dbthermal._compiled import compiled
 from dbthermal.separation._tiles import Array, Mask, Tile
 
-_STEPS: Final = 5
+# Newton's steps, at most, and the length of the last one [K].
+_STEPS, _CONVERGED = 5, 1e-5
 # Step of a numerical slope of B [K].
 _STEP: Final = 0.05
 # Half-widths grow by this factor; deviations within which estimates agree.
@@ -81,6 +82,8 @@ def solve(
         step = np.stack([(gain * residual).sum(axis=0) + sr * pull, -ss * pull])
         step[1] += (other * residual).sum(axis=0)
         s, r = s + step[0], r + step[1]
+        if not np.any(np.abs(step) > _CONVERGED):
+            break
     white = (gain**2 * variance).sum(axis=0)
     shared = np.maximum(rr / determinant - white, 0.0)
     if tile.pattern is not None:
