@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.special import bdtrc, ndtri
-from scipy.stats import norm
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MINIMUM_FRAMES
@@ -37,7 +36,8 @@ _FEWEST_STILL: Final = 1000
 # Ranks of the magnitudes that tell the noise, and of the next ones; outliers are beyond. Their mean
 # in a normal distribution, and the ratio of what both tell from which it is no noise.
 _RANKS: Final = np.array([0.0, 0.7, 0.95])
-_MEANS: Final = -2.0 * np.diff(norm.pdf(ndtri(0.5 + 0.5 * _RANKS))) / np.diff(_RANKS)
+_DENSITY: Final = np.exp(-0.5 * ndtri(0.5 + 0.5 * _RANKS) ** 2) / np.sqrt(2.0 * np.pi)
+_MEANS: Final = -2.0 * np.diff(_DENSITY) / np.diff(_RANKS)
 _UNEQUAL: Final = 1.1
 # Factor from which a noise is another than the stated one; largest between bands of what moves.
 _LARGER: Final = 1.4

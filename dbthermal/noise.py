@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri, ndtri
 
 from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
@@ -28,10 +27,10 @@ MAD: Final = 1.0 / float(ndtri(0.75))
 
 _ORDER = 8
 # Square of the Mahalanobis distance within which 99 % of the noise lies.
-_TRIM = float(chi2.ppf(0.99, 2))
+_TRIM = float(chdtri(2, 0.01))
 _SIGNIFICANCE = 3.0
 # Covariance of a normal distribution cut there, relative to the uncut one.
-_TRIMMED_VARIANCE = float(chi2.cdf(_TRIM, 4) / chi2.cdf(_TRIM, 2))
+_TRIMMED_VARIANCE = float(chdtr(4, _TRIM) / chdtr(2, _TRIM))
 # Standard deviation of a correlation of second differences, times sqrt(frames): their
 # autocorrelation is 1, -2/3, 1/6, so sqrt(1 + 2 (4/9 + 1/36)).
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)

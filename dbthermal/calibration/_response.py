@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal import _numbers, bands, planck, schema
 from dbthermal import response as responses
@@ -310,7 +310,7 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
     """
     band, off = curve.band, counts - curve.counts(temperature)
-    if np.sum(off**2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 2):
+    if np.sum(off**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
     fitting = []
@@ -318,7 +318,7 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
         rest = np.arange(counts.size) != place
         others = fit_band(band, temperature[rest], counts[rest])
         beside = counts - others.counts(temperature)
-        if np.sum(beside[rest] ** 2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 3):
+        if np.sum(beside[rest] ** 2) <= std**2 * chdtri(counts.size - 3, _FALSE_ALARM):
             fitting.append((place, beside[place]))
     if len(fitting) == 1:
         ((place, distance),) = fitting

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
@@ -81,7 +81,7 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
         variance[place] = 0.5 * np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
     variance = variance.reshape(len(variance), -1)
     freedom = 2 * (frames - 1) ** 2 / (3 * (frames - 1) - 1)
-    noise = np.sqrt(np.median(variance, axis=1) * freedom / chi2.median(freedom))
+    noise = np.sqrt(np.median(variance, axis=1) * freedom / chdtri(freedom, 0.5))
     for band, value in zip(counts["band"].values, noise, strict=True):
         if not value > 0:
             rule = "Must be positive: the samples must be finite and vary from frame to frame"

@@ -6,7 +6,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal._arrays import Array, Mask
 
@@ -128,7 +128,7 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
     own = np.zeros(2)
     if pairs.shape[1] >= _LEAST_PAIRS:
-        own = np.median(pairs, axis=1) / chi2.median(1)
+        own = np.median(pairs, axis=1) / chdtri(1, 0.5)
     shared = np.where(own < _MOST_OWN, 1.0 - np.minimum(own, 1.0), 1.0)
     return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 

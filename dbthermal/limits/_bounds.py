@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.stats import mode
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
@@ -204,6 +203,8 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
             f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene. "
             "Must lie in (0, 1)."
         )
+    from scipy.stats import mode  # noqa: PLC0415 - slow to import, and nothing else here needs it
+
     # A pixel rests at its most frequent temperature, the lowest of several, if frames share one.
     level, frames = mode(background, axis=0)
     rest = (background == level) & (frames > 1) & resting

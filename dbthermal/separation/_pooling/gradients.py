@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 
 from dbthermal._arrays import Array, Mask
 
@@ -160,7 +160,7 @@ def _spreads(fits: list[Left]) -> list[float]:
 
 def _seen(freedom: int) -> float:
     """Deviations from which an excess is no chance: a chi-square of little freedom is skew."""
-    return float((chi2.isf(norm.sf(_SIGMAS), freedom) - freedom) / np.sqrt(2.0 * freedom))
+    return float((chdtri(freedom, ndtr(-_SIGMAS)) - freedom) / np.sqrt(2.0 * freedom))
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
@@ -187,7 +187,7 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
         coefficients = len(values) * (design.shape[1] - 1 + np.arange(2))
         criteria = left + coefficients * np.log(second.size)
         if criteria.min() < lowest:
-            lowest, noise = criteria.min(), chi2.isf(_CHANCE, values.size - coefficients[0])
+            lowest, noise = criteria.min(), chdtri(values.size - coefficients[0], _CHANCE)
             result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)
     return result
 

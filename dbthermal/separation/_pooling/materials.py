@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 from scipy.ndimage import binary_dilation, distance_transform_cdt, find_objects
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
 from dbthermal import response as responses
@@ -334,7 +334,7 @@ def _links(
         least = _LEAST_STEP * np.abs(np.mean(change.ravel()[both]))
         where = np.divmod(both, cells.shape[1])
         steps[index] = step(where, values[:, both], noise[:, both].mean(axis=1), first.size, least)
-    unbroken = steps < chi2.isf(_STEP_RATE, len(emitted))
+    unbroken = steps < chdtri(len(emitted), _STEP_RATE)
     return pairs[unbroken], steps[unbroken]
 
 
@@ -363,7 +363,7 @@ def step(
         return np.inf
     heights = values @ orthonormal
     residual = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
-    if np.any(residual > chi2.isf(_BORDER_RATE, pixels - design.shape[1])):
+    if np.any(residual > chdtri(pixels - design.shape[1], _BORDER_RATE)):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dbthermal._arrays import Array, Mask
 
@@ -52,7 +52,7 @@ def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
     # sum w (f - mean)^2 = sum w f^2 - (sum w f)^2 / sum w
     chi_square = second - np.divide(first**2, total, out=np.zeros_like(total), where=total > 0)
     freedom = np.maximum(count - 1, 1)
-    limit = chi2.isf(error_rate / max(total.shape[1] - 1, 1), freedom)
+    limit = chdtri(freedom, error_rate / max(total.shape[1] - 1, 1))
     return np.asarray(np.any(chi_square > limit, axis=0))
 
 
@@ -83,7 +83,7 @@ class Regions:
         self._tolerance = features.tolerance[:, np.newaxis]
         freedom = np.arange(features.common.size + 1)
         borders = 3 * self._total.shape[1]
-        self._limits = chi2.isf(error_rate / borders, np.maximum(freedom, 1))
+        self._limits = chdtri(np.maximum(freedom, 1), error_rate / borders)
         self._parent = np.arange(self._total.shape[1])
 
     def root(self, cell: int) -> int:

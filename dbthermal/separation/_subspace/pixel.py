@@ -5,7 +5,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
-from scipy.stats import chi2
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
@@ -13,7 +12,7 @@ from dbthermal.separation._subspace import kernels, reflection_ratio, regression
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._tiles import Whole
 
-CHANCE: Final = float(chi2.isf(reflection_ratio.CHANCE, 1))
+CHANCE: Final = float(chdtri(1, reflection_ratio.CHANCE))
 _GRAY_LIMIT: Final = float(chdtri(1, reflection_ratio.GRAY_CHANCE))
 _TINY: Final = float(np.finfo(np.float64).tiny)
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, chdtri, ndtr
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import host, like, namespace, quotient
@@ -27,7 +26,7 @@ FEWER: Final = 4
 TEMPERATURES: Final = 9
 """Background temperatures, over the calibrated range, at which a gray body is looked for."""
 
-CHANCE: Final = float(2.0 * norm.sf(4.0))
+CHANCE: Final = float(2.0 * ndtr(-4.0))
 """Chance of four standard deviations, at which a hypothesis on the ratios is rejected."""
 
 # Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
@@ -263,4 +262,4 @@ def agrees(scatter: Array, axis: Array) -> Mask:
     turned = xp.einsum("pbc,cp->bp", scatter, axis)
     along = xp.einsum("bp,bp->p", axis, turned)
     statistic = xp.einsum("bp,bp->p", turned, turned) / along - along
-    return statistic < chi2.isf(CHANCE, len(axis) - 1)
+    return statistic < chdtri(len(axis) - 1, CHANCE)
