@@ -90,6 +90,12 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         (axis, y, x) [pixel] where the cameras see reflections apart. Attributes of the alignment:
         `clock`, `time_offset` [s], `frames_lost`, `transform`. From a `target` it is lazy.
 
+    Warns
+    -----
+    UserWarning
+        As the steps; and where the clocks of two cameras apart are known no better than within a
+        tenth of a frame.
+
     Examples
     --------
     A plate of glass, simulated, from raw counts; both cameras look through one window:
@@ -168,11 +174,13 @@ def _aligned(
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
         aligned, field = at(reflection_shift=field)
         frame = float(np.median(np.diff(aligned["time"].values)))
-        while tried and (offset := _better(tried, frame)) is not None:
+        while tried and field is tried[-1].field:  # the last one told a delay
+            if (offset := _better(tried, frame)) is None:
+                break
             aligned, field = at(offset=offset)
         if tried:
             best = min(tried, key=lambda one: abs(one.late))
-            if best is not tried[-1]:
+            if field is not best.field:
                 aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
             if abs(best.late) > _PRECISION * frame:
                 aligned = warned(
