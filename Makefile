@@ -109,7 +109,7 @@ reproduce: export MALLOC_ARENA_MAX := 1
 reproduce: export MALLOC_MMAP_MAX_ := 0
 reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
 # One notebook more than processors, for 00_acquisition waits for its emulated instruments most of the time.
-reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, three at a time
+reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, one more at a time than JOBS
 	JOBS=$$((JOBS + 1)) && $(parallel) full
 
 full: $(foreach one,$(early),$(filter results/$(one).ipynb,$(full) $(rig))) $(full) $(rig)

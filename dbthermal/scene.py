@@ -32,10 +32,11 @@ __dir__ = __all__.copy
 # image.
 _PIXELS: Final = 20_000
 _FRAMES: Final = 400
-# Clocks that are tried, at most, the step at which that ends [frame], the least share of a delay
-# that is taken to be seen [1], and trials in a row, at most, that are no better than one before.
-_ROUNDS, _LATE, _FLAT, _VAIN = 8, 0.02, 0.125, 2
-_PRECISION: Final = 0.1  # of the clocks, from which they pass as known [frame]
+# Clocks that are tried, at most, and in a row without being better than one before.
+_ROUNDS, _VAIN = 8, 2
+_LATE: Final = 0.02  # clocks no further apart are the same [frame]
+_FLAT: Final = 0.125  # least share of a delay that is taken to be seen [1]
+_PRECISION: Final = 0.1  # step that is left, up to which the clocks pass as known [frame]
 SAMPLE: Final = 220
 """Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
 
@@ -93,8 +94,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     Warns
     -----
     UserWarning
-        As the steps; and where the clocks of two cameras apart are known no better than within a
-        tenth of a frame.
+        As the steps; and where the clocks of cameras apart seem to be off by more than a tenth of a
+        frame still.
 
     Examples
     --------
@@ -169,30 +170,32 @@ def _aligned(
         return aligned, field
 
     aligned, field = at(**({} if "offset" in options else {"offset": together}))
-    if "offset" not in options:
+    if "offset" in options:
+        step = 0.0
+    else:
         # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
+        tried.clear()
         aligned, field = at(reflection_shift=field)
         frame = float(np.median(np.diff(aligned["time"].values)))
         while tried and field is tried[-1].field:  # the last one told a delay
-            if (offset := _better(tried, frame)) is None:
+            if (offset := _next(tried, frame)) is None:
                 break
             aligned, field = at(offset=offset)
-        if tried:
-            best = min(tried, key=lambda one: abs(one.late))
-            if field is not best.field:
-                aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
-            if abs(best.late) > _PRECISION * frame:
-                aligned = warned(
-                    aligned,
-                    f"The cameras' clocks are known within {abs(best.late) / frame:.2g} frames "
-                    f"only, more than {_PRECISION:g}: what moves fast may be wrong without a flag. "
-                    "Give their offset [s] if it is known.",
-                )
-    if field is None:
+        best, step = _step(tried, frame) if tried else (None, np.nan)
+        if best is not None and field is not best.field:
+            aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
+        step /= frame
+    if field is None or not (seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0):
         return aligned, None
-    apart = seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0
-    return aligned, field if apart else None
+    if not abs(step) <= _PRECISION:
+        off = f"{abs(step):.2g}" if np.isfinite(step) else "an unknown number of"
+        aligned = warned(
+            aligned,
+            f"The cameras' clocks may be {off} frames apart, more than {_PRECISION:g}: what moves "
+            "fast may be wrong without a flag. Give their offset [s] if it is known.",
+        )
+    return aligned, field
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +208,7 @@ class _Trial:
 
     @property
     def late(self) -> float:
-        """Time by which the others are seen late [s]."""
+        """Time by which the others are seen late with these clocks [s]."""
         return float(self.field.attrs["delay"])
 
     @property
@@ -215,21 +218,35 @@ class _Trial:
         return float(offset[self.others].mean() - offset[~self.others].mean())
 
 
-def _better(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
-    """Offsets of the clocks by which nothing would be late; None where no trial would be better."""
-    best, *rest = sorted(tried, key=lambda one: abs(one.late))
-    if len(tried) > _ROUNDS or len(tried) - 1 - tried.index(best) > _VAIN:
-        return None
+def _step(tried: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
+    """Trial with the least delay, and the step of the others' clocks by which there is none [s]."""
+    best = min(tried, key=lambda one: abs(one.late))
+    rest = [
+        one
+        for one in tried
+        if np.array_equal(one.others, best.others) and abs(one.clock - best.clock) >= _LATE * frame
+    ]
+    beyond = [one for one in rest if one.late * best.late < 0.0]
     slope = 1.0
     if rest:  # Newton's steps are short beside noise: from the second on they are a secant's
-        beyond = [one for one in rest if one.late * best.late < 0.0]
         near = min(beyond or rest, key=lambda one: abs(one.clock - best.clock))
-        slope = (near.late - best.late) / (best.clock - near.clock or np.inf)
-    step = best.late / float(np.clip(slope, _FLAT, 1.0))
-    if min(abs(best.clock + step - one.clock) for one in tried) < _LATE * frame:
+        slope = (near.late - best.late) / (best.clock - near.clock)
+    if not slope > 0.0:
+        slope = 1.0
+    elif not beyond:
+        slope = float(np.clip(slope, _FLAT, 1.0))
+    return best, best.late / slope
+
+
+def _next(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
+    """Offsets of the clocks to be tried next [s]; None if they, or enough others, have been."""
+    best, step = _step(tried, frame)
+    if len(tried) >= _ROUNDS or len(tried) - 1 - tried.index(best) >= _VAIN:
         return None
     behind = step * best.others
-    return best.offset.copy(data=best.offset.values + behind - behind[0])
+    offset = best.offset.copy(data=best.offset.values + behind - behind[0])
+    known = any(float(abs(offset - one.offset).max()) < _LATE * frame for one in tried)
+    return None if known else offset
 
 
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:

@@ -85,60 +85,97 @@ def test_cameras_apart_have_the_same_result_on_disk(
         np.testing.assert_allclose(on_disk[name], at_once[name], rtol=1e-3, err_msg=str(name))
 
 
-def clocks_tried(
-    plate: tuple[xr.Dataset, ...],
-    monkeypatch: pytest.MonkeyPatch,
-    start: float,
-    seen: Callable[[float], float],
-) -> tuple[xr.Dataset, int]:
-    """Capture on the clocks that are found, and the number of them that were tried.
+Seen = Callable[[float], tuple[float, int]]
 
-    The second camera is seen late by a function of its offset [frame]; what moves one way tells a
-    start.
+
+def clocks_tried(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, start: list[float], seen: Seen
+) -> tuple[list[float], list[float], xr.Dataset]:
+    """Offsets found, from those that what moves one way tells; those tried [frame]; the result.
+
+    By an offset of the other bands [frame] a camera is seen late [frame], and one is the reference.
     """
     _, raw, fitted, response = plate
     corrected, frame, tried = correct_capture(raw, fitted), 0.1, list[float]()
+    bands = [*RIG.bands, "more"][: len(start)]
+    corrected = corrected.isel(band=[0, 1, 1][: len(bands)]).assign_coords(band=bands)
 
     def started(capture: xr.Dataset, offset: xr.DataArray | None = None, **_: Any) -> xr.Dataset:
-        return align(capture, offset=start * frame if offset is None else offset)
+        first = xr.DataArray(np.array(start) * frame, dims="band", coords={"band": bands})
+        return align(capture, offset=first if offset is None else offset)
 
     def shift(aligned: xr.Dataset, _: xr.Dataset) -> xr.Dataset:
-        tried.append(aligned.attrs["time_offset"][1] / frame)
-        attrs = {"reference_band": RIG.bands[0], "delay": seen(tried[-1]) * frame}
-        return xr.Dataset(attrs=attrs)
+        offsets = np.array(aligned.attrs["time_offset"]) / frame
+        tried.append(float(offsets[1:].mean()))
+        late, reference = seen(tried[-1])
+        return xr.Dataset(attrs={"reference_band": bands[reference], "delay": late * frame})
 
     monkeypatch.setattr(scene, "align", started)
     monkeypatch.setattr(scene, "_shift", shift)
-    monkeypatch.setattr(scene, "seen_apart", lambda _: False)
-    return scene._aligned(corrected, response, {})[0], len(tried)
+    monkeypatch.setattr(scene, "seen_apart", lambda _: True)
+    monkeypatch.setattr(scene, "cameras_apart", lambda *_: (1.0, []))
+    aligned, field = scene._aligned(corrected, response, {})
+    found = [offset / frame for offset in aligned.attrs["time_offset"]]
+    assert field is not None
+    assert abs(field.attrs["delay"]) == abs(seen(float(np.mean(found[1:])))[0] * frame)
+    return found, tried, aligned
 
 
-@pytest.mark.parametrize("start", [-3.6, -0.25, 0.3])
+@pytest.mark.parametrize("start", [-3.6, -0.25, 0.3, 0.549])
+@pytest.mark.parametrize("slope", [0.3, 0.8, 3.0])
 def test_clocks_are_found_from_a_poor_start(
-    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, start: float
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, start: float, slope: float
 ) -> None:
-    """A delay that is seen too short, and with an error, leads to the clock by which it is none."""
+    """A delay seen too short or too long, with an error, leads to the clock by which it is none.
+
+    No delay is seen at clocks that are set together, for which these have no reason to be.
+    """
     true = 0.55
 
-    def seen(clock: float) -> float:
-        return (true - clock) * (0.8 if clock < true else 0.5) + 0.08 * math.sin(5.0 * clock)
+    def seen(clock: float) -> tuple[float, int]:
+        error = 0.02 * math.sin(5.0 * clock)
+        return (0.0 if clock == 0.0 else slope * (true - clock) + error), 0
 
-    aligned, number = clocks_tried(plate, monkeypatch, start, seen)
-    found = aligned.attrs["time_offset"][1] / 0.1
-    print(f"from {start} frames, in {number} trials: {found:.3f}, true {true}")
-    assert abs(found - true) < 0.15  # the error of the delay that is seen over its slope
+    (_, found), tried, aligned = clocks_tried(plate, monkeypatch, [0.0, start], seen)
+    print(f"from {start} frames, in {len(tried)} trials: {found:.3f}, true {true}")
+    assert abs(found - true) < 0.02 / slope + 0.02
     assert "warnings" not in aligned.attrs
 
 
-def test_clocks_that_nothing_tells_are_doubted(
+def test_clocks_of_other_bands_stay_apart(
     plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of three bands the others move together: what they differ by was told before."""
+    found, *_ = clocks_tried(plate, monkeypatch, [0.0, 0.9, -1.0], lambda clock: (0.2 - clock, 0))
+    np.testing.assert_allclose(found, [0.0, 1.15, -0.75], atol=0.02)
+
+
+def test_clocks_are_found_of_either_reference(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The band that is interpolated may be the quietest then: what is late, is the other one."""
+
+    def seen(clock: float) -> tuple[float, int]:
+        return (0.45 - clock, 0) if abs(clock - round(clock)) > 0.15 else (clock - 0.45, 1)
+
+    (_, found), *_ = clocks_tried(plate, monkeypatch, [0.0, -0.3], seen)
+    assert abs(found - 0.45) < 0.02
+
+
+@pytest.mark.parametrize("after", [0.3, np.nan])
+def test_clocks_that_nothing_tells_are_doubted(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, after: float
+) -> None:
     """Where the reflections are seen late by every clock, or by one alone, the result says so."""
-    for seen in (lambda _: 0.3, lambda clock: 0.3 if clock == 0.0 else np.nan):
-        with pytest.warns(UserWarning, match=r"clocks are known within 0.3 frames only"):
-            aligned, number = clocks_tried(plate, monkeypatch, -0.2, seen)
-        assert "0.3 frames" in aligned.attrs["warnings"][-1]
-        assert number <= 9
+
+    def seen(clock: float) -> tuple[float, int]:
+        return (0.3 if abs(clock + 0.2) < 0.01 else after), 0
+
+    with pytest.warns(UserWarning, match=r"clocks may be 0\.3 frames apart"):
+        (_, found), tried, aligned = clocks_tried(plate, monkeypatch, [0.0, -0.2], seen)
+    assert abs(found + 0.2) < 0.01
+    assert len(tried) == 3
+    assert "0.3 frames" in aligned.attrs["warnings"][-1]
 
 
 def test_a_target_is_refused_before_the_work(plate: tuple[xr.Dataset, ...], tmp_path: Path) -> None:

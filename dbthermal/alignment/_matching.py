@@ -28,7 +28,7 @@ BLUR: Final = 1.2
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _ROUNDS: Final = 12
-# Mean change of the field at its end, and before it goes on in finer images [pixel].
+# Mean change of the field at its end, and before it goes on in finer images [pixel of the image].
 _CONVERGED, _COARSE = 2e-3, 2e-2
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0

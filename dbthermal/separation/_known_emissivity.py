@@ -23,7 +23,7 @@ from dbthermal import mixing
 from dbthermal._compiled import compiled
 from dbthermal.separation._tiles import Array, Mask, Tile
 
-# Newton's steps, at most, and the length of the last one [K].
+# Newton's steps, at most, and the length of the last one in a tile [K].
 _STEPS, _CONVERGED = 5, 1e-5
 # Step of a numerical slope of B [K].
 _STEP: Final = 0.05

@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from pathlib import Path
@@ -227,17 +228,16 @@ def _separate_rows(
     provenance: Mapping[str, Any],
 ) -> None:
     """Read rows of a capture on disk or in hand; write each block of them whole or not."""
-    if parent_process() is not None:
-        chunks_in_turn()
-    part = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
-    # What is dask's is computed here: its own threads, or the cluster's, would hold more blocks.
-    part = part.load(scheduler="synchronous")
-    for top, path in paths.items():
-        block = slice(top, top + height)
-        here = {name: _of_rows(value, block) for name, value in options.items()}
-        result = solve(part.isel(y=block), response, method, workers=1, **here)
-        store.save_rows([result], path, provenance, height)
-        del result  # or it would be there beside the next one
+    with chunks_in_turn() if parent_process() else nullcontext():  # as an executor's process
+        part = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
+        # What is dask's is computed here: its own threads, or the cluster's, would hold more.
+        part = part.load(scheduler="synchronous")
+        for top, path in paths.items():
+            block = slice(top, top + height)
+            here = {name: _of_rows(value, block) for name, value in options.items()}
+            result = solve(part.isel(y=block), response, method, workers=1, **here)
+            store.save_rows([result], path, provenance, height)
+            del result  # or it would be there beside the next one
 
 
 def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:

@@ -9,6 +9,7 @@ import os
 import shutil
 import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -170,12 +171,13 @@ def _save(
         (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
 
 
-def chunks_in_turn() -> None:
-    """Read and write chunks one after another from now on, as suits a process that has one core.
+def chunks_in_turn() -> AbstractContextManager[Any]:
+    """Context in which chunks are read and written one after another, for a process of one core.
 
-    zarr's threads would wait for each other there, for a fifth of the time of writing.
+    There zarr's threads would wait for each other, for a fifth of the time of writing.
     """
-    zarr.config.set({"async.concurrency": 1})
+    context: AbstractContextManager[Any] = zarr.config.set({"async.concurrency": 1})
+    return context
 
 
 def _check(part: xr.Dataset) -> None:

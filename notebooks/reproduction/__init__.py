@@ -2,5 +2,6 @@
 
 import sys
 
-# nbformat's jsonschema would build a grammar of web addresses, which no notebook has, for a second.
+# nbformat's jsonschema would build a grammar of international addresses (IRI) for a second; no
+# notebook has any.
 sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.ndimage import map_coordinates, spline_filter
 
 from dbthermal import alignment, schema, separation, simulation
 from dbthermal.alignment import _registration as registration
@@ -28,6 +29,34 @@ def picture(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
         distance = np.hypot(along / axes[0], across / axes[1])
         result += height / (1 + np.exp((distance - 1) * axes[0] / 0.7))
     return result
+
+
+def test_splines_and_motions_are_those_of_differences() -> None:
+    """Splines are SciPy's, and their slopes over a pixel; a transform's motion is a limit."""
+    rng, shape = np.random.default_rng(3), (40, 52)
+    images = rng.normal(size=(3, *shape))
+    matrix = homography((0.7, -1.2), 1.5, 1.02)
+    matrix[2, :2] = 2e-4, -1e-4
+    places = resampling.positions(matrix, shape)
+    inside = registration._inside(places, "9.5")
+    splines = np.stack([spline_filter(one) for one in images], axis=-1)
+    values, down, right = registration._sampled(splines, places[:, inside])
+    at = {
+        away: np.stack([map_coordinates(one, (places.T + away).T[:, inside]) for one in images])
+        for away in ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
+    }
+    np.testing.assert_allclose(values, at[0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(down, at[0.5, 0.0] - at[-0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(right, at[0.0, 0.5] - at[0.0, -0.5], atol=1e-12)
+    motion = registration._motion(matrix, places, inside)
+    for row, column in np.ndindex(3, 3):
+        off = np.zeros((3, 3))
+        off[row, column] = 1e-6 if row == 2 else 1e-4
+        one, other = (
+            resampling.positions(it, shape)[:, inside] for it in (matrix + off, matrix - off)
+        )
+        slope = (one - other) / (2.0 * off[row, column])
+        np.testing.assert_allclose(motion[row, column], slope, rtol=1e-6, atol=1e-3)
 
 
 def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.ndarray:
