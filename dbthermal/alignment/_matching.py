@@ -28,8 +28,7 @@ BLUR: Final = 1.2
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _ROUNDS: Final = 12
-# Mean change of the field at its end, and before it goes on in finer images [pixel of the image].
-_CONVERGED, _COARSE = 2e-3, 2e-2
+_CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _COLOUR: Final = 0.05  # least variance of coloured noise over that of white noise
@@ -223,13 +222,12 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     border = (BORDER, BORDER)
     padded = np.pad(movies.first, (border, border, (0, 0)), mode="reflect")
     matches: Sequence[Match | None] = [None] * len(movies.others)
-    least = (_CONVERGED if movies.factor == 1 else _COARSE) * movies.factor
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data, matches = _information(movies, padded, shift, matches)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
-        if change.mean() < least:
+        if change.mean() < _CONVERGED * movies.factor:
             break
     return field, data
 
