@@ -192,8 +192,8 @@ def _aligned(
         off = f"{abs(step):.2g}" if np.isfinite(step) else "an unknown number of"
         aligned = warned(
             aligned,
-            f"The cameras' clocks may be {off} frames apart, more than {_PRECISION:g}: what moves "
-            "fast may be wrong without a flag. Give their offset [s] if it is known.",
+            f"The offset found between the cameras' clocks may be off by {off} frames, more than "
+            f"{_PRECISION:g}: what moves fast may be wrong without a flag. Give it [s] if known.",
         )
     return aligned, field
 

@@ -171,7 +171,7 @@ def test_clocks_that_nothing_tells_are_doubted(
     def seen(clock: float) -> tuple[float, int]:
         return (0.3 if abs(clock + 0.2) < 0.01 else after), 0
 
-    with pytest.warns(UserWarning, match=r"clocks may be 0\.3 frames apart"):
+    with pytest.warns(UserWarning, match=r"clocks may be off by 0\.3 frames"):
         (_, found), tried, aligned = clocks_tried(plate, monkeypatch, [0.0, -0.2], seen)
     assert abs(found + 0.2) < 0.01
     assert len(tried) == 3
