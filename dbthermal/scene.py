@@ -219,7 +219,7 @@ class _Trial:
 
 
 def _step(tried: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
-    """Trial with the least delay, and the step of the others' clocks by which there is none [s]."""
+    """Trial with the least delay, and the step of the others' clocks that ends it [s]."""
     best = min(tried, key=lambda one: abs(one.late))
     rest = [
         one
