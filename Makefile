@@ -192,7 +192,7 @@ results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00
 	$(execute) chain $* -f params/recorded/$*.yaml -p recorded results/smoke/00_acquisition
 
 # The notebooks that open what another one saved; the last of them reads the numbers of all.
-calibrated := 02_emissivity 04_separation 08_twins
+calibrated := 02_emissivity 04_separation
 paper := 09_paper
 $(calibrated:%=results/full/%.ipynb): results/full/01_calibration.ipynb
 $(calibrated:%=results/smoke/%.ipynb): results/smoke/01_calibration.ipynb

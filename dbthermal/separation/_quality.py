@@ -17,6 +17,7 @@ Bits = npt.NDArray[np.uint32]
 
 MOST_MISSING: Final = 0.5  # share of the frames without which a pixel is not solved
 LONGEST_GAP: Final = 2  # frames in a row that may be bridged in a pixel
+LONGEST_SHARE: Final = 0.01  # of the frames, in a row: as many may be in a long capture
 MOST_BRIDGED: Final = 0.15  # share of the frames from which a pixel lacks too many to be bridged
 
 # Frames from which fewer pixels are sampled, of as many samples together.
@@ -118,20 +119,21 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     """
     if valid.all():
         return counts, valid
-    common = valid.mean(axis=1) > MOST_MISSING
+    sampled = valid.mean(axis=0) > MOST_MISSING  # beside an object most pixels have no samples
+    common = valid[:, sampled].sum(axis=1) > MOST_MISSING * sampled.sum()
     gap = ~valid & common[:, np.newaxis]
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)
     if not np.any(gap):
         return counts, valid
     frame, pixel = np.nonzero(gap)
-    ends = []
-    for step in (-1, 1):
-        end = frame
-        for _ in range(LONGEST_GAP):  # beyond the capture there is no valid frame
-            end = np.clip(np.where(valid[end, pixel], end, end + step), 0, len(valid) - 1)
-        ends.append(end)
-    short = valid[ends[0], pixel] & valid[ends[1], pixel] & (ends[1] - ends[0] <= LONGEST_GAP + 1)
-    frame, pixel, first, last = (one[short] for one in (frame, pixel, *ends))
+    some, place = np.unique(pixel, return_inverse=True)
+    places = np.arange(len(valid))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(valid[:, some], places, -len(valid)))[frame, place]
+    after = np.where(valid[::-1, some], places, -len(valid))
+    after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
+    longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
+    short = after - before <= longest + 1
+    frame, pixel, first, last = (one[short] for one in (frame, pixel, before, after))
     share = (time[frame] - time[first]) / (time[last] - time[first])
     filled = counts.copy()
     line = (1.0 - share) * counts[:, first, pixel] + share * counts[:, last, pixel]

@@ -25,7 +25,7 @@ import xarray as xr
 
 import dbthermal
 
-Experiment = Callable[..., xr.Dataset]
+Experiment = Callable[..., Any]
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -52,12 +52,11 @@ def kept(experiment: Experiment, folder: Path) -> Experiment:
     return partial(_result, experiment, folder / _IMPORTED[:32] / name)
 
 
-def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) -> xr.Dataset:
+def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) -> Any:
     """Result from its file, computed if there is none, or if it is not as it was written."""
     inputs = inspect.signature(experiment).bind(*args, **options)
     inputs.apply_defaults()
     path = folder / f"{joblib.hash(inputs.arguments)}.pkl"
-    result: xr.Dataset
     if path.exists():
         with suppress(zlib.error):  # which compares its checksum
             name, result = pickle.loads(zlib.decompress(path.read_bytes()))
@@ -67,7 +66,7 @@ def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) ->
     result = experiment(*args, **options)
     folder.mkdir(parents=True, exist_ok=True)
     with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
-        part.write(zlib.compress(pickle.dumps((path.name, result)), level=1))
+        part.write(zlib.compress(pickle.dumps((path.name, result)), level=0))
     Path(part.name).replace(path)
     return result
 

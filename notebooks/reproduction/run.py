@@ -89,7 +89,7 @@ class Run:
         """Save a text in Markdown as ``<stem><ending>.md``."""
         store.save_text(text, self._path(f"{ending}.md"), self.provenance)
 
-    def cached(self, experiment: Callable[..., xr.Dataset]) -> Callable[..., Any]:
+    def cached(self, experiment: Callable[..., Any]) -> Callable[..., Any]:
         """Experiment whose results are kept, delayed for `joblib.Parallel`."""
         kept = cache.kept(experiment, paths.cells(self.stem))
         delayed: Callable[..., Any] = joblib.delayed(kept)

@@ -16,7 +16,7 @@ MOVING: Final = 0.5
 WRONG: Final = 0.1
 """Error of an emissivity from which it is called wrong [1]."""
 
-EVERY: Final = 5
+EVERY: Final = 10
 """A method that looks at whole images, each by itself, gets the first of so many frames."""
 
 Options = Mapping[str, Any]
@@ -50,8 +50,9 @@ def compare(
     The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
     variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
     same number of pixels, drawn from those in which the reflection varies by more than `MOVING`;
-    methods that treat each pixel alone get these only, the others every fifth frame (`EVERY`). The
-    noise of the two bands [K] is known to all, the emissivities [1] to "calibrated" alone.
+    methods that treat each pixel alone get these only, the others all pixels of every tenth frame
+    (`EVERY`), with noise of their own. The noise of the two bands [K] is known to all, the
+    emissivities [1] to "calibrated" alone.
     Variables of `judge` over (variant, ...).
     """
     rng, settings = np.random.default_rng(seed), Plate(**plate)
@@ -61,15 +62,15 @@ def compare(
     time = np.arange(settings.frames) / settings.rate
     shape = (settings.shape[0], settings.shape[1])
     scene = simulation.walkers(time, shape, value, rng, crossings=settings.crossings)
-    capture = simulation.observe(scene, response, rng)
     chosen = _choose(scene, pixels, rng)
     truth = _strip(scene, chosen)
-    images = [part.isel(time=slice(None, None, EVERY)) for part in (scene, capture)]
-    strips = [truth, _strip(capture, chosen)]
+    frames = scene.isel(time=slice(None, None, EVERY))
+    imaging = [separation.get_method(one["method"]).whole_image for one in variants.values()]
+    strip = simulation.observe(truth, response, rng)
+    images = simulation.observe(frames, response, rng) if any(imaging) else strip
     rows = []
-    for options in variants.values():
-        whole = separation.get_method(options["method"]).whole_image
-        truth_seen, seen = images if whole else strips
+    for options, whole in zip(variants.values(), imaging, strict=True):
+        truth_seen, seen = (frames, images) if whole else (truth, strip)
         result = separation.solve(seen, response, seed=seed, **_known(truth_seen, options))
         rows.append(judge(truth, _strip(result, chosen) if whole else result))
     label = xr.DataArray(list(variants), dims="variant", name="variant")

@@ -8,7 +8,6 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
-from dbthermal import correction as corrections
 from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import twins
@@ -41,18 +40,16 @@ def judge_twin(
     variants: Mapping[str, Mapping[str, Any]],
     *,
     material: str,
-    shape: Sequence[int],
-    clock: Sequence[float],
-    baseline: float = 0.0,
+    capture: twins.Capture,
     registrations: Sequence[Registration] = ("perfect",),
-) -> xr.Dataset:
+    shown: bool = False,
+) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
-    One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, a
-    number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are
-    registered in some ways (`twins.registered`), and by two at the first one's place. Of
-    the variants (see `at_thermocouple`), "calibrated" gets the emissivities that the bench finds
-    for a piece of the same material, with their deviations.
+    One of `twins.TWINS`, of a material of `emissivity.embedded_table`, by two cameras a baseline
+    apart, whose views are registered in some ways (`twins.registered`), and by two at the first
+    one's place. Of the variants (see `at_thermocouple`), "calibrated" gets the emissivities that
+    the bench finds for a piece of the same material, with their deviations.
 
     Returns
     -------
@@ -63,9 +60,11 @@ def judge_twin(
         pixels whose object changes by less than `RESTING`, where two bands leave the emissivity
         open; `emissivity_difference` (band) [1], mean magnitude of the default method's emissivity
         less the calibrated one over the pixels without a flag.
+    Dataset or None
+        As of `separate_twin`, of the first registration; if it is to be shown.
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
-    scene = twins.twin(name, capture_of(material, shape, clock, baseline), rng)
+    scene = twins.twin(name, capture, rng)
     fit = on_bench(response, material, rng)
     known = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
     informed = {
@@ -73,10 +72,10 @@ def judge_twin(
         for label, options in variants.items()
     }
     views = {"one place": simulation.observe(scene, response, rng)}
-    if baseline:
+    if capture.baseline:
         apart = twins.observe(scene, response, rng)
         views = {how: twins.registered(scene, apart, how) for how in registrations} | views
-    parts = []
+    parts, picture = [], None
     for cameras, corrected in views.items():
         shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None
         separated = separation.solve(corrected, response, reflection_shift=shift)
@@ -91,53 +90,55 @@ def judge_twin(
             )
             ways["pooled"] = over_the_image(scene, whole)
             ways["completed"] = over_the_image(scene, whole, completed=True)
+            if shown and picture is None:
+                picture = _with_truth(whole, scene, corrected, response)
         image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))
         both = {**image.data_vars, "resting": _resting(scene), "emissivity_difference": away}
         parts.append(read.assign_coords(way=image["way"]).assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
-    return xr.concat(parts, label, join="outer", combine_attrs="override")
+    return xr.concat(parts, label, join="outer", combine_attrs="override"), picture
 
 
 def capture_of(
     material: str, shape: Sequence[int], clock: Sequence[float], baseline: float
 ) -> twins.Capture:
-    """Capture of a twin of a material, see `judge_twin`, in the bands of the default rig."""
+    """Capture of a twin of a material, in the bands of the default rig.
+
+    Of rows and columns, a number of frames and their rate [Hz], by cameras a baseline apart [m].
+    """
     table = emissivity.embedded_table()["emissivity"]
     true = table.sel(material=material, band=list(simulation.Rig().bands), drop=True)
     time = np.arange(int(clock[0])) / clock[1]
     return twins.Capture(true, (shape[0], shape[1]), time, baseline)
 
 
-def separate_twin(
-    name: str,
-    seed: int,
-    capture: twins.Capture,
-    detector: xr.Dataset,
-    correction: xr.Dataset,
-    response: xr.Dataset,
-    **options: Any,
-) -> xr.Dataset:
-    """Separate a twin, seen by the default rig with a fixed pattern, by the default method.
+def separate_twin(name: str, seed: int, capture: twins.Capture, **options: Any) -> xr.Dataset:
+    """Separate a twin, seen by the default rig, by the default way; options of `twins.twin`.
 
-    The detector is from `simulation.pattern`, correction and response are calibrated; options are
-    those of `twins.twin`. Returns the result of `separation.solve`, and in addition
-    `apparent_temperature` (band, time, y, x), of the registered views; `true_object_temperature`
-    and `true_background_temperature` (time, y, x) [K], of the first camera.
+    Returns the result of `separation.separate`, and in addition `apparent_temperature`
+    (band, time, y, x), of the registered views; `true_object_temperature` and
+    `true_background_temperature` (time, y, x) [K], of the first camera.
     """
-    rng = np.random.default_rng(seed)
+    rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng, **options)
-    counts = twins.observe(scene, simulation.Rig().response(), rng)
-    raw = simulation.capture(counts, detector)
-    corrected = twins.registered(scene, corrections.correct(raw, correction))
+    corrected = twins.registered(scene, twins.observe(scene, response, rng))
     shift = alignment.reflection_shift(corrected, response) if capture.baseline else None
-    result = separation.solve(corrected, response, reflection_shift=shift)
-    seen = responses.apparent_temperature(response, corrected["counts"]).astype("float32")
+    whole = separation.separate(corrected, response, reflection_shift=shift)
+    return _with_truth(whole, scene, corrected, response)
+
+
+def _with_truth(
+    separated: xr.Dataset, scene: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset
+) -> xr.Dataset:
+    """Result with the inputs and the truth beside it, see `separate_twin`."""
+    seen = responses.apparent_temperature(response, corrected["counts"])
     films = {
-        f"true_{part}_temperature": scene[f"{part}_temperature"].astype("float32")
+        f"true_{part}_temperature": scene[f"{part}_temperature"]
         for part in ("object", "background")
     }
     films["apparent_temperature"] = seen
-    return result.assign(films).assign_attrs(corrected.attrs)
+    films = {name: film.astype("float32") for name, film in films.items()}
+    return separated.assign(films).assign_attrs(corrected.attrs)
 
 
 def _moving(scene: xr.Dataset) -> xr.DataArray:
