@@ -153,20 +153,20 @@ def test_short_gaps_are_bridged_by_a_line() -> None:
 def test_gaps_beside_an_object_are_bridged() -> None:
     """Pixels without any sample, as most are beside an object, do not say which gaps are short."""
     counts, valid = np.ones((2, FRAMES, 6)), np.zeros((FRAMES, 6), dtype=bool)
-    valid[:, :2] = True
-    valid[6, 0] = valid[9, :2] = False
+    valid[:, :3] = True
+    valid[6, 0] = valid[9, :3] = False
     usable = quality.bridge(counts, valid, np.arange(float(FRAMES)))[1]
-    np.testing.assert_array_equal(usable[6], [True, True, False, False, False, False])
+    np.testing.assert_array_equal(usable[6], [True, True, True, False, False, False])
     assert not usable[9].any()  # a frame that all of the object lack is one that was lost
 
 
 def test_longer_gaps_of_a_long_capture_are_bridged() -> None:
     """A hundredth of the capture is bridged, and not a frame more."""
     frames = 1000
-    counts, valid = np.ones((2, frames, 4)), np.ones((frames, 4), dtype=bool)
+    counts, valid = np.ones((2, frames, 5)), np.ones((frames, 5), dtype=bool)
     valid[100:110, 0] = valid[100:111, 1] = False
     usable = quality.bridge(counts, valid, np.arange(float(frames)))[1]
-    np.testing.assert_array_equal(usable.all(axis=0), [True, False, True, True])
+    np.testing.assert_array_equal(usable.all(axis=0), [True, False, True, True, True])
 
 
 def test_pixels_of_the_same_frames_are_one_set() -> None:
