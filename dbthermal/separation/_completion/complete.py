@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
 from dbthermal._arrays import release
+from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -211,7 +212,11 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
             continue
         places = tiles.numbers(window, block.sizes["x"])
         tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
-        wanted = valid.any(axis=0) & lacking[local].ravel()
+        # A frame that was lost is no sample to complete: many captures lack some.
+        missing = [np.isnan(completed[name].values[:, *window]) for name in (*FILMS, *MAPS)]
+        films, maps = (part.reshape(len(part), -1) for part in missing[:2]), missing[2:]
+        wanted = np.any([(film & valid).any(axis=0) for film in films], axis=0)
+        wanted |= np.any([part.any(axis=0).ravel() for part in maps], axis=0) & valid.any(axis=0)
         sources = np.where(wanted, scene.source[places], -1)
         for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
             here = sources == source
@@ -257,32 +262,47 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
     Only in the frames (time) that some pixel has. The deviation grows as that of a random walk of
     the curve's own steps. Returns how many each pixel (y, x) had, in one of the films.
     """
-    time = completed["time"].values[frames]
+    time = completed["time"].values[frames].astype(np.float64)
     number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
     for name in FILMS:
         films = [completed[one].values for one in (name, f"{name}_std")]
-        gaps = np.isnan(films[0][frames, rows])
-        bridged = gaps.any(axis=0) & ~gaps.all(axis=0)
-        for y, x in zip(*np.nonzero(bridged), strict=True):
-            place = (frames, rows.start + y, x)
-            curve, std = (film[place].astype(np.float64) for film in films)
-            _bridge(curve, std, gaps[:, y, x], time)
-            films[0][place], films[1][place] = curve, std
-        completed["status"].values[rows] |= bridged * np.uint32(Status.COMPLETED_FRAMES)
-        number = np.maximum(number, bridged * gaps.sum(axis=0))
+        gaps = np.isnan(films[0][frames, rows]).sum(axis=0)
+        y, x = np.nonzero((gaps > 0) & (gaps < time.size))
+        place = (np.flatnonzero(frames)[:, np.newaxis], rows.start + y, x)
+        curves, stds = (np.ascontiguousarray(film[place].T, dtype=np.float64) for film in films)
+        _bridge(curves, stds, time)
+        films[0][place], films[1][place] = curves.T, stds.T
+        completed["status"].values[rows.start + y, x] |= np.uint32(Status.COMPLETED_FRAMES)
+        number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
     return number
 
 
-def _bridge(value: Array, std: Array, gap: Mask, time: Array) -> None:
-    """Bridge the gaps of a curve (time), in place."""
-    known, missing = np.flatnonzero(~gap), np.flatnonzero(gap)
-    after = np.searchsorted(known, missing)
-    left, right = known[np.maximum(after - 1, 0)], known[np.minimum(after, known.size - 1)]
-    since, until = np.abs(time[missing] - time[left]), np.abs(time[right] - time[missing])
-    steps = np.diff(value[known]) ** 2 / np.diff(time[known])
-    rate = steps.mean() if steps.size else 0.0
-    apart = np.where(left == right, 1.0, since + until)
-    walk = rate * np.where(left == right, since, since * until / apart)
-    value[missing] = np.interp(time[missing], time[known], value[known])
-    std[missing] = np.sqrt(np.interp(time[missing], time[known], std[known] ** 2) + walk)
+@compiled
+def _bridge(values: Array, stds: Array, time: Array) -> None:
+    """Bridge the gaps of curves (curve, time) with a number somewhere, in place."""
+    for value, std in zip(values, stds):  # noqa: B905 - not compiled with strict
+        last, rate, steps = -1, 0.0, 0
+        for t in range(time.size):
+            if np.isfinite(value[t]):
+                if last >= 0:
+                    rate += (value[t] - value[last]) ** 2 / (time[t] - time[last])
+                    steps += 1
+                last = t
+        rate, left = rate / max(steps, 1), -1
+        for right in range(time.size + 1):
+            if right < time.size and not np.isfinite(value[right]):
+                continue
+            for t in range(left + 1, right):
+                if left < 0 or right == time.size:  # an end: as the nearest frame
+                    near = right if left < 0 else left
+                    value[t], walk = value[near], abs(time[t] - time[near])
+                    variance = std[near] ** 2
+                else:
+                    since, whole = time[t] - time[left], time[right] - time[left]
+                    share = since / whole
+                    value[t] = value[left] + share * (value[right] - value[left])
+                    variance = std[left] ** 2 + share * (std[right] ** 2 - std[left] ** 2)
+                    walk = since * (time[right] - time[t]) / whole
+                std[t] = np.sqrt(variance + rate * walk)
+            left = right
