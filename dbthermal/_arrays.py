@@ -12,7 +12,7 @@ import importlib
 import mmap
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -123,6 +123,18 @@ def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     for part in parts(values):
         result[part] = values[part]
     return result
+
+
+def copier() -> Callable[[npt.NDArray[Any]], npt.NDArray[Any]] | None:
+    """Function of any thread that copies an array to this one's folder of films; None without."""
+    if (folder := _FOLDER.get()) is None:
+        return None
+
+    def copy(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        with on_disk(folder):
+            return copied(values)
+
+    return copy
 
 
 def parts(film: npt.NDArray[Any]) -> Iterator[slice]:

@@ -8,6 +8,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 """
 
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Final, TypeAlias
@@ -20,7 +21,7 @@ from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, select
+from dbthermal._arrays import Array, Mask, copier, select
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -37,8 +38,9 @@ _LOST_WEIGHT: Final = 0.25
 # Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
-# Pixels of which the noise of a resampled sample is measured, along either side.
+# Pixels of which the noise of a resampled sample is measured, along either side, and frames.
 _AROUND: Final = 5
+_STEPS: Final = 700
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some twenty times [byte].
@@ -64,6 +66,7 @@ class Displacement:
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
     found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
     read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
+    to_disk: Callable[[npt.NDArray[Any]], npt.NDArray[Any]] | None = field(default_factory=copier)
 
     def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
         """Return what was computed for a key before: a capture is read many times."""
@@ -205,20 +208,26 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    The source is read if they are not kept; all pixels are kept of a small capture alone.
+    The source is read if they are not kept; all pixels are kept of a small capture alone, and some
+    pixels of any capture whose films are on disk.
     """
     films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
-    chosen = (*key, None if isinstance(some, slice) else some.tobytes())
+    every, chosen = (*key, None), (*key, None if isinstance(some, slice) else some.tobytes())
     if chosen not in films:
-        found = films.get((*key, None))
+        found = films.get(every)
         if found is None:
             block, grains = load()
             counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
             counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
             found = counts, usable, valid, status, gain
         share = (rows.stop - rows.start) / displacement.shape[0]
-        if not isinstance(some, slice):
+        if chosen != every:
             share, found = 1.0, tuple(select(film, some) for film in found)
+            if displacement.to_disk is not None:
+                with suppress(OSError):  # a full disk: read anew
+                    counts, usable, valid, status, gain = map(displacement.to_disk, found)
+                    films[chosen] = counts, usable, valid, status, gain
+                return found
         size, held = (sum(film.nbytes for film in one) for one in (found, chain(*films.values())))
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
             return found
@@ -374,7 +383,9 @@ def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
 
 def _roughness(counts: Array) -> Array:
     """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
-    return np.asarray(np.median(np.abs(np.diff(counts, axis=1)), axis=1, overwrite_input=True))
+    every = slice(None, None, max(1, counts.shape[1] // _STEPS))
+    steps = np.abs(counts[:, 1:][:, every] - counts[:, :-1][:, every])
+    return np.asarray(np.median(steps, axis=1, overwrite_input=True))
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
