@@ -11,10 +11,10 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from dbthermal import schema
 from dbthermal._arrays import Array
+from dbthermal._compiled import compiled
 from dbthermal.readers._decoding import MEMORY, Film, decode
 
 # Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
@@ -24,7 +24,6 @@ _COMPARED: Final = (
     *("turbo", "jet", "hot", "coolwarm", "gray"),
 )
 _SAMPLE, _STEP = 4096, 1.0
-_LEAF: Final = 64  # colours in a leaf of the tree: of a curve fewer are slower
 
 _YCC: Final = np.array(
     [
@@ -33,7 +32,6 @@ _YCC: Final = np.array(
         [0.25, -0.209344, -0.040656],
     ]
 )
-_SUBSTEPS: Final = 16  # of a palette's step; a position's grain is then far below the codec's error
 _COLOURED: Final = 30  # least difference between the channels of a coloured pixel [0-255]
 
 
@@ -214,15 +212,12 @@ def _distinct(film: Film) -> _Video:
 
 
 def _palette(name: str) -> Array:
-    """Colours (n, 3) [0-255] along a palette, `_SUBSTEPS` to each of its steps."""
+    """Colours (256, 3) [0-255] of a palette."""
     from matplotlib import colormaps  # noqa: PLC0415  (drawing is not needed to read a spectrum)
 
     if name not in colormaps or colormaps[name].N != 256:
         raise ValueError(f"Unknown palette '{name}'. Must be a colour map of matplotlib with 256.")
-    steps = np.arange(256)
-    colours = colormaps[name](steps)[:, :3] * 255
-    fine = np.arange(255 * _SUBSTEPS + 1) / _SUBSTEPS
-    return np.stack([np.interp(fine, steps, channel) for channel in colours.T], axis=1)
+    return np.asarray(colormaps[name](np.arange(256))[:, :3] * 255.0)
 
 
 def _ycc(colours: Array) -> Array:
@@ -232,9 +227,41 @@ def _ycc(colours: Array) -> Array:
 
 def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
-    distance, nearest = KDTree(_ycc(palette), leafsize=_LEAF).query(_ycc(colours))
-    position = (nearest / (len(palette) - 1)).astype(np.float32)
-    return position, distance, np.linalg.norm(colours - palette[nearest], axis=1)
+    place, distance = np.empty((2, len(colours)))
+    _project(_ycc(colours), _ycc(palette), place, distance)
+    first = np.minimum(place.astype(np.intp), len(palette) - 2)
+    nearest = palette[first] + (place - first)[:, np.newaxis] * np.diff(palette, axis=0)[first]
+    position = (place / (len(palette) - 1)).astype(np.float32)
+    return position, distance, np.linalg.norm(colours - nearest, axis=1)
+
+
+@compiled
+def _project(points: Array, corners: Array, place: Array, distance: Array) -> None:
+    """Place [corner] on a line through corners (corner, 3) nearest to points (n, 3), and how near.
+
+    In place. A part of the line that is nearer than all corners ends within its length of them.
+    """
+    steps = corners[1:] - corners[:-1]
+    lengths, squares = np.sum(steps**2, axis=1), np.empty(len(corners))
+    longest = np.sqrt(lengths.max())
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for i in range(len(corners)):
+            one, two, three = x - corners[i, 0], y - corners[i, 1], z - corners[i, 2]
+            squares[i] = one * one + two * two + three * three
+        best, within = np.inf, (np.sqrt(squares.min()) + longest) ** 2
+        for i in range(len(steps)):
+            if min(squares[i], squares[i + 1]) > within:
+                continue
+            along, left = 0.0, 0.0
+            for k in range(3):
+                along += (points[p, k] - corners[i, k]) * steps[i, k]
+            share = min(max(along / max(lengths[i], 1e-300), 0.0), 1.0)
+            for k in range(3):
+                left += (points[p, k] - corners[i, k] - share * steps[i, k]) ** 2
+            if left < best:
+                best, place[p] = left, i + share
+        distance[p] = np.sqrt(best)
 
 
 def _attrs(

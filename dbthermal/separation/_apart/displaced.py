@@ -44,7 +44,7 @@ _STEPS: Final = 700
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some twenty times [byte].
-_KEPT: Final = 2**29
+_KEPT: Final = 2**30
 # Deviations of the blur beyond which it has no weight.
 TAIL: Final = 3.0
 
