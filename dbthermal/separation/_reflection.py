@@ -24,8 +24,9 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
 
     .. math:: (1 - e_1) (y - \bar y)
 
-    with the mean over time, in the linear response of small changes. Where the object is constant
-    all that changes is reflected: the apparent temperature less its mean.
+    with the mean over time, in the linear response of small changes. Where the object is constant,
+    and no background was completed, all that changes is reflected: the apparent temperature less
+    its mean.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
         Apparent temperature of the inputs (band, time, y, x) [K], from
         `response.apparent_temperature`.
     result : Dataset
-        From `solve`, of the same capture.
+        From `solve`, `separate` or `complete`, of the same capture.
 
     Returns
     -------
@@ -85,7 +86,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
     change = (background - background.mean("time")) * reflectivity
     constant = (result["status"] & int(schema.Status.CONSTANT_OBJECT)) != 0
-    change = change.where(~constant, first - first.mean("time"))
+    without = constant & background.isnull().all("time")
+    change = change.where(~without, first - first.mean("time"))
     attrs = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
     return change.astype("float32").rename("reflected_change").assign_attrs(attrs)
 

@@ -12,9 +12,11 @@ from test_displaced import field
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation
 from dbthermal.schema import Status
+from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion.scene import contradicted, gather
 from dbthermal.separation._inputs import check
 from dbthermal.separation._solve import get_method
+from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Rig, observe
 from reproduction.experiments.pictures import ROOM, Picture
 
@@ -60,6 +62,39 @@ def test_measured_values_are_untouched(half: Case) -> None:
     assert bool((completed | ~missing).all())
     assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).where(missing, 1).all())
     xr.testing.assert_equal(whole["status"] & ~np.uint32(COMPLETED), alone["status"])
+
+
+def test_a_bend_that_may_be_the_background_tells_no_emissivity() -> None:
+    """The curve is known as one beside a quadratic and a cubic of such variances."""
+    time, rng = np.arange(320) / 10.0, np.random.default_rng(4)
+    rise = 20.0 * (1.0 - np.exp(-time / 12.0))
+    signals = np.stack([rise, 0.84 * rise])[..., np.newaxis] + 0.01 * rng.standard_normal(
+        (2, 320, 3)
+    )
+    tile = Tile(
+        signals=signals,
+        time=time,
+        curves=(),
+        noise=(0.03, 0.35),
+        shape=(1, 3),
+        rng=rng,
+    )
+    means = posterior.bins(tile, np.ones((320, 3), dtype=bool))
+    plain, bend = posterior.curve(tile, means, np.zeros(1)), np.array([[0.0, 0.4, 1e3]])
+    loose = posterior.curve(tile, means, np.zeros(1), bend=bend)
+    angle = np.arccos(np.cos(np.pi * (np.arange(4) + 0.5) / 4.0))
+    bends = np.cos(np.multiply.outer([2.0, 3.0], angle))
+    for pixel, deviation in enumerate(bend[0]):
+        inverse = np.linalg.inv(plain.information[0, :, :, pixel])
+        expected = np.linalg.inv(inverse + deviation**2 * bends.T @ bends)
+        np.testing.assert_allclose(
+            loose.information[0, :, :, pixel], expected, rtol=1e-6, atol=1e-6 * expected.max()
+        )
+        # The mean stays: H' = (H^-1 + V)^-1, h' = H' H^-1 h.
+        mean = np.linalg.solve(plain.information[0, :, :, pixel], plain.linear[0, :, pixel])
+        np.testing.assert_allclose(
+            loose.linear[0, :, pixel], expected @ mean, rtol=1e-6, atol=1e-6 * expected.max()
+        )
 
 
 def test_material_elsewhere_completes_within_noise(half: Case) -> None:

@@ -1,12 +1,15 @@
 """Two cameras side by side: the object as certain as from one place, right or flagged."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from dbthermal import alignment, separation, simulation
+from dbthermal._arrays import on_disk
+from dbthermal._samples import Grain
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import displaced
@@ -258,6 +261,28 @@ def test_noise_of_a_registration_is_not_taken_for_white() -> None:
     _, _, status, gain = displaced.read(outside, moved, slice(0, 4), whole, 1, grains)
     assert quality.unusable(status).all()  # rows that the second camera does not see at all
     assert np.isfinite(gain).all()
+
+
+def test_surveyed_pixels_are_kept_on_disk(tmp_path: Path) -> None:
+    """Of films on disk any chosen pixels are read once, and come the same the next time."""
+    shape, counts = (20, 48), np.random.default_rng(3).normal(20000.0, 10.0, (2, 300, 20, 48))
+    places = {"band": list(RIG.bands), "time": TIME}
+    capture = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, places)
+    with on_disk(tmp_path):
+        moved = displaced.check(field(smooth_shift(shape, 2.5, 0.5)), capture, 0)
+    read: list[xr.Dataset] = []
+
+    def load() -> tuple[xr.Dataset, list[Grain]]:
+        read.append(capture)
+        return capture, quality.grains(capture)
+
+    rows, some = slice(0, 20), np.arange(100, 700)
+    first = displaced.paired(load, moved, rows, rows, some, 1)
+    kept = [part.copy() for part in first]
+    first[0][:] = 0.0  # a tile is made of it, in place
+    for part, again in zip(kept, displaced.paired(load, moved, rows, rows, some, 1), strict=True):
+        np.testing.assert_array_equal(again, part)
+    assert len(read) == 1
 
 
 FIELD = field(np.zeros((2, *SMALL.shape)))

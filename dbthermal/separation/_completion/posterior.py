@@ -34,6 +34,8 @@ _LEAST: Final = 2
 # Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
 _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
+# A quadratic and a cubic that are no part of a line, at the nodes: Chebyshev's polynomials.
+_BENDS: Final = np.cos(np.multiply.outer([2.0, 3.0], np.arccos(_NODES)))
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
@@ -113,8 +115,13 @@ def bins(tile: Tile, valid: Mask) -> Bins:
     return Bins(total / np.maximum(frames, 1.0), frames, starts)
 
 
-def curve(tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0) -> Curve:
+def curve(
+    tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0, bend: Array | float = 0.0
+) -> Curve:
     """Other bands over the first; offsets (band - 1) [K] of a pixel against them are not known.
+
+    Nor is what a slow change of the background bends them by, of deviations (band - 1, pixel) [K].
+    It would pass for the bend of the responses, which is large for a hot metal alone.
 
     The variance is that of the noise, or the bins' if it is more: there the background fluctuates.
     The first band has a variance of strays [K^2], beside the noise, which the others do not follow.
@@ -130,6 +137,7 @@ def curve(tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0) ->
     base = _lagrange(centred / half)  # (node, bin, pixel)
     gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)
     information, linear = [], []
+    bends = np.broadcast_to(bend, (len(tile.noise) - 1, total.size))
     ridge = 1e-9 * total * np.eye(4)[..., np.newaxis]
     for m in range(1, len(tile.noise)):
         moment = np.einsum("ibp,bp,bp->ip", base, weight, means.signals[m])
@@ -142,6 +150,11 @@ def curve(tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0) ->
             row = inverse.sum(axis=1)
             share = 1.0 / (offset[m - 1] ** -2 + row.sum(axis=0))
             right = right - row * (share * right.sum(axis=0))
+            inverse = inverse - share * row[:, np.newaxis] * row
+        for one in _BENDS:  # the same, of a quadratic and a cubic of variance p^2
+            row = np.einsum("ijp,j->ip", inverse, one)
+            share = bends[m - 1] ** 2 / (1.0 + bends[m - 1] ** 2 * (one @ row))
+            right = right - row * (share * (one @ right))
             inverse = inverse - share * row[:, np.newaxis] * row
         information.append(inverse)
         linear.append(right)

@@ -191,8 +191,9 @@ def solve(
         means = posterior.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
-        stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
-        data = posterior.curve(tile, means, scene.offset, stray**2)
+        behind = (1.0 - np.tensordot(prior.weight, prior.mean, 1)) * level.fluctuation
+        stray, bend = behind[0] * scene.apart, np.abs(behind[1:] - behind[0] * (not scene.apart))
+        data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
         variance = np.maximum(variance, _LEAST[1] ** 2)
