@@ -213,17 +213,20 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
         places = tiles.numbers(window, block.sizes["x"])
         tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
         # A frame that was lost is no sample to complete: many captures lack some.
-        missing = [np.isnan(completed[name].values[:, *window]) for name in (*FILMS, *MAPS)]
-        films, maps = (part.reshape(len(part), -1) for part in missing[:2]), missing[2:]
-        wanted = np.any([(film & valid).any(axis=0) for film in films], axis=0)
-        wanted |= np.any([part.any(axis=0).ravel() for part in maps], axis=0) & valid.any(axis=0)
+        names = (*FILMS, *MAPS, f"{FILMS[0]}_std")
+        parts = [completed[name].values[:, *window] for name in names]
+        parts = [part.reshape(len(part), -1) for part in parts]
+        wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in parts[:2]], axis=0)
+        wanted |= np.any([np.isnan(part).any(axis=0) for part in parts[2:4]], axis=0)
+        wanted &= valid.any(axis=0)
+        measured = np.array([parts[0], parts[-1]], dtype=np.float64)
         sources = np.where(wanted, scene.source[places], -1)
         for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
             here = sources == source
             if not here.any():
                 continue
-            part = (tile.select_pixels(here), valid[:, here])
-            values, _ = scenes.solve(scene, *part, source, places[here])
+            part = (tile.select_pixels(here), valid[:, here], source, places[here])
+            values, _ = scenes.solve(scene, *part, measured[..., here])
             if source == scenes.MATERIAL:
                 kept = ~scenes.contradicted(scene, values, places[here])
                 sources[here] = np.where(kept, source, scenes.PRIOR)

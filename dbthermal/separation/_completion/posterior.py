@@ -296,6 +296,29 @@ def _average(
     return mean, total
 
 
+def behind(
+    tile: Tile, static: Moments, temperature: Array, std: Array, fluctuation: Array
+) -> tuple[Array, Array]:
+    r"""Background behind a measured object (time, pixel) [K], and its variance [K^2].
+
+    What the object leaves of the first band, about the level:
+
+    .. math:: r = c + k \left[\frac{z_1 - e_1 s}{1 - e_1} - c\right]
+
+    NaN where no object temperature [K] was measured.
+    """
+    curve, e = tile.curves[0], static.emissivity[0]
+    signal, dark = curve.signal(temperature) - tile.reference, 1.0 - e
+    seen = (tile.signals[0] - e * signal) / dark
+    noise = (tile.noise[0] ** 2 + (e * std * curve.slope(temperature)) ** 2) / dark**2
+    gain = fluctuation / (fluctuation + noise)
+    # dr = k (r - s) / (1 - e_1) de_1 + (1 - k) dc
+    change = np.zeros((len(static.covariance), *signal.shape))
+    change[0], change[-1] = gain * (seen - signal) / dark, 1.0 - gain
+    spread = gain * noise + known_emissivity.through(change, static.covariance)
+    return static.level + gain * (seen - static.level), spread
+
+
 def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:
     """Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
 

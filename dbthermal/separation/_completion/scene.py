@@ -179,20 +179,28 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
 
 
 def solve(
-    scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
+    scene: Scene,
+    tile: Tile,
+    valid: Mask,
+    source: int,
+    places: Whole,
+    measured: Array | None = None,
 ) -> tuple[Values, Array]:
     """Complete the pixels of a tile whose emissivities come from one source.
 
-    Beside the values, the posterior mean and variance of the background's level, the prior's
-    variance, and the variance of the background over time (4, pixel).
+    The background is told with the object temperatures that are `measured`, and their deviations
+    (2, time, pixel) [K], NaN elsewhere. Beside the values, the posterior mean and variance of the
+    background's level, the prior's variance, and the variance of the background over time
+    (4, pixel).
     """
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
         means = posterior.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
-        behind = (1.0 - np.tensordot(prior.weight, prior.mean, 1)) * level.fluctuation
-        stray, bend = behind[0] * scene.apart, np.abs(behind[1:] - behind[0] * (not scene.apart))
+        mirrored = (1.0 - np.tensordot(prior.weight, prior.mean, 1)) * level.fluctuation
+        stray = mirrored[0] * scene.apart
+        bend = np.abs(mirrored[1:] - mirrored[0] * (not scene.apart))
         data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
@@ -203,9 +211,13 @@ def solve(
         signal, left = known_emissivity.smooth(found.signal, found.white, valid, tile.time)
         left = left + found.shared + known_emissivity.through(found.sensitivity, static.covariance)
         around = known_emissivity.through(found.background_sensitivity, static.covariance)
-        around = found.background_variance + around
+        behind = found.background, found.background_variance + around
+        if measured is not None:
+            own, spread = posterior.behind(tile, static, measured[0], measured[1], variance)
+            known = np.isfinite(own)
+            behind = np.where(known, own, behind[0]), np.where(known, spread, behind[1])
         values: Values = {}
-        films = (signal, left), (found.background, around)
+        films = (signal, left), behind
         for name, (mean, spread) in zip(FILMS, films, strict=True):
             temperature = tile.temperature(0, np.where(valid, mean, np.nan))
             values[name] = temperature
@@ -215,8 +227,8 @@ def solve(
         for name, (mean, covariance) in zip(MAPS, pairs, strict=True):
             values[name] = mean
             values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
-    told = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
-    return values, np.array(np.broadcast_arrays(*told))
+    room = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
+    return values, np.array(np.broadcast_arrays(*room))
 
 
 def contradicted(scene: Scene, values: Values, places: Whole) -> Mask:

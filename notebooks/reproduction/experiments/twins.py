@@ -136,7 +136,7 @@ def _with_truth(
         f"true_{part}_temperature": scene[f"{part}_temperature"]
         for part in ("object", "background")
     }
-    films["apparent_temperature"] = seen
+    films["apparent_temperature"] = seen.assign_attrs(scene.attrs)
     films = {name: film.astype("float32") for name, film in films.items()}
     return separated.assign(films).assign_attrs(corrected.attrs)
 
