@@ -17,8 +17,9 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from tempfile import TemporaryFile
+from threading import Lock
 from typing import Any, Final
-from weakref import WeakSet
+from weakref import WeakSet, finalize
 
 import numpy as np
 import numpy.typing as npt
@@ -125,16 +126,37 @@ def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return result
 
 
-def copier() -> Callable[[npt.NDArray[Any]], npt.NDArray[Any]] | None:
-    """Function of any thread that copies an array to this one's folder of films; None without."""
-    if (folder := _FOLDER.get()) is None:
-        return None
+class Shelf:
+    """Arrays in one file that vanishes with the process, kept and read by any thread."""
 
-    def copy(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        with on_disk(folder):
-            return copied(values)
+    def __init__(self, folder: Path) -> None:
+        self._file = TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the shelf is there
+        self._lock = Lock()
+        finalize(self, self._file.close)
 
-    return copy
+    def put(self, values: npt.NDArray[Any]) -> Callable[[], npt.NDArray[Any]]:
+        """Keep an array; return what reads it. OSError if the disk has no room for it."""
+        values = np.ascontiguousarray(values)
+        shape, dtype = values.shape, values.dtype  # of `get`, which does not hold the values
+        with self._lock:
+            place = self._file.seek(0, os.SEEK_END)
+            self._file.write(values.data)
+            self._file.flush()
+
+        def get() -> npt.NDArray[Any]:
+            result = np.empty(shape, dtype)
+            with self._lock:
+                self._file.seek(place)
+                self._file.readinto(result.data)
+            return result
+
+        return get
+
+
+def shelf() -> Shelf | None:
+    """Shelf in the folder of this thread's films; None where they are in memory."""
+    folder = _FOLDER.get()
+    return None if folder is None else Shelf(folder)
 
 
 def parts(film: npt.NDArray[Any]) -> Iterator[slice]:

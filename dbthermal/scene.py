@@ -80,7 +80,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         `separation.separate`, such as ``{"offset": 0.0}`` [s] for cameras with one clock.
     target : str or Path, optional
         Folder ``*.zarr`` for the result. What is computed on the way is then in files beside it,
-        which vanish with the process: some 64 bytes for each pixel and frame.
+        which vanish with the process: some 64 bytes for each pixel and frame, and for up to 2048
+        pixels of each material as much again.
     provenance : mapping, optional
         For the `target`, see `store.save`.
 

@@ -114,8 +114,9 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     """Bridge short gaps of single pixels by a line in all bands.
 
     A line between the same two frames in all bands holds the same mixture of object and
-    background. Bridged are gaps of `LONGEST_GAP` frames that most other pixels have, in pixels that
-    lack few. Returns the counts, and the samples that are valid or bridged.
+    background. Bridged are gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture,
+    in pixels that lack few, where most others that have samples at all have one. Returns the
+    counts, and the samples that are valid or bridged.
     """
     if valid.all():
         return counts, valid

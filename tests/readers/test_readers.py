@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from dbthermal import readers
+from dbthermal.readers import _videos
 
 HEADER = """Name: Plate  Glass
 Type: manmade
@@ -242,6 +243,22 @@ def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
     assert_allclose(np.sqrt(np.mean((movie - wave()) ** 2)), 0, atol=0.01)
     assert_allclose(movie, wave(), rtol=0, atol=0.05)
     assert_allclose(movie["time"], np.arange(12) / 10, rtol=0, atol=1e-9)
+
+
+def test_colours_are_projected_onto_a_palette() -> None:
+    """A colour between two of a palette is its own; any other's distance is that of all points."""
+    palette, rng = _videos._palette("plasma"), np.random.default_rng(6)
+    between = 0.5 * (palette[1:] + palette[:-1])
+    position, distance, away = _videos._nearest(between, palette)
+    assert_allclose(position, (np.arange(255) + 0.5) / 255, atol=1e-6)
+    assert_allclose(distance, 0.0, atol=1e-9)
+    assert_allclose(away, 0.0, atol=1e-9)
+    others = rng.uniform(0.0, 255.0, (50, 3))
+    share = np.linspace(0.0, 1.0, 200)[:, np.newaxis, np.newaxis]
+    dense = ((1.0 - share) * palette[:-1] + share * palette[1:]).reshape(-1, 3)
+    apart = _videos._ycc(others)[:, np.newaxis] - _videos._ycc(dense)
+    expected = np.linalg.norm(apart, axis=2).min(axis=1)
+    assert_allclose(_videos._nearest(others, palette)[1], expected, rtol=1e-3)
 
 
 def test_palette_video_says_that_it_is_not_radiometric(plasma: Path) -> None:

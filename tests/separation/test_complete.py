@@ -10,7 +10,7 @@ from captures import emissivity_of
 from test_displaced import field
 
 from dbthermal import emissivity as emissivity_module
-from dbthermal import schema, separation
+from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion.scene import contradicted, gather
@@ -95,6 +95,35 @@ def test_a_bend_that_may_be_the_background_tells_no_emissivity() -> None:
         np.testing.assert_allclose(
             loose.linear[0, :, pixel], expected @ mean, rtol=1e-6, atol=1e-6 * expected.max()
         )
+
+
+@pytest.mark.parametrize("temperature", [300.0, 353.0])
+def test_background_behind_a_measured_object_changes_as_it_does(temperature: float) -> None:
+    """Behind a constant object all that changes is reflected, however uncertain its temperature."""
+    rng = np.random.default_rng(2)
+    scene = NOBODY.draw(TIME, emissivity_of(0.86, 0.72), rng)
+    walkers = simulation.walkers(TIME, (20, 24), emissivity_of(0.86, 0.72), rng)
+    still = xr.full_like(scene["object_temperature"], temperature)
+    scene = scene.assign(
+        object_temperature=still, background_temperature=walkers["background_temperature"]
+    )
+    capture = observe(scene, RESPONSE, rng)
+    alone = separation.solve(capture, RESPONSE)
+    constant = schema.has_flag(alone["status"], "constant_object")
+    assert float(constant.mean()) > 0.5
+    whole = separation.complete(alone, capture, RESPONSE, prior="plate window glass")
+    true, found = (
+        (one["background_temperature"] - one["background_temperature"].mean("time")).where(constant)
+        for one in (scene, whole)
+    )
+    share = float((found * true).sum() / (true**2).where(found.notnull()).sum())
+    inside = abs(whole["background_temperature"] - scene["background_temperature"]) < (
+        1.96 * whole["background_temperature_std"]
+    )
+    hold = float(inside.where(constant).mean())
+    print(f"{temperature:g} K: {share:.3f} of the change, intervals hold {hold:.3f}")
+    assert 0.9 < share < 1.1
+    assert hold > 0.9
 
 
 def test_material_elsewhere_completes_within_noise(half: Case) -> None:

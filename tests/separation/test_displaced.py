@@ -263,8 +263,9 @@ def test_noise_of_a_registration_is_not_taken_for_white() -> None:
     assert np.isfinite(gain).all()
 
 
-def test_surveyed_pixels_are_kept_on_disk(tmp_path: Path) -> None:
+def test_surveyed_pixels_are_kept_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of films on disk any chosen pixels are read once, and come the same the next time."""
+    monkeypatch.setattr(displaced, "_KEPT", 0)  # nothing in memory
     shape, counts = (20, 48), np.random.default_rng(3).normal(20000.0, 10.0, (2, 300, 20, 48))
     places = {"band": list(RIG.bands), "time": TIME}
     capture = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, places)

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, copier, select
+from dbthermal._arrays import Array, Mask, Shelf, select, shelf
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -66,7 +66,8 @@ class Displacement:
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
     found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
     read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
-    to_disk: Callable[[npt.NDArray[Any]], npt.NDArray[Any]] | None = field(default_factory=copier)
+    shelf: Shelf | None = field(default_factory=shelf)  # of captures whose films are on disk
+    shelved: dict[Hashable, list[Callable[[], Any]]] = field(default_factory=dict)
 
     def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
         """Return what was computed for a key before: a capture is read many times."""
@@ -213,6 +214,9 @@ def paired(
     """
     films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
     every, chosen = (*key, None), (*key, None if isinstance(some, slice) else some.tobytes())
+    if chosen in displacement.shelved:
+        counts, usable, valid, status, gain = (get() for get in displacement.shelved[chosen])
+        return counts, usable, valid, status, gain
     if chosen not in films:
         found = films.get(every)
         if found is None:
@@ -223,10 +227,9 @@ def paired(
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, found = 1.0, tuple(select(film, some) for film in found)
-            if displacement.to_disk is not None:
+            if displacement.shelf is not None:
                 with suppress(OSError):  # a full disk: read anew
-                    counts, usable, valid, status, gain = map(displacement.to_disk, found)
-                    films[chosen] = counts, usable, valid, status, gain
+                    displacement.shelved[chosen] = [displacement.shelf.put(it) for it in found]
                 return found
         size, held = (sum(film.nbytes for film in one) for one in (found, chain(*films.values())))
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):

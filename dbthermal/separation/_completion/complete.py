@@ -287,14 +287,14 @@ def _bridge(values: Array, stds: Array, time: Array) -> None:
     for value, std in zip(values, stds):  # noqa: B905 - not compiled with strict
         last, rate, steps = -1, 0.0, 0
         for t in range(time.size):
-            if np.isfinite(value[t]):
+            if not np.isnan(value[t]):
                 if last >= 0:
                     rate += (value[t] - value[last]) ** 2 / (time[t] - time[last])
                     steps += 1
                 last = t
         rate, left = rate / max(steps, 1), -1
         for right in range(time.size + 1):
-            if right < time.size and not np.isfinite(value[right]):
+            if right < time.size and np.isnan(value[right]):
                 continue
             for t in range(left + 1, right):
                 if left < 0 or right == time.size:  # an end: as the nearest frame

@@ -297,26 +297,37 @@ def _average(
 
 
 def behind(
-    tile: Tile, static: Moments, temperature: Array, std: Array, fluctuation: Array
+    tile: Tile, static: Moments, measured: Array, valid: Mask, fluctuation: Array
 ) -> tuple[Array, Array]:
     r"""Background behind a measured object (time, pixel) [K], and its variance [K^2].
 
-    What the object leaves of the first band, about the level:
+    What the object's temperatures and deviations (2, time, pixel) [K] leave of the first band,
 
-    .. math:: r = c + k \left[\frac{z_1 - e_1 s}{1 - e_1} - c\right]
+    .. math:: r_0 = \frac{z_1 - e_1 s}{1 - e_1}, \quad
+              r = c + g (\bar r_0 - c) + k (r_0 - \bar r_0)
 
-    NaN where no object temperature [K] was measured.
+    The object's error is common to all frames: it makes the mean over time uncertain, which leans
+    on the level c, and not the change about it. NaN where no object temperature was measured.
     """
     curve, e = tile.curves[0], static.emissivity[0]
-    signal, dark = curve.signal(temperature) - tile.reference, 1.0 - e
-    seen = (tile.signals[0] - e * signal) / dark
-    noise = (tile.noise[0] ** 2 + (e * std * curve.slope(temperature)) ** 2) / dark**2
-    gain = fluctuation / (fluctuation + noise)
-    # dr = k (r - s) / (1 - e_1) de_1 + (1 - k) dc
-    change = np.zeros((len(static.covariance), *signal.shape))
-    change[0], change[-1] = gain * (seen - signal) / dark, 1.0 - gain
-    spread = gain * noise + known_emissivity.through(change, static.covariance)
-    return static.level + gain * (seen - static.level), spread
+    signal, dark = curve.signal(measured[0]) - tile.reference, 1.0 - e
+    seen = np.where(valid, (tile.signals[0] - e * signal) / dark, np.nan)
+    used = np.isfinite(seen)
+    number = np.maximum(used.sum(axis=0), 1)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.where(used, values, 0.0).sum(axis=0) / number)
+
+    noise = (tile.noise[0] / dark) ** 2
+    common = mean((e * measured[1] * curve.slope(measured[0]) / dark) ** 2) + noise / number
+    change, level = fluctuation / (fluctuation + noise), fluctuation / (fluctuation + common)
+    middle, off = mean(seen), (seen - signal) / dark
+    value = static.level + level * (middle - static.level) + change * (seen - middle)
+    # dr_0 = (r_0 - s) / (1 - e_1) de_1
+    slope = np.zeros((len(static.covariance), *seen.shape))
+    slope[0], slope[-1] = level * mean(off) + change * (off - mean(off)), 1.0 - level
+    spread = level * common + change * noise
+    return value, spread + known_emissivity.through(slope, static.covariance)
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:

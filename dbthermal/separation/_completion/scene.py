@@ -198,9 +198,11 @@ def solve(
         means = posterior.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
-        mirrored = (1.0 - np.tensordot(prior.weight, prior.mean, 1)) * level.fluctuation
-        stray = mirrored[0] * scene.apart
-        bend = np.abs(mirrored[1:] - mirrored[0] * (not scene.apart))
+        stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
+        # A change f of it alone bends the others by (1 - e_m) f; at one place by (1 - e_m / e_1) f.
+        own = 1.0 if scene.apart else prior.mean[:, :1]
+        bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / own) ** 2, 1))
+        bend = bend * level.fluctuation
         data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
@@ -213,8 +215,8 @@ def solve(
         around = known_emissivity.through(found.background_sensitivity, static.covariance)
         behind = found.background, found.background_variance + around
         if measured is not None:
-            own, spread = posterior.behind(tile, static, measured[0], measured[1], variance)
-            known = np.isfinite(own)
+            own, spread = posterior.behind(tile, static, measured, valid, variance)
+            known = np.isfinite(own) & np.isfinite(spread)
             behind = np.where(known, own, behind[0]), np.where(known, spread, behind[1])
         values: Values = {}
         films = (signal, left), behind

@@ -84,7 +84,7 @@ def judge_twin(
         seen = (scene, corrected, response, separated)
         read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
         ways = {"alone": over_the_image(scene, separated)}
-        if cameras != "one place":
+        if cameras != "one place" or (shown and picture is None):
             whole = separation.separate(
                 corrected, response, reflection_shift=shift, alone=separated
             )
