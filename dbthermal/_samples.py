@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.ndimage import uniform_filter
 from scipy.special import bdtrc, ndtri
 
 from dbthermal._arrays import Array, Mask
@@ -27,6 +28,8 @@ _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
 PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
+# Pixels along either side of which the noise of resampled counts is measured, and steps in time.
+_AROUND, _STEPS = 5, 700
 
 _AT_ONCE: Final = 2**17  # samples that are compared together, to stay in the cache
 
@@ -142,6 +145,29 @@ def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
     for first in (0, 1, 3, 4):
         around += rapid[:, first : first + inner] ** 2
     return rapid[:, 2:-2], change, around
+
+
+def resampled_noise(
+    counts: npt.NDArray[Any], resampled: npt.NDArray[Any], stated: Array, width: int
+) -> Array:
+    """Noise (pixel) [1] of resampled counts over that which is stated, of an image so wide.
+
+    Both are told by the changes between frames, of the counts (band, time, pixel) that were
+    resampled and of the results; 1 where nothing is stated.
+    """
+    usual = np.mean(_roughness(counts) ** 2, axis=1) ** 0.5
+    found = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
+    ratio = np.divide(found, stated, out=np.zeros_like(stated), where=stated > 0.0)
+    ratio = ratio.reshape(-1, width)
+    mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
+    return np.asarray(np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel())
+
+
+def _roughness(counts: npt.NDArray[Any]) -> Array:
+    """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
+    every = slice(None, None, max(1, counts.shape[1] // _STEPS))
+    steps = np.abs(counts[:, 1:][:, every] - counts[:, :-1][:, every])
+    return np.asarray(np.median(steps, axis=1, overwrite_input=True))
 
 
 def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:

@@ -66,6 +66,7 @@ def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) ->
     result = experiment(*args, **options)
     folder.mkdir(parents=True, exist_ok=True)
     with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
+        # Not smaller, but with a checksum: compression would take longer than a small experiment.
         part.write(zlib.compress(pickle.dumps((path.name, result)), level=0))
     Path(part.name).replace(path)
     return result

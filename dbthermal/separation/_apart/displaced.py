@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import correlate1d, distance_transform_edt, map_coordinates, uniform_filter
+from scipy.ndimage import correlate1d, distance_transform_edt, map_coordinates
 from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
@@ -38,9 +38,6 @@ _LOST_WEIGHT: Final = 0.25
 # Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
-# Pixels of which the noise of a resampled sample is measured, along either side, and frames.
-_AROUND: Final = 5
-_STEPS: Final = 700
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some twenty times [byte].
@@ -296,7 +293,10 @@ def read(
         # Neighbours that a registration has interpolated share noise: measured, not computed.
         key = (rows.start, rows.stop, source.start, source.stop)
         gain *= displacement.once(
-            key, lambda: _shared(seen[:, :, good], counts[others], gain, displacement.shape[1])
+            key,
+            lambda: samples.resampled_noise(
+                seen[:, :, good], counts[others], gain, displacement.shape[1]
+            ),
         )
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
@@ -309,15 +309,6 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
     y, x = np.divmod(used, pixels // (rows.stop - rows.start))
     places = {"y": y + rows.start, "x": x}
     return used, {name: xr.DataArray(one, dims="pixel") for name, one in places.items()}
-
-
-def _shared(seen: Array, resampled: Array, gain: Array, width: int) -> Array:
-    """Measured noise (pixel) [1] of resampled counts over that which a `gain` states."""
-    usual = np.mean(_roughness(seen) ** 2, axis=1) ** 0.5
-    found = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
-    ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(-1, width)
-    mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
-    return np.asarray(np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel())
 
 
 def _blurred(
@@ -382,13 +373,6 @@ def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
     """Weights (row, row among) of a Gaussian, 0 in its tail."""
     away = np.subtract.outer(np.arange(rows.stop)[rows], np.arange(among.stop)[among]) / deviation
     return np.where(abs(away) <= TAIL, np.exp(-0.5 * away**2), 0.0)
-
-
-def _roughness(counts: Array) -> Array:
-    """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
-    every = slice(None, None, max(1, counts.shape[1] // _STEPS))
-    steps = np.abs(counts[:, 1:][:, every] - counts[:, :-1][:, every])
-    return np.asarray(np.median(steps, axis=1, overwrite_input=True))
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
