@@ -15,10 +15,11 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import _rows, schema, store
-from dbthermal._arrays import Mask, made_on_disk, on_disk, release
+from dbthermal._arrays import Mask, empty, made_on_disk, on_disk, quotient, release
 from dbthermal._warnings import warned
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
+from dbthermal.alignment._resampling import registered
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
@@ -28,10 +29,10 @@ from dbthermal.store._results import check_place
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
 
-# Pixels and frames, at most, of the reduced capture, from which all is found that is of the whole
-# image.
+# Pixels and frames, at most, of the means from which all is found that is of the whole image.
 _PIXELS: Final = 20_000
 _FRAMES: Final = 400
+_COMMON: Final = 0.5  # share of a square's pixels that a frame must have
 # Clocks that are tried, at most, and in a row without being better than one before.
 _ROUNDS, _VAIN = 8, 2
 _LATE: Final = 0.02  # clocks no further apart are the same [frame]
@@ -159,6 +160,34 @@ def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Capture on one clock, and the shift of its reflections; None where they are not apart."""
+    options = dict(options)
+    if "transform" in options:
+        corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
+    small = _of_squares(corrected)
+    if small is corrected:
+        aligned, field, step = _on_one_clock(corrected, response, options)
+    else:  # what is of the whole image is found of the small one
+        aligned, field, step = _on_one_clock(small, _averaged(response), options)
+        names = corrected["band"].values
+        offset = xr.DataArray(aligned.attrs["time_offset"], {"band": names}, "band")
+        aligned = align(corrected, **{**options, "offset": offset})
+        field = None if field is None else _enlarged(field, corrected)
+    if field is None or not (seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0):
+        return aligned, None
+    if not abs(step) <= _PRECISION:
+        off = f"{abs(step):.2g}" if np.isfinite(step) else "an unknown number of"
+        aligned = warned(
+            aligned,
+            f"The offset found between the cameras' clocks may be off by {off} frames, more than "
+            f"{_PRECISION:g}: what moves fast may be wrong without a flag. Give it [s] if known.",
+        )
+    return aligned, field
+
+
+def _on_one_clock(
+    corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
+) -> tuple[xr.Dataset, xr.Dataset | None, float]:
+    """Capture on one clock, the shift of its reflections, and the clocks' last step [frame]."""
     names, tried = corrected["band"].values, list[_Trial]()
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
 
@@ -172,31 +201,20 @@ def _aligned(
 
     aligned, field = at(**({} if "offset" in options else {"offset": together}))
     if "offset" in options:
-        step = 0.0
-    else:
-        # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
-        # the clocks are compared at places of the same reflection, whose shift is then found anew.
-        tried.clear()
-        aligned, field = at(reflection_shift=field)
-        frame = float(np.median(np.diff(aligned["time"].values)))
-        while tried and field is tried[-1].field:  # the last one told a delay
-            if (offset := _next(tried, frame)) is None:
-                break
-            aligned, field = at(offset=offset)
-        best, step = _step(tried, frame) if tried else (None, np.nan)
-        if best is not None and field is not best.field:
-            aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
-        step /= frame
-    if field is None or not (seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0):
-        return aligned, None
-    if not abs(step) <= _PRECISION:
-        off = f"{abs(step):.2g}" if np.isfinite(step) else "an unknown number of"
-        aligned = warned(
-            aligned,
-            f"The offset found between the cameras' clocks may be off by {off} frames, more than "
-            f"{_PRECISION:g}: what moves fast may be wrong without a flag. Give it [s] if known.",
-        )
-    return aligned, field
+        return aligned, field, 0.0
+    # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock: the
+    # clocks are compared at places of the same reflection, whose shift is then found anew.
+    tried.clear()
+    aligned, field = at(reflection_shift=field)
+    frame = float(np.median(np.diff(aligned["time"].values)))
+    while tried and field is tried[-1].field:  # the last one told a delay
+        if (offset := _next(tried, frame)) is None:
+            break
+        aligned, field = at(offset=offset)
+    best, step = _step(tried, frame) if tried else (None, np.nan)
+    if best is not None and field is not best.field:
+        aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
+    return aligned, field, step / frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,52 +271,90 @@ def _next(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:
     """Shift of the reflections over all pixels; None where nothing tells it."""
     try:
-        field = reflection_shift(*_reduced(aligned, response))
+        field = reflection_shift(*_of_means(aligned, response))
     except ValueError:  # as where nothing moves, or the image is too small
         return None
-    return _enlarged(field, aligned) if bool(field["known"].any()) else None
+    return field if bool(field["known"].any()) else None
 
 
-def _reduced(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Capture of means over squares of pixels and over frames, and the response for it."""
-    side, length = _reduction(aligned)
-    if side == length == 1:
+def _side(counts: xr.DataArray) -> int:
+    """Side of the squares [pixel] of which what is of the whole image is found."""
+    return int(np.ceil(np.sqrt(max(1.0, counts[0, 0].size / _PIXELS))))
+
+
+def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
+    """Capture of means over squares of pixels, if its image is large, each band on its own clock.
+
+    Of each pixel's changes about its own mean: one that lacks a sample does not move the others'.
+    """
+    counts, side = corrected["counts"], _side(corrected["counts"])
+    if side == 1:
+        return corrected
+    bands, frames, height, width = (*counts.shape[:2], *(n // side for n in counts.shape[2:]))
+    film, seen = empty((bands, frames, height, width), np.float32), np.zeros((height, width), bool)
+    bad = np.zeros(counts.shape[2:], dtype=bool)
+    if "status" in corrected:
+        bad = (corrected["status"].values & int(schema.UNMEASURED)) != 0
+    for row in range(height):
+        part = slice(row * side, (row + 1) * side), slice(0, width * side)
+        values = counts[:, :, *part].values
+        here = schema.measured(values) & ~bad[part]
+        own = np.where(here, values, 0.0).sum(axis=1, dtype=np.float64)
+        own = quotient(own, here.sum(axis=1), np.nan)
+        told = np.isfinite(own).all(axis=0)  # of all bands the same pixels
+        here &= told
+        change = np.where(here, values - own[:, np.newaxis], 0.0)
+        squares = (bands, -1, side, width, side)
+        number = here.reshape(squares).sum(axis=(2, 4))
+        changes = quotient(change.reshape(squares).sum(axis=(2, 4)), number, np.nan)
+        all_told = told.reshape(side, width, side).sum(axis=(0, 2))
+        levels = np.where(told, own, 0.0).reshape(bands, 1, side, width, side).sum(axis=(2, 4))
+        common = number > _COMMON * all_told
+        film[:, :, row] = np.where(common, changes + quotient(levels, all_told, np.nan), np.nan)
+        seen[row] = all_told > 0
+        release()
+    dims, attrs = counts.dims, counts.attrs
+    return corrected.drop_dims(["y", "x"]).assign(
+        counts=(dims, film, attrs),
+        status=(dims[2:], np.where(seen, 0, Status.DEAD_PIXEL).astype(np.uint32)),
+    )
+
+
+def _averaged(response: xr.Dataset) -> xr.Dataset:
+    """Response for means of samples, whose noise is found of the capture."""
+    # Interpolated samples are not independent: the noise of their means is that of the means.
+    return response.drop_vars(["noise", "netd"], errors="ignore")
+
+
+def _of_means(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Capture of means over frames, if it is long, and the response for it."""
+    length = aligned.sizes["time"] // _FRAMES
+    if length <= 1:
         return aligned.load(), response
-    maps = aligned.drop_vars(["y", "x"], errors="ignore")
-    counts, squares = maps["counts"], dict[str, Any](y=side, x=side, boundary="trim")
-    none = {dim: xr.zeros_like(maps[dim], dtype=np.int32) for dim in ("time", "y", "x")}
-    bad = (maps.get("status", none["y"] + none["x"]) & int(schema.UNMEASURED)) != 0
-    segment = maps.get("segment", none["time"])
+    counts = aligned.drop_vars(["y", "x"], errors="ignore")["counts"]
+    segment = aligned.get("segment", xr.zeros_like(aligned["time"], dtype=np.int32))
     first = segment.values[np.arange(segment.size) // length * length]
     rows = []
-    for top in range(0, counts.sizes["y"] - side + 1, side):
-        block = counts[:, :, top : top + side].astype(np.float64)
+    for top in range(counts.sizes["y"]):
+        block = counts[:, :, top : top + 1].astype(np.float64)
         # Of all bands the same samples, on one side of a shutter event.
         valid = schema.measured(block).all("band") & (segment == first)
-        valid &= ~bad[top : top + side]
-        rows.append(block.where(valid).coarsen(time=length, **squares).mean())
-    small = xr.Dataset(
+        rows.append(block.where(valid).coarsen(time=length, boundary="trim").mean())
+    mean = xr.Dataset(
         {
             "counts": xr.concat(rows, "y").astype(np.float32).assign_attrs(counts.attrs),
-            "status": bad.coarsen(**squares).all() * np.uint32(Status.DEAD_PIXEL),
             "segment": ("time", first[: rows[0].sizes["time"] * length : length]),
         },
         attrs=aligned.attrs,
     )
-    # Interpolated samples are not independent: the noise of their means is that of the means.
-    return small, response.drop_vars(["noise", "netd"], errors="ignore")
-
-
-def _reduction(aligned: xr.Dataset) -> tuple[int, int]:
-    """Side of a square of pixels, and number of frames, of which `_reduced` takes the mean."""
-    pixels = aligned.sizes["y"] * aligned.sizes["x"]
-    side = int(np.ceil(np.sqrt(max(1.0, pixels / _PIXELS))))
-    return side, max(1, aligned.sizes["time"] // _FRAMES)
+    if "status" in aligned:
+        mean["status"] = aligned["status"].variable
+    return mean, _averaged(response)
 
 
 def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
-    """Field of a reduced capture over the pixels of the whole one."""
-    side, shape = _reduction(aligned)[0], (aligned.sizes["y"], aligned.sizes["x"])
+    """Field of a capture `_of_squares` over the pixels of the whole one."""
+    side, shape = _side(aligned["counts"]), (aligned.sizes["y"], aligned.sizes["x"])
     # The centre of a square of n pixels is n - 1 half pixels from that of its first.
     places = (np.indices(shape) - 0.5 * (side - 1)) / side
     near = tuple(

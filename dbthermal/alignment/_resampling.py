@@ -127,16 +127,13 @@ def align(
     (True, [0, 1])
     """
     names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
-    views, shares, recorded = corrected["counts"], np.ones(len(names)), {}
+    views = corrected["counts"]
     if transform is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        corrected, shares = _registered(corrected, _maps(transform, corrected), lazy=lazy)
-        if "row" in transform.dims:
-            places = schema.band_positions(transform, names, "the transform")
-            recorded["transform"] = transform.values[places].ravel().tolist()
+        corrected = registered(corrected, transform, lazy=lazy)
     counts, alike = corrected["counts"], corrected
     if reflection_shift is not None and offset is None:
-        alike, _ = _registered(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
+        alike, _ = _moved(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
     offsets = _offsets(alike, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
@@ -171,17 +168,30 @@ def align(
     apart = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
     gone = [name for name, away in zip(names, apart, strict=True) if away]
     result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
-    result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
-    if "pattern_std" in result:
-        result["pattern_std"] = result["pattern_std"] * shares
-        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
+    if "noise_factor" in corrected:
+        factors = factors * corrected["noise_factor"].values
+    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),
         frames_lost=lost,
         pauses=clocks.pauses(times).ravel().tolist(),
-        **recorded,
     )
+
+
+def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) -> xr.Dataset:
+    """Capture with all views on the first one's grid, each band on its own clock, see `align`."""
+    result, shares = _moved(corrected, _maps(transform, corrected), lazy=lazy)
+    factors = shares * (corrected["noise_factor"].values if "noise_factor" in corrected else 1.0)
+    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
+    if "pattern_std" in result:
+        result["pattern_std"] = result["pattern_std"] * shares
+        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
+    if "row" in transform.dims:
+        names = [str(name) for name in corrected["band"].values]
+        places = schema.band_positions(transform, names, "the transform")
+        result.attrs["transform"] = transform.values[places].ravel().tolist()
+    return result
 
 
 def interpolation(places: Array, taps: int) -> csr_array:
@@ -339,10 +349,8 @@ def _single(counts: npt.NDArray[Any]) -> Movie:
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
 
 
-def _registered(
-    corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool
-) -> tuple[xr.Dataset, Array]:
-    """All views, and the status, on the first one's grid; factor of each one's noise (band)."""
+def _moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[xr.Dataset, Array]:
+    """All views, and the status, at other rows and columns; factor of each one's noise (band)."""
     counts, status = corrected["counts"], corrected.get("status")
     flags = np.zeros(counts.shape[2:], dtype=np.uint8) if status is None else status.values
     weights = [_weights(places, flags > 0) for places in maps]
