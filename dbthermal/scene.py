@@ -4,8 +4,9 @@
 step. With a target on disk its films are there, too, and it works in the memory of some rows.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -19,7 +20,7 @@ from dbthermal._arrays import Mask, empty, made_on_disk, on_disk, quotient, rele
 from dbthermal._warnings import warned
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
-from dbthermal.alignment._resampling import registered
+from dbthermal.alignment._resampling import STEP, on_one_clock, registered
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
@@ -165,9 +166,10 @@ def _aligned(
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
     small = _of_squares(corrected)
     if small is corrected:
-        aligned, field, step = _on_one_clock(corrected, response, options)
+        aligned, field, step = _clocked(corrected, response, options, align)
     else:  # what is of the whole image is found of the small one
-        aligned, field, step = _on_one_clock(small, _averaged(response), options)
+        resample = partial(on_one_clock, steps=STEP * _side(corrected["counts"]))
+        aligned, field, step = _clocked(small, response, options, resample)
         names = corrected["band"].values
         offset = xr.DataArray(aligned.attrs["time_offset"], {"band": names}, "band")
         aligned = align(corrected, **{**options, "offset": offset})
@@ -184,15 +186,18 @@ def _aligned(
     return aligned, field
 
 
-def _on_one_clock(
-    corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
+def _clocked(
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    options: Mapping[str, Any],
+    resample: Callable[..., xr.Dataset],
 ) -> tuple[xr.Dataset, xr.Dataset | None, float]:
     """Capture on one clock, the shift of its reflections, and the clocks' last step [frame]."""
     names, tried = corrected["band"].values, list[_Trial]()
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
 
     def at(**how: Any) -> tuple[xr.Dataset, xr.Dataset | None]:
-        aligned = align(corrected, **{**options, **how})
+        aligned = resample(corrected, **{**options, **how})
         field = _shift(aligned, response)
         if field is not None and np.isfinite(field.attrs["delay"]):
             offset = together.copy(data=aligned.attrs["time_offset"])
@@ -213,7 +218,7 @@ def _on_one_clock(
         aligned, field = at(offset=offset)
     best, step = _step(tried, frame) if tried else (None, np.nan)
     if best is not None and field is not best.field:
-        aligned, field = align(corrected, **{**options, "offset": best.offset}), best.field
+        aligned, field = resample(corrected, **{**options, "offset": best.offset}), best.field
     return aligned, field, step / frame
 
 
@@ -317,13 +322,9 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
     return corrected.drop_dims(["y", "x"]).assign(
         counts=(dims, film, attrs),
         status=(dims[2:], np.where(seen, 0, Status.DEAD_PIXEL).astype(np.uint32)),
+        # Neighbours that a registration made of the same pixels have their mean's noise together.
+        noise_factor=("band", np.full(bands, 1.0 / side), schema.NOISE_FACTOR.attrs),
     )
-
-
-def _averaged(response: xr.Dataset) -> xr.Dataset:
-    """Response for means of samples, whose noise is found of the capture."""
-    # Interpolated samples are not independent: the noise of their means is that of the means.
-    return response.drop_vars(["noise", "netd"], errors="ignore")
 
 
 def _of_means(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
@@ -349,7 +350,8 @@ def _of_means(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr
     )
     if "status" in aligned:
         mean["status"] = aligned["status"].variable
-    return mean, _averaged(response)
+    # Interpolated samples are not independent: the noise of their means is that of the means.
+    return mean, response.drop_vars(["noise", "netd"], errors="ignore")
 
 
 def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:

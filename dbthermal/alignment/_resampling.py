@@ -34,7 +34,7 @@ TAPS: Final = 6  # pixels a side that a sample between pixels is made of
 _ROUNDING: Final = 1e-7  # a weight that is none [1]
 _BEYOND: Final = 0.1  # so far outside the centre of the last pixel its line still holds [pixel]
 
-_STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
+STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
 
@@ -126,11 +126,35 @@ def align(
     >>> bool((aligned.counts[1, :-1] == counts[1, 1:]).all()), aligned.frames_lost
     (True, [0, 1])
     """
-    names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
-    views = corrected["counts"]
+    schema.check_corrected(corrected)
     if transform is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
         corrected = registered(corrected, transform, lazy=lazy)
+    return on_one_clock(
+        corrected,
+        offset=offset,
+        search=search,
+        clock=clock,
+        reflection_shift=reflection_shift,
+        lazy=lazy,
+    )
+
+
+def on_one_clock(
+    corrected: xr.Dataset,
+    *,
+    offset: float | xr.DataArray | None = None,
+    search: int = SEARCH,
+    clock: str | None = None,
+    reflection_shift: xr.Dataset | None = None,
+    lazy: bool = False,
+    steps: float = STEP,
+) -> xr.Dataset:
+    """Registered views on one clock, see `align`; of other steps [standard deviation of noise].
+
+    Means over pixels have less noise, but step no less where something passes.
+    """
+    names = [str(name) for name in corrected["band"].values]
     counts, alike = corrected["counts"], corrected
     if reflection_shift is not None and offset is None:
         alike, _ = _moved(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
@@ -143,7 +167,7 @@ def align(
     noise, relative = _noise(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
-    plans, factors, missing = [], np.ones(len(names)), _missing(views)
+    plans, factors, missing = [], np.ones(len(names)), _missing(counts)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
         plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
@@ -158,7 +182,7 @@ def align(
             movie = _single(movies.isel(band=band).values)
             if missing[band].any():
                 movie = np.where(missing[band][:, None, None], np.float32(np.nan), movie)
-            plan.apply(movie, result[band], _largest(noise[band], movie))
+            plan.apply(movie, result[band], _largest(steps * noise[band], movie))
         return result
 
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
@@ -314,9 +338,9 @@ def _place(clock: str, names: list[str]) -> int:
 
 
 def _largest(noise: float, movie: Movie) -> float:
-    """Largest step [count] of noise: a difference less the mean of its two neighbours."""
+    """Largest step [count] of so much noise: a difference less the mean of its two neighbours."""
     rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
-    return float(_STEP * np.sqrt(3.0) * noise + rounding)
+    return float(np.sqrt(3.0) * noise + rounding)
 
 
 def _noise(signals: Array, stamps: Array) -> Array:
