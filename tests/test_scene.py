@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _arrays, _rows, scene, simulation, store
+from dbthermal import _arrays, _rows, scene, schema, simulation, store
 from dbthermal.alignment import align
 from dbthermal.correction import correct_capture
 from dbthermal.scene import separate_capture
@@ -176,6 +176,69 @@ def test_clocks_that_nothing_tells_are_doubted(
     assert abs(found + 0.2) < 0.01
     assert len(tried) == 3
     assert "0.3 frames" in aligned.attrs["warnings"][-1]
+
+
+@pytest.mark.slow
+def test_a_large_image_is_aligned_by_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clocks and the shift of means over squares are those of all pixels."""
+    rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (3, -2), "late": 1, "shutter": (0.4,)}
+    recording = whole.record(
+        (64, 96), (300, 10.0), 1, **rig, lost=(0.03, 0.005), steps=6, frames=16
+    )
+    fitted, response = whole.calibrate(recording.movies)
+    corrected = correct_capture(recording.capture, fitted)
+    options = {"transform": whole.registration(rig["view"])}
+    aligned, found = [], []
+    for pixels in (64 * 96, 64 * 96 // 4):
+        monkeypatch.setattr(scene, "_PIXELS", pixels)
+        capture, field = scene._aligned(corrected, response, options)
+        assert field is not None
+        aligned.append(capture)
+        found.append(field)
+    clocks = [capture.attrs["time_offset"][1] for capture in aligned]
+    true = smooth_shift((66, 99), *rig["shift"])[1, 2:, :96]  # of the part that both views show
+    known = found[0]["known"].values & found[1]["known"].values
+    errors = [field["shift"].values[1][known] - true[known] for field in found]
+    spread = [float(np.sqrt(np.mean(error**2))) for error in errors]
+    print(f"clocks {clocks} s, true 0.05; shifts off by {spread} pixels, {known.mean():.2f} known")
+    np.testing.assert_allclose(clocks, 0.05, atol=0.005)  # 0.05 of a frame
+    assert known.mean() > 0.9
+    assert spread[1] < 1.5 * spread[0]
+    assert aligned[1]["counts"].shape == aligned[0]["counts"].shape
+    np.testing.assert_allclose(aligned[1]["noise_factor"], aligned[0]["noise_factor"], rtol=0.02)
+
+
+def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pixel that lacks samples does not step the mean; a bad one and a missing frame count."""
+    rng, level = np.random.default_rng(2), np.array([20000.0, 21000.0])[:, None, None, None]
+    pattern, change = rng.normal(0.0, 500.0, (2, 1, 6, 9)), rng.normal(0.0, 50.0, (2, 40, 1, 1))
+    counts = (level + pattern + change).astype(np.float32)
+    counts[1, 10:20, 0, 0] = np.nan  # single samples
+    counts[0, 30] = np.nan  # a frame
+    counts[0, :, 0:3, 3:6] = np.nan  # a square that one band does not see
+    status = np.zeros((6, 9), np.uint32)
+    status[4, 4] = schema.Status.DEAD_PIXEL
+    counts[:, :, 4, 4] = 7.0
+    corrected = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts), "status": (("y", "x"), status)},
+        {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
+    )
+    monkeypatch.setattr(scene, "_PIXELS", 6)
+    small = scene._of_squares(corrected)
+    values = small["counts"].values
+    assert values.shape == (2, 40, 2, 3)
+    blind = np.zeros((2, 3), dtype=bool)
+    blind[0, 1] = True
+    np.testing.assert_array_equal(small["status"] != 0, blind)
+    assert np.isnan(values[:, :, blind]).all()
+    there = np.arange(40) != 30
+    assert np.isnan(values[0, 30]).all()
+    seen = values[:, there][:, :, ~blind]
+    expected = np.broadcast_to(change[:, there, 0], seen.shape)
+    np.testing.assert_allclose(seen - seen[:, :1], expected - expected[:, :1], atol=10.0)
+    np.testing.assert_allclose(
+        seen[..., 1:] - seen[:, :1, 1:], (expected - expected[:, :1])[..., 1:], atol=0.02
+    )
 
 
 def test_a_target_is_refused_before_the_work(plate: tuple[xr.Dataset, ...], tmp_path: Path) -> None:
