@@ -179,3 +179,16 @@ EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
 
 The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from reflectances of 116 %
 and -1.4 % relative to the reference."""
+
+MEASURED: Final = "measured"
+"""Attribute `origin` of what a real camera has recorded; of all else it begins otherwise."""
+
+
+def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
+    """Attribute `origin` of what is made of several inputs: simulated where one of them is.
+
+    Of the inputs' attributes; empty if no input states one.
+    """
+    stated = [str(one["origin"]) for one in attrs if "origin" in one]
+    others = [one for one in stated if one != MEASURED]
+    return {"origin": (others or stated)[0]} if stated else {}

@@ -16,6 +16,12 @@ Limits = tuple[float, float]
 POSITIVE: Final = (np.nextafter(0.0, 1.0), np.finfo(np.float64).max)
 """Limits of what is finite and positive."""
 
+FINITE: Final = (-1e9, 1e9)
+"""Limits of what is finite, of counts or kelvin that a detector may have."""
+
+KELVIN: Final = (150.0, 3000.0)
+"""Limits of a temperature [K] that is in kelvin, and not in degrees Celsius or counts."""
+
 
 def real_numbers(
     name: str, value: Any, within: Limits | None = None, shape: tuple[int, ...] | None = None
@@ -35,6 +41,7 @@ def real_numbers(
     array = given.astype(np.float64, copy=False)
     if within and np.any(bad := ~((array >= within[0]) & (array <= within[1]))):
         rule = "be finite and positive" if within is POSITIVE else f"lie in {[*within]}"
+        rule += ": in kelvin, not in degrees Celsius or counts" if within is KELVIN else ""
         raise ValueError(f"Invalid {name} {given[bad].flat[0]}. Must {rule}.")
     return array
 

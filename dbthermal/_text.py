@@ -38,9 +38,19 @@ _WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]{,15})")
 _REAL: Final = re.compile(r"([-+]?(0|[1-9][0-9]*)\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
 
 
+def as_path(path: Any) -> Path:
+    """Path of text or of a path; TypeError for anything else, ValueError for an address."""
+    if not isinstance(path, str | os.PathLike):
+        kind = type(path).__name__
+        raise TypeError(f"Invalid path {shown(path)}, a {kind}. Must be text or a path.")
+    if "://" in os.fspath(path):
+        raise ValueError(f"Invalid path '{path}', an address. Must be of a file or folder here.")
+    return Path(path)
+
+
 def regular_file(path: str | Path, limit: int) -> Path:
     """Path of a regular file of at most `limit` bytes; others are refused without being opened."""
-    path = Path(path)
+    path = as_path(path)
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
         kind = "folder" if stat.S_ISDIR(state.st_mode) else "pipe, socket or device"

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal import _numbers
 from dbthermal._arrays import Array
 
 __all__ = ["background", "condition_number", "leaving", "matrix", "mixed"]
@@ -63,10 +64,7 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
     >>> leaving([0.9, 0.2], 60.0, 20.0).tolist()
     [56.0, 28.0]
     """
-    emissivity = np.asarray(emissivity, dtype=np.float64)
-    bad = ~((emissivity >= 0) & (emissivity <= 1))
-    if np.any(bad):
-        raise ValueError(f"Invalid emissivity {emissivity[bad].flat[0]}. Must lie in [0, 1].")
+    emissivity = _numbers.real_numbers("emissivity", emissivity, (0.0, 1.0))
     return np.asarray(mixed(emissivity, np.asarray(emitted), np.asarray(reflected)), np.float64)
 
 
@@ -76,9 +74,10 @@ def matrix(emissivity: npt.ArrayLike) -> Array:
     Parameters
     ----------
     emissivity : array_like, shape (..., band)
-        Emissivity a band [1].
+        Emissivity a band [1], or NaN; ValueError for one outside [0, 1].
     """
-    emissivity = np.asarray(emissivity, dtype=np.float64)
+    emissivity = _numbers.real_numbers("emissivity", emissivity)
+    _numbers.real_numbers("emissivity", emissivity[~np.isnan(emissivity)], (0.0, 1.0))
     return np.stack([emissivity, 1.0 - emissivity], axis=-1)
 
 
@@ -90,7 +89,7 @@ def condition_number(emissivity: npt.ArrayLike) -> Array:
     Parameters
     ----------
     emissivity : array_like, shape (..., band)
-        Emissivity a band [1]; at least two bands.
+        Emissivity a band [1], or NaN; ValueError for one outside [0, 1], or of one band.
 
     Examples
     --------
@@ -99,10 +98,11 @@ def condition_number(emissivity: npt.ArrayLike) -> Array:
     >>> condition_number([[0.86, 0.72], [0.90, 0.90]]).round(1).tolist()
     [9.6, inf]
     """
-    emissivity = np.asarray(emissivity, dtype=np.float64)
-    known = np.all(np.isfinite(emissivity), axis=-1)
-    filled = np.where(known[..., np.newaxis], emissivity, 0.5)
-    singular = np.linalg.svd(matrix(filled), compute_uv=False)
+    rows = matrix(emissivity)
+    if rows.ndim < 2 or rows.shape[-2] < 2:
+        raise ValueError(f"Invalid shape {rows.shape[:-1]} of emissivities. Must have two bands.")
+    known = np.all(np.isfinite(rows), axis=(-2, -1))
+    singular = np.linalg.svd(np.where(known[..., None, None], rows, 0.5), compute_uv=False)
     largest, smallest = singular[..., 0], singular[..., -1]
     infinite = np.full_like(largest, np.inf)
     regular = smallest > 4 * np.finfo(np.float64).eps * largest

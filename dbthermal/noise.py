@@ -49,9 +49,13 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     time : array_like
         Times (time,) [s], which need not be even.
     """
+    signal = _numbers.real_numbers("signal", signal)
     if np.any(np.isinf(signal)):
         raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
-    time = _numbers.real_numbers("time [s]", time)
+    time = _numbers.real_numbers("time [s]", time, shape=signal.shape[:1])
+    if np.any(bad := ~(np.diff(time) > 0.0)):
+        place = int(np.argmax(bad))
+        raise ValueError(f"Invalid time {time[place + 1]} s after {time[place]} s. Must rise.")
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
     line = before * signal[:-2] + (1.0 - before) * signal[2:]
     return np.asarray((signal[1:-1] - line) / np.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
@@ -98,6 +102,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     >>> np.allclose(estimate(first, second, time), [0.05, 0.15], rtol=0.1)  # [K]
     True
     """
+    first, second = (_numbers.real_numbers("signal", one) for one in (first, second))
+    if first.ndim != 2 or first.shape != second.shape:
+        found = f"shapes {first.shape} and {second.shape} of the signals"
+        raise ValueError(f"Invalid {found}. Must be (time, pixel), and equal.")
     frames, pixels = first.shape
     if frames < MINIMUM_FRAMES or pixels == 0:
         raise ValueError(

@@ -287,6 +287,8 @@ def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     schema.check_numbers(temperature, "the temperature", "K")
     names = [str(name) for name in schema.check(response, "response")["band"].values]
     of_bands = curves(response, names)
+    if "band" in temperature.dims:
+        raise ValueError(f"Invalid dims {temperature.dims} of the temperature. Must lack 'band'.")
     values = require_range(temperature.values, of_bands[0], "temperature")
     parts = [temperature.copy(data=one.counts(values)) for one in of_bands]
     result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))

@@ -7,6 +7,7 @@ step. With a target on disk its films are there, too, and it works in the memory
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -39,6 +40,7 @@ _ROUNDS, _VAIN = 8, 2
 _LATE: Final = 0.02  # clocks no further apart are the same [frame]
 _FLAT: Final = 0.125  # least share of a delay that is taken to be seen [1]
 _PRECISION: Final = 0.1  # step that is left, up to which the clocks pass as known [frame]
+_STEPS: Final[tuple[Callable[..., Any], ...]] = (correct_capture, align, separate)
 SAMPLE: Final = 220
 """Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
 
@@ -121,6 +123,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> bool(abs(error).median() < 0.3)  # K
     True
     """
+    for step, options in zip(_STEPS, (correcting, aligning, separating), strict=True):
+        _check_options(step, options)
     if target is not None:
         place = check_place(target, ".zarr").absolute().parent
         place.mkdir(parents=True, exist_ok=True)
@@ -149,6 +153,19 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
     maps = {} if field is None else {"reflection_shift": field["shift"]}
     return result.assign(maps).assign_attrs(attrs)
+
+
+def _check_options(step: Callable[..., Any], options: Any) -> None:
+    """Refuse what is no mapping of options that a step has by name, and is not given here."""
+    name = step.__name__
+    if not isinstance(options, Mapping):
+        kind = type(options).__name__
+        raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
+    by_name = [one for one in signature(step).parameters.values() if one.kind is one.KEYWORD_ONLY]
+    known = [one.name for one in by_name if one.name != "lazy"]
+    for option in options:
+        if option not in known:
+            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {known}.")
 
 
 def _let_go(part: xr.Dataset) -> xr.Dataset:

@@ -18,6 +18,7 @@ from dbthermal._glossary import (
     EXPOSURE_TIME,
     FRAME_FLAGS,
     LARGEST,
+    MEASURED,
     NOISE,
     NOISE_FACTOR,
     OPTIONAL,
@@ -27,6 +28,7 @@ from dbthermal._glossary import (
     STAGES,
     STATUS,
     Variable,
+    origin,
 )
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "EXPOSURE_TIME",
     "FRAME_FLAGS",
     "LARGEST",
+    "MEASURED",
     "NOISE",
     "NOISE_FACTOR",
     "OPTIONAL",
@@ -55,6 +58,7 @@ __all__ = [
     "check_variable",
     "has_flag",
     "measured",
+    "origin",
     "status_attrs",
     "variables",
 ]

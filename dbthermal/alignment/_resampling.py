@@ -156,6 +156,8 @@ def on_one_clock(
     """
     names = [str(name) for name in corrected["band"].values]
     counts, alike = corrected["counts"], corrected
+    if reflection_shift is not None:
+        schema.check(reflection_shift, "reflection_shift")
     if reflection_shift is not None and offset is None:
         alike, _ = _moved(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
     offsets = _offsets(alike, offset, names, search)
@@ -323,7 +325,6 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
 
 def _reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
     """Rows and columns (2, y, x) in each band of one reflection; NaN where it is not known."""
-    schema.check(field, "reflection_shift")
     field = laid_on(field, corrected, "the reflection shift", "the capture")
     here = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
     moved = here + field["shift"].where(field["known"]).transpose("axis", "y", "x").values

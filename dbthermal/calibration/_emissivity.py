@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, planck, schema
+from dbthermal import _numbers, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
@@ -67,7 +67,7 @@ class Bias:
                 raise ValueError(
                     f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
                 )
-        planck.require_positive("air_temperature [K]", self.air_temperature)
+        _numbers.real_number("air_temperature [K]", self.air_temperature, _numbers.KELVIN)
 
     @property
     def _felt(self) -> float:

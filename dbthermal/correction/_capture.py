@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _rows, schema
+from dbthermal import _text as texts
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import find_shutter, mark_shutter
@@ -131,6 +132,8 @@ def correct_capture(
     """
     schema.check(capture, "capture")
     schema.check(correction, "correction")
+    if not isinstance(shutter, bool | np.bool_):
+        raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
     closed = _closed(capture)
     events = find_shutter(capture, closed=closed) if shutter else None
     before = correction if flat is None else renew_offset(correction, flat)

@@ -5,7 +5,7 @@ view at several temperatures, and each pixel is brought to the frame's mean by l
 pixel is marked, never filled from its neighbours, which would look like a measurement.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -88,7 +88,7 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
             raise ValueError(f"Invalid noise {value} count of the movies in band '{band}'. {rule}.")
     means = counts.mean("frame", dtype=np.float64, skipna=False)
     variables = schema.variables("blackbody_frames", {"counts": means.values, "noise": noise})
-    return xr.Dataset(variables, means.coords, {"frames": frames})
+    return xr.Dataset(variables, means.coords, {"frames": frames, **schema.origin(movies.attrs)})
 
 
 def fit_correction(
@@ -161,6 +161,8 @@ def fit_correction(
     counts = schema.check(blackbody, "blackbody_frames")["counts"]
     if counts.sizes["temperature"] < 2:
         raise ValueError("Invalid blackbody frames of 1 temperature. Must have at least 2.")
+    kelvin = counts["temperature"].values
+    _numbers.real_numbers("temperature [K] of a blackbody", kelvin, _numbers.KELVIN)
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = (counts.sizes["y"], counts.sizes["x"])
@@ -174,8 +176,9 @@ def fit_correction(
     values |= {"residual": residual, "level": level}
     values |= _residual_pattern(residual, level, blackbody)
     coords = {name: counts.coords[name] for name in counts.dims if name in counts.coords}
-    attrs = {"threshold": threshold, "detector_maximum": maximum}
+    attrs: dict[str, Any] = {"threshold": threshold, "detector_maximum": maximum}
     attrs |= {"blackbody_temperatures": counts["temperature"].values.tolist()}
+    attrs |= schema.origin(blackbody.attrs)
     return xr.Dataset(schema.variables("correction", values), coords, attrs)
 
 
@@ -256,7 +259,7 @@ def correct(
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):
         raise ValueError("Invalid capture: gain and offset were corrected before. Must be raw.")
-    if counts.dtype != np.uint16:
+    if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     maps = _maps(correction, counts)
@@ -283,6 +286,7 @@ def correct(
     by_camera = correction.attrs.get("by_camera", 0)
     done |= {"gain_offset_corrected": 1 - by_camera, "detector_maximum": maximum}
     done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
+    done |= schema.origin(capture.attrs, correction.attrs)
     return schema.check(result.assign_attrs(done), "corrected")
 
 

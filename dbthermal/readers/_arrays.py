@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import schema
 from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
@@ -22,7 +23,9 @@ _DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _UNITS: Final = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_ATTRIBUTES: Final = ("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value")
+_ATTRIBUTES: Final = (
+    *("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value", "origin"),
+)
 
 
 def array(
@@ -109,7 +112,7 @@ def array(
         counts = np.asarray(values).astype(np.uint16)
     fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
     recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
-    return recordings.clocked(counts, clock, label, format="array")
+    return recordings.clocked(counts, clock, label, format="array", **schema.origin(own))
 
 
 def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:

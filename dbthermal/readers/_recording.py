@@ -56,7 +56,8 @@ class FileFlag(schema.Flags):
 
 def files(path: Paths) -> list[Path]:
     """Regular files of a recording, in the order of time; ValueError by what to do instead."""
-    paths = [Path(path)] if isinstance(path, str | Path) else [Path(one) for one in path]
+    several = path if isinstance(path, list | tuple) else [path]
+    paths = [texts.as_path(one) for one in several]
     if not paths:
         raise ValueError("Empty list of files. Must name at least one.")
     numbers = [[int(digits) for digits in re.findall("[0-9]+", one.stem)] for one in paths]
@@ -219,7 +220,7 @@ def recording(
     outside = slots - np.clip(slots, known[0], known[-1])
     time = np.interp(slots, known, exposed[known]) + period * outside
     coordinate = ("time", time - time[0], schema.COORDINATES["time"].attrs)
-    return xr.Dataset(variables, {"time": coordinate}, {"origin": "measured", **attrs})
+    return xr.Dataset(variables, {"time": coordinate}, {"origin": schema.MEASURED, **attrs})
 
 
 def clocked(counts: Counts, clock: Clock, name: str, **attrs: str) -> xr.Dataset:

@@ -102,7 +102,7 @@ def two_bands(
         )
     shared = min(one.sizes["time"] for one in pair)
     parts = [one["counts"].values[:shared] for one in pair]
-    if shared > 1 and np.array_equal(parts[0], parts[1]):
+    if np.array_equal(parts[0], parts[1]):
         raise ValueError(
             f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
             "is one file named twice?"
@@ -123,7 +123,7 @@ def two_bands(
     variables["frame_flags"] = (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS))
     time = ("time", clock, schema.COORDINATES["time"].attrs)
     attrs = {
-        "origin": "measured",
+        **schema.origin(first.attrs, second.attrs),
         "source": " and ".join(str(one.attrs.get("source", "")) for one in pair),
         "offset": late,
         "offset_by": "dates" if offset is None else "caller",
@@ -184,6 +184,7 @@ def _check(one: xr.Dataset, name: str) -> None:
         if not known.size or not np.isfinite(known).all() or np.any(np.diff(known) <= 0):
             rule = "Must be known, finite and rise; an exposure time may be NaN, not all"
             raise ValueError(f"Invalid '{variable}' of band '{name}' {shown(values)}. {rule}.")
-    if one["counts"].dtype != np.uint16:
-        dtype = one["counts"].dtype
-        raise TypeError(f"Invalid dtype {dtype} of the counts of band '{name}'. Must be uint16.")
+    for variable in ("counts", "frame_flags"):
+        if ((dtype := one[variable].dtype).kind, dtype.itemsize) != ("u", 2):
+            found = f"dtype {dtype} of the {variable} of band '{name}'"
+            raise TypeError(f"Invalid {found}. Must be uint16.")

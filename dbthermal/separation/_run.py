@@ -19,6 +19,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from dbthermal import _numbers, store
+from dbthermal import _text as texts
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
 from dbthermal.separation._solve import get_method, require_seed, solve
@@ -249,8 +250,10 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
             f"Invalid number of targets {len(targets)} for {len(sources)} captures. Must be one "
             "for each."
         )
-    places = [Path(place).absolute() for place in targets]
-    captures = [it if isinstance(it, xr.Dataset) else Path(it).absolute() for it in sources]
+    places = [texts.as_path(place).absolute() for place in targets]
+    captures = [
+        it if isinstance(it, xr.Dataset) else texts.as_path(it).absolute() for it in sources
+    ]
     named = [*places, *(it for it in captures if isinstance(it, Path))]
     for place in places:
         if place.suffix != ".zarr" or named.count(place) > 1:
@@ -306,6 +309,11 @@ def _begin(parts: Path, plan: Mapping[str, Any]) -> None:
     file, content = parts / "plan.json", json.dumps(plan, indent=2, sort_keys=True)
     parts.mkdir(parents=True, exist_ok=True)
     if not file.exists():
+        if foreign := [one.name for one in parts.iterdir() if not one.name.startswith(".plan-")]:
+            raise ValueError(
+                f"Foreign folder '{parts}', with '{foreign[0]}'. Must be of a run, for it is "
+                "deleted at the end, or none."
+            )
         part = parts / f".plan-{os.getpid()}"
         part.write_text(content)
         part.replace(file)

@@ -120,6 +120,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
+    schema.check_corrected(corrected)
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps

@@ -63,6 +63,7 @@ class Rig:
         if len(self.noise) != len(self.bands):
             raise ValueError(f"Invalid noise {self.noise} K. Must be one for each of {self.bands}.")
         planck.require_positive("noise [K]", self.noise)
+        _numbers.real_number("offset [count]", self.offset, _numbers.FINITE)
         for name in ("counts_per_kelvin", "lowest", "highest", "gain_std", "offset_std"):
             _numbers.real_number(name, getattr(self, name), (0.0, schema.LARGEST))
         if not 0 <= _numbers.real_number("bad_fraction", self.bad_fraction) < 1:

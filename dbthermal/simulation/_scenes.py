@@ -48,8 +48,11 @@ class Background:
     def __post_init__(self) -> None:
         if self.kind not in _BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
-        for name in ("level", "amplitude", "drift", "count", "duration"):
-            _numbers.real_numbers(name, getattr(self, name))
+        _numbers.real_number("level [K]", self.level, _numbers.KELVIN)
+        for name in ("amplitude", "drift"):
+            _numbers.real_number(f"{name} [K]", getattr(self, name), _numbers.FINITE)
+        for name in ("count", "duration"):
+            _numbers.real_numbers(name, getattr(self, name), (0.0, schema.LARGEST), (2,))
         if not 0 <= self.count[0] <= self.count[1]:
             raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
         if not 0 < self.duration[0] <= self.duration[1]:
@@ -256,7 +259,9 @@ def walkers(
     >>> dict(capture["counts"].sizes)
     {'band': 2, 'time': 50, 'y': 24, 'x': 32}
     """
-    level, skin, hottest = temperatures
+    level, skin, hottest = _numbers.real_numbers(
+        "temperatures [K]", temperatures, _numbers.KELVIN, (3,)
+    )
     height, width = shape
     rows, columns = np.meshgrid(
         np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"

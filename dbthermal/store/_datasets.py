@@ -19,6 +19,7 @@ import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from dbthermal import _text as texts
 from dbthermal.store._integrity import (
     MARK,
     SUMS,
@@ -134,11 +135,14 @@ def save_rows(
 def _save(
     parts: Iterable[xr.Dataset],
     path: str | Path,
-    provenance: Mapping[str, Any],
+    provenance: Any,
     height: int | None,
 ) -> None:
     """Save parts that follow one another along y, each of a height that chunks then divide."""
     options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+    if not isinstance(provenance, Mapping):
+        kind = type(provenance).__name__
+        raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
@@ -265,7 +269,7 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
     (True, {'frames': 2})
     """
-    if not Path(path).is_dir():
+    if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
         raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
     checked = CheckedStore(path)
@@ -317,7 +321,9 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    first, *rest = [Path(part) for part in parts]
+    if not (folders := [texts.as_path(part) for part in parts]):
+        raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
+    first, *rest = folders
     with whole(path, ".zarr") as folder:
         shutil.copytree(first, folder, copy_function=_link)
         metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import __version__
+from dbthermal import __version__, _numbers
 from dbthermal import _text as texts
 from dbthermal.store._integrity import AS_WRITTEN, SUMS, warn_unchecked
 
@@ -85,7 +85,7 @@ def checksum(path: str | Path) -> str:
     path : str or Path
         File or folder; FileNotFoundError if it does not exist.
     """
-    path = Path(path)
+    path = texts.as_path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -275,9 +275,10 @@ def save_video(
     if codec not in _ENCODERS:
         raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
     encoder, options = _ENCODERS[codec]
+    frequency = _numbers.real_number("rate [Hz]", rate, (0.01, 1e6))
     with whole(path, ".mp4") as part, av.open(part, "w") as film:
         film.metadata["comment"] = as_json(provenance)
-        fraction = Fraction(rate).limit_denominator(1000)
+        fraction = Fraction(frequency).limit_denominator(1000)
         stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
         for frame in frames:
@@ -297,9 +298,12 @@ def save_video(
 
 def check_place(path: str | Path, suffix: str) -> Path:
     """Refuse the path of a file or folder of another end than this, or inside a store."""
-    path = Path(path)
+    path = texts.as_path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
+        rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
+        raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
     for folder in path.resolve().parents:
         if (folder / SUMS).is_file():
             raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")

@@ -243,6 +243,7 @@ def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> N
     attrs = correct(capture, correction).attrs
     assert attrs == {
         "camera": "simulated",
+        "origin": "simulated",  # of the correction: what it makes is no measurement
         "gain_offset_corrected": 1,
         "gain_offset_threshold": 6.0,
         "detector_maximum": 65535,

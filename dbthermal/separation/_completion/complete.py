@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal._arrays import release
 from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
@@ -28,6 +28,7 @@ _BITS: Final = {
     scenes.MATERIAL: Status.COMPLETED_FROM_MATERIAL | Status.COMPLETED_FROM_SURROUNDINGS,
     scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
 }
+_SPREAD: Final = (1e-3, 1e3)  # deviation of surroundings that are stated [K]
 _METHOD: Final = Method(posterior.curve, any_bands=True, survey=posterior.curve)
 
 
@@ -142,6 +143,9 @@ class Beside:
     surroundings_std: float
     reflection_shift: xr.Dataset | None
 
+    def __post_init__(self) -> None:
+        _numbers.real_number("surroundings_std [K]", self.surroundings_std, _SPREAD)
+
 
 def filled(
     result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, beside: Beside, workers: int
@@ -190,6 +194,10 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
                 f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
                 "standard deviation. Must be of one that does, as 'subspace'."
             )
+    for name in (name for name in map(str, result.data_vars) if name.endswith("_std")):
+        if np.any(negative := result[name].values < 0.0):
+            value = result[name].values[negative][0]
+            raise ValueError(f"Invalid '{name}' {value} of the result. Must not be negative.")
     measured = result["emissivity"].where(result["status"] == 0).values
     if np.any(bad := (measured <= 0.0) | (measured >= 1.0)):
         rule = "Must lie in (0, 1) where the status is 0, and not in per cent"

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import chdtri
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
@@ -34,8 +34,6 @@ _LEAST: Final = (0.2, 0.1)
 _SAMPLE: Final = 400
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
-# Stated temperatures below are in degrees Celsius, or no room's; above, they are counts [K].
-_COLDEST, _HOTTEST = 150.0, 3000.0
 # Chance by which a pixel tells other emissivities than its material's: of three deviations.
 _CHANCE: Final = 0.0027
 # Residual, in standard deviations of the noise, from which a result is of another capture.
@@ -165,14 +163,7 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
     given = laid_on(given, scene.inputs.capture, "surroundings", "the capture")
     values = given.values.astype(np.float64)
     values = values.ravel() if given.dims else values
-    bad = ~((values >= _COLDEST) & (values <= _HOTTEST))
-    if np.any(bad):
-        raise ValueError(
-            f"Invalid surroundings {values[bad].flat[0]} K. Must be from {_COLDEST} to {_HOTTEST} "
-            "K: in kelvin, not in degrees Celsius or counts."
-        )
-    if not 0 < std < np.inf:
-        raise ValueError(f"Invalid surroundings_std {std} K. Must be positive.")
+    _numbers.real_numbers("surroundings [K]", values, _numbers.KELVIN)
     curve = scene.inputs.curves[scene.inputs.bands[0]]
     signal = curve.signal(values) - curve.reference
     return Level(signal, std * curve.slope(values), _FLUCTUATION)

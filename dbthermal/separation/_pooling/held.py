@@ -81,11 +81,9 @@ def hold(
 
 def _share(labels: Array, holds: Mask) -> Array:
     """Share (y, x) of the pixels of each one's material for which something holds; 0 without."""
-    numbers = labels + 1
-    share = np.bincount(numbers.ravel(), holds.ravel()) / np.maximum(
-        np.bincount(numbers.ravel()), 1
-    )
-    return np.where(labels >= 0, share[numbers], 0.0)
+    numbers = np.unique(labels, return_inverse=True)[1].ravel()
+    share = np.bincount(numbers, holds.ravel()) / np.bincount(numbers)
+    return np.where(labels >= 0, share[numbers].reshape(labels.shape), 0.0)
 
 
 def _border(labels: Array) -> Mask:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, schema
 from dbthermal import response as responses
 from dbthermal.schema import Status
 from dbthermal.separation import _inputs
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _PARTS: Final = 5  # means over the latency
 _LOST: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
+_SLOWEST, _FASTEST = 1e-3, 1e5  # frame rates [Hz], and the reciprocals of times [s]
 _ROWS: Final = 16  # that a thread takes at once
 
 
@@ -124,8 +125,9 @@ class Stream:
         workers: int = 2,
     ) -> None:
         seconds = {"latency [s]": latency, "memory [s]": memory, "refresh [s]": refresh}
-        for name, value in ({"frame_rate [Hz]": frame_rate} | seconds).items():
-            planck.require_positive(name, value)
+        _numbers.real_number("frame_rate [Hz]", frame_rate, (_SLOWEST, _FASTEST))
+        for name, value in seconds.items():
+            _numbers.real_number(name, value, (1.0 / _FASTEST, 1.0 / _SLOWEST))
         require_workers(workers)
         known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
@@ -252,8 +254,10 @@ class Stream:
             if "band" in frames.coords:
                 places = schema.band_positions(frames, [*self.bands], "the frames")
                 frames = frames.isel(band=places)
+            schema.check_numbers(frames, "the frames", "count")
             frames = frames.transpose("band", ..., "y", "x").values
-        times, counts = np.asarray(time, dtype=np.float64), np.ma.asarray(frames)
+        times, counts = _numbers.real_numbers("time [s] of frames", time), np.ma.asarray(frames)
+        segment = _numbers.whole_number("segment", segment, (0, 2**31))
         if counts.dtype.kind != "f":
             raise TypeError(
                 f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "
@@ -276,7 +280,7 @@ class Stream:
         if segment < self._segment:
             raise ValueError(f"Invalid segment {segment} after {self._segment}. Must not fall.")
         if segment > self._segment:  # a mean is of one segment
-            self._segment, self._filled = int(segment), 0
+            self._segment, self._filled = segment, 0
         planes = counts.filled(np.nan).reshape(2, -1, *self._shape)
         return times, planes[:: 1 if self._order[0] == 0 else -1]
 
