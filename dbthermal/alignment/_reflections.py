@@ -113,12 +113,13 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
 
 
 def seen_apart(field: xr.Dataset) -> bool:
-    """Say that the cameras stand apart: their shift is more than its deviation."""
+    """Say that the cameras stand apart: along an axis their shift is more than its deviation."""
     known = field["known"].values
     if not known.any():
         return False
-    shift, std = (np.hypot(*field[name].values[:, known]) for name in ("shift", "shift_std"))
-    return bool(np.median(shift) > max(_SIGMAS * np.median(std), _LEAST_SHIFT))
+    medians = [np.median(np.abs(field[n].values[:, known]), axis=1) for n in ("shift", "shift_std")]
+    shift, std = medians
+    return bool(np.any(shift > np.maximum(_SIGMAS * std, _LEAST_SHIFT)))
 
 
 @dataclass(frozen=True)

@@ -390,7 +390,4 @@ def _displacement(
 def numbered(corrected: xr.Dataset, pool: xr.DataArray) -> Labels:
     """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
     flat = _selection(corrected, pool, "pool", "iu", ("y", "x")).values.ravel().astype(np.int64)
-    if flat.size and (lowest := flat.min()) < -1:
-        rule = "Must be -1 for none, or from 0"
-        raise ValueError(f"Invalid label {lowest} of a material. {rule}.")
     return np.where(flat >= 0, np.searchsorted(np.unique(flat[flat >= 0]), flat), -1)

@@ -120,7 +120,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
-    schema.check_corrected(corrected)
+    schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
@@ -197,8 +197,8 @@ def _apart(
         if shift is not None and seen_apart(shift):
             alone = one(reflection_shift=shift)
             # An object that heats rapidly is apart in pixels that are paired by their reflections.
-            left, moving = _pixels_apart(alone)
-            if left / moving < apart or _unflagged(alone) > good:
+            left, moving = _pixels_apart(alone, shift)
+            if left / moving < apart or _unflagged(alone) > good + _APART:
                 return alone, shift, []
     first = one() if known is None else known
     return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
@@ -297,9 +297,18 @@ def _unflagged(result: xr.Dataset) -> float:
     return float((status == 0).sum() / max(int(measured.sum()), 1))
 
 
-def _pixels_apart(result: xr.Dataset) -> tuple[int, int]:
-    """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1."""
+def _pixels_apart(result: xr.Dataset, shift: xr.Dataset | None = None) -> tuple[int, int]:
+    """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1.
+
+    With a shift of the reflections also those that have no pair, though not by the image's end.
+    """
     status = result["status"].values
     moving = (status & (_UNMEASURED | np.uint32(Status.NO_BACKGROUND_MOTION))) == 0
     apart = (status & np.uint32(Status.BANDS_APART)) != 0
+    if shift is not None:
+        reach = np.nanmax(np.abs(shift["shift"].where(shift["known"]).values), axis=(1, 2))
+        down, right = np.minimum(np.ceil(reach).astype(int), np.array(status.shape) // 2)
+        inside = np.zeros(status.shape, dtype=bool)
+        inside[down : status.shape[0] - down, right : status.shape[1] - right] = True
+        apart |= inside & ((status & np.uint32(Status.NO_REFLECTION_PAIR)) != 0)
     return int((apart & moving).sum()), max(int(moving.sum()), 1)

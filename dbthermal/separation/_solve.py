@@ -256,7 +256,6 @@ def separated(
         pooled=int(pooled),
         response_kind=inputs.response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
-        **schema.origin(*sources[::-1]),
         **({"warnings": [*doubts]} if doubts else {}),
         noise_source=inputs.response.attrs["noise_source"],
         emissivity_source="capture" if inputs.emissivity is None else "given",

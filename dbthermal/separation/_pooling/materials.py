@@ -57,6 +57,10 @@ _TOLERANCE: Final = 0.0025
 # Standard deviation of a pixel's ratio, relative to it, beyond which it is left out [1]: neither
 # its own distribution nor that of the emissivity is a normal one there.
 _VAGUE: Final = 0.3
+# Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
+# deviations; variance of a median of normal values over that of their mean.
+_UNLIKE, _CERTAIN = 0.2, 3.0
+_MEDIAN: Final = np.pi / 2.0
 # Fewest pixels of a material: remainders at a border, which stand out by their errors, have fewer.
 _SMALLEST: Final = 16
 # Square of the deviations by which a ratio tells two materials apart.
@@ -227,7 +231,8 @@ def joined(
     found = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
     found.join_alike(pairs, _RESOLUTION)
-    own, boxes, grown = _features(alone, bands)[1], find_objects(cells), True
+    # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
+    own, boxes, grown = _features(alone, bands), find_objects(cells), True
     while grown:
         grown = False
         for pair in pairs:
@@ -242,7 +247,9 @@ def joined(
                 for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
             )
             here = found.roots()[cells[window]]
-            if _continuous(here == one, here == other, own.window(window), _RESOLUTION):
+            sides = here == one, here == other
+            ratios, both = (part.window(window) for part in own)
+            if _alike(*sides, ratios) and _continuous(*sides, both, _RESOLUTION):
                 found.join(one, other)
                 grown = True
     return _labelled(cells, found, alone)
@@ -366,6 +373,19 @@ def step(
     if np.any(residual > chdtri(pixels - design.shape[1], _BORDER_RATE)):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))
+
+
+def _alike(one: Mask, other: Mask, ratios: Features) -> bool:
+    """Say that the ratios on both sides of a border (y, x) may be those of one material."""
+    told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
+    sides = [told & part for part in (one, other)]
+    if not all(part.any() for part in sides):
+        return True
+    middle = np.array([np.median(ratios.values[:, part], axis=1) for part in sides])
+    variance = [np.median(ratios.variances[:, part], axis=1) / part.sum() for part in sides]
+    error = np.sqrt(_MEDIAN * np.sum(variance, axis=0))
+    least = np.maximum(_CERTAIN * error, _UNLIKE * middle.mean(axis=0))
+    return bool(np.all(np.abs(middle[1] - middle[0]) <= least))
 
 
 def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:

@@ -257,7 +257,7 @@ class Stream:
             schema.check_numbers(frames, "the frames", "count")
             frames = frames.transpose("band", ..., "y", "x").values
         times, counts = _numbers.real_numbers("time [s] of frames", time), np.ma.asarray(frames)
-        segment = _numbers.whole_number("segment", segment, (0, 2**31))
+        segment = _numbers.whole_number("segment", segment, (-(2**31), 2**31))
         if counts.dtype.kind != "f":
             raise TypeError(
                 f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "

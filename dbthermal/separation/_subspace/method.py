@@ -84,6 +84,9 @@ _DELAY_SIGMAS: Final = 4.0
 _UNKNOWN: Final = 0.1
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_EMISSIVITY)
+# Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
+# whatever order their bands are.
+_EMITTED: Final = (0.7, 1.3)
 # Last orders of the smooth curve at which its polynomials may be too few.
 _LAST: Final = 6
 # Flags of pixels in which rapid changes of the object are looked for.
@@ -280,6 +283,9 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     # Before an object that hardly changes, what changes would be the background: comes and goes.
     resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
     swapped[resting] = ~residuals.returning(select(tile.signals[0], resting))
+    # Or along a ratio that is one of emissivities: of an object that is switched on and off.
+    emitted = np.all((solution.ratio > _EMITTED[0]) & (solution.ratio < _EMITTED[1]), axis=0)
+    swapped |= constant & emitted
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
     excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom)
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
