@@ -7,8 +7,9 @@ from scipy.ndimage import gaussian_filter
 from test_displaced import SMALL, film
 
 from dbthermal import separation, simulation
+from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
-from dbthermal.separation._separate import _unflagged, cameras_apart
+from dbthermal.separation._separate import _pixels_apart, _unflagged, cameras_apart
 from reproduction.experiments.pictures import smooth_shift
 
 RIG = simulation.Rig()
@@ -191,3 +192,76 @@ def test_what_has_no_samples_hides_no_displacement(slow: bool) -> None:
     # What a shift leaves without a flag is compared with this, of other pixels of the same scene.
     every = _unflagged(separation.solve(padded, RIG.response()))
     np.testing.assert_allclose(good, every, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(("metal", "seed"), [((0.1, 0.15), 1), ((0.2, 0.18), 3), ((0.05, 0.06), 0)])
+def test_a_metal_is_not_pooled_with_glass(metal: tuple[float, float], seed: int) -> None:
+    """A gray metal tells no emissivity: its ratios alone say that it is not the glass beside it."""
+    rng, of = np.random.default_rng(seed), 22.0 + 1.5 * np.sin(Y / 6.0 + seed) < X
+    pairs = materials((0.86, 0.72), metal, of=of.astype(int))
+    scene = simulation.walkers(
+        TIME, SHAPE, pairs, rng, temperatures=(295.0, 305.0, 325.0), crossings=7
+    )
+    result = separation.separate(simulation.observe(scene, RIG.response(), rng), RIG.response())
+    share, held, silent = judged(scene, result, f"{metal} beside glass")
+    assert 0.4 < share < 0.55  # the glass, which is half of the picture
+    assert held > 0.92
+    assert silent < 0.01
+    assert not np.any((result["status"].values == 0) & of)
+
+
+@pytest.mark.parametrize("ripple", [0.3, 1.0])
+def test_a_plate_on_a_thermostat_is_no_constant_object(ripple: float) -> None:
+    """It goes up and down before a room at rest: what changes is not what it mirrors."""
+    heat, level, on = np.empty(TIME.size), 25.0, True
+    for frame in range(TIME.size):
+        level += ((40.0 if on else 0.0) - level) * (TIME[1] - TIME[0]) / 10.0
+        on = level < 25.0 - ripple or (on and level < 25.0 + ripple)
+        heat[frame] = level
+    profile = np.exp(-((X / SHAPE[1] - 0.5) ** 2 + (Y / SHAPE[0] - 0.5) ** 2))
+    plate, room = 295.0 + heat[:, np.newaxis, np.newaxis] * profile, np.full((1, *SHAPE), 295.0)
+    pairs = materials((0.86, 0.72), of=np.zeros(SHAPE, dtype=int))
+    scene = simulation.scene(TIME, plate, np.broadcast_to(room, plate.shape), pairs)
+    capture = simulation.observe(scene, RIG.response(), np.random.default_rng(1))
+    result = separation.separate(capture, RIG.response())
+    off = abs(result["object_temperature"] - scene["object_temperature"])
+    held = float((off < 1.96 * result["object_temperature_std"]).mean())
+    print(f"ripple {ripple} K: median error {float(off.median()):.2f} K, intervals {held:.3f}")
+    assert held > 0.97
+    assert float(off.median()) < 1.0  # the camera's own reading is 2.4 K off
+    status = result["status"].values
+    both = np.uint32(Status.CONSTANT_OBJECT | Status.ROLES_MAY_BE_SWAPPED)
+    assert np.mean((status & both) == np.uint32(Status.CONSTANT_OBJECT)) < 0.01
+
+
+def shift_field(
+    shift: tuple[float, float], std: tuple[float, float], known: np.ndarray
+) -> xr.Dataset:
+    """Shift of the reflections, the same at all pixels, where it is known (y, x)."""
+    pairs = {"shift": shift, "shift_std": std}
+    maps = {
+        name: (("axis", "y", "x"), np.where(known, np.reshape(pair, (2, 1, 1)), np.nan))
+        for name, pair in pairs.items()
+    }
+    return xr.Dataset({**maps, "known": (("y", "x"), known)}, {"axis": ["y", "x"]})
+
+
+def test_a_shift_is_seen_along_one_axis() -> None:
+    """Upright people tell a shift along the baseline, and none across it."""
+    known = np.ones(SHAPE, dtype=bool)
+    assert seen_apart(shift_field((1.3, 4.0), (10.0, 0.08), known))
+    assert not seen_apart(shift_field((1.3, 0.2), (10.0, 0.08), known))
+    assert not seen_apart(shift_field((0.05, 0.05), (0.01, 0.01), known))
+    assert not seen_apart(shift_field((1.3, 4.0), (10.0, 0.08), ~known))
+
+
+def test_pixels_without_a_pair_are_not_explained() -> None:
+    """But for those whose pair lies beyond the image's end."""
+    field = shift_field((0.0, 4.0), (0.1, 0.1), np.ones(SHAPE, dtype=bool))
+    status = np.zeros(SHAPE, dtype=np.uint32)
+    status[:, -4:] = Status.NO_REFLECTION_PAIR
+    result = xr.Dataset({"status": (("y", "x"), status)})
+    assert _pixels_apart(result, field) == (0, status.size)
+    status[:, 10:20] = Status.NO_REFLECTION_PAIR
+    assert _pixels_apart(result, field) == (10 * SHAPE[0], status.size)
+    assert _pixels_apart(result) == (0, status.size)

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from dbthermal._arrays import release
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._pooling import gradients, ratios
@@ -80,6 +81,7 @@ def _survey(
             scatters = survey.scatter * square, survey.rapid_scatter * square
             survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
             surveys.append((cut.places[pixels], survey))
+        release()
     if material is None:
         bar.update((rows.stop - rows.start) * inputs.capture.sizes["x"])
     return surveys
