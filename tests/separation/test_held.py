@@ -207,7 +207,7 @@ def test_a_metal_is_not_pooled_with_glass(metal: tuple[float, float], seed: int)
     assert 0.4 < share < 0.55  # the glass, which is half of the picture
     assert held > 0.92
     assert silent < 0.01
-    assert not np.any((result["status"].values == 0) & of)
+    assert np.mean(result["status"].values[of] == 0) < 0.01  # at the border, of both
 
 
 @pytest.mark.parametrize("ripple", [0.3, 1.0])
