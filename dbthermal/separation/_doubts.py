@@ -4,9 +4,11 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import median_filter
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._tiles import RANGE_SIGMAS
 
@@ -15,6 +17,13 @@ _PIXELS: Final = 10_000
 _OUTSIDE: Final = 0.01  # share of samples outside the calibration that is told
 _HARDLY: Final = 0.1  # share of the moving pixels
 _REASONS: Final = 3  # flags that are named
+_SAMPLES: Final = 2**24  # of a band that tell a step of a camera's level, at most
+_FEWEST: Final = 100  # pixels that tell it
+_PAUSE: Final = 1.5  # frame periods, from which two frames do not follow one another
+_AROUND: Final = 9  # frames whose median change is the scene's that goes on
+# Deviations of a step; share of it, and deviations, of what another band shows of the scene.
+_CERTAIN, _SHARE, _SIGMAS = 16.0, 0.15, 4.0
+_EVEN: Final = 0.5  # difference of mean and median, relative to a step of all pixels
 
 
 def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
@@ -43,6 +52,47 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
                 f"{share:.0%} of the samples of band '{name}' lie outside the {low:.0f} to "
                 f"{high:.0f} count that its response was calibrated over. Must lie within: "
                 "calibrate over the temperatures of the scene; or is it another band's response?"
+            )
+    return found
+
+
+def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
+    """Doubts about a step of one band's level alone, in all pixels: a camera's, not the scene's."""
+    counts, time = corrected["counts"], corrected["time"].values
+    pixels = min(_PIXELS, max(_FEWEST, _SAMPLES // time.size))
+    step = max(1, int(np.sqrt(counts[0, 0].size / pixels)))
+    segment = corrected["segment"].values if "segment" in corrected else np.zeros(time.size)
+    joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
+    means, medians, noise, found = [], [], [], list[str]()
+    for band in counts:
+        slope = responses.curve(response, str(band["band"].item())).reference_slope
+        film = band[:, ::step, ::step].values.reshape(time.size, -1) / slope
+        changes = np.diff(np.where(schema.measured(film), film, np.nan), axis=0)
+        seen = joined & (np.isfinite(changes).sum(axis=1) > max(_FEWEST, 0.5 * changes.shape[1]))
+        low, middle, high = np.zeros((3, seen.size))
+        low[seen], middle[seen], high[seen] = np.nanpercentile(changes[seen], [25, 50, 75], axis=1)
+        mean = np.zeros(seen.size)
+        mean[seen] = np.nanmean(changes[seen], axis=1)
+        # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
+        means.append(np.where(seen, mean - median_filter(mean, _AROUND), 0.0))
+        medians.append(np.where(seen, middle - median_filter(middle, _AROUND), 0.0))
+        width = np.median((high - low)[seen]) if seen.any() else np.inf
+        noise.append(0.5 * MAD * width / np.sqrt(changes.shape[1]))
+    # In proportion to what moves, as a median is not; which is the same if all pixels step.
+    unseen = np.abs(means) + _SIGMAS * np.array(noise)[:, np.newaxis]
+    for place, (mean, median) in enumerate(zip(means, medians, strict=True)):
+        size = np.abs(mean)
+        alone = (size > _CERTAIN * noise[place]) & np.all(
+            np.delete(unseen, place, axis=0) < _SHARE * size, axis=0
+        )
+        alone &= np.abs(median - mean) < _EVEN * size
+        if alone.any():
+            frame = int(np.argmax(size * alone))
+            found.append(
+                f"The level of band '{counts['band'].values[place]}' steps by "
+                f"{mean[frame]:.2g} K at {time[frame + 1]:g} s in all pixels, and no other "
+                "band's does: a camera's own, which no error bar holds. Must be steady, or marked "
+                "(correction.mark_shutter)."
             )
     return found
 

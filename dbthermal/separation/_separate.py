@@ -22,7 +22,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
-from dbthermal.separation._doubts import against_response
+from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.held import hold
@@ -124,7 +124,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
-    unlike = against_response(corrected, response)
+    unlike = against_response(corrected, response) + of_one_camera(corrected, response)
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     if alone is not None:
         made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}

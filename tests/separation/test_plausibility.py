@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import calibration, schema, simulation
-from dbthermal.separation._doubts import against_response, hardly_measured
+from dbthermal.separation._doubts import against_response, hardly_measured, of_one_camera
 
 RIG = simulation.Rig()
 
@@ -45,6 +45,24 @@ def test_samples_outside_the_calibration_are_counted(corrected: xr.Dataset) -> N
     high[0, :, :3] += 60000.0
     (said,) = against_response(corrected.assign(counts=high), response)
     assert said.startswith("25% of the samples of band '8-14' lie outside the ")
+
+
+@pytest.mark.parametrize(("band", "kelvin"), [(1, 1.0), (0, 2.0)])
+def test_a_step_of_one_camera_is_told(corrected: xr.Dataset, band: int, kelvin: float) -> None:
+    """All pixels of one band step at once; the scene does not, nor does a marked shutter event."""
+    response, slope = RIG.response(), [115.0, 11.5][band]
+    late = (corrected["time"] > 5.0).astype(np.float32)
+    stepped = corrected.copy(deep=True)
+    stepped["counts"][band] += kelvin * slope * late
+    (said,) = of_one_camera(stepped, response)
+    print(said)
+    assert said.startswith(f"The level of band '{RIG.bands[band]}' steps by ")
+    assert "at 5.1 s in all pixels" in said
+    assert of_one_camera(corrected, response) == []
+    assert of_one_camera(stepped.assign(segment=late.astype(np.int32)), response) == []
+    both = corrected.copy(deep=True)
+    both["counts"] += kelvin * late * xr.DataArray([115.0, 2 * 11.5], dims="band")
+    assert of_one_camera(both, response) == []  # the room's light is switched
 
 
 def test_exchanged_blackbody_is_told_by_the_netd() -> None:
