@@ -39,12 +39,12 @@ _REAL: Final = re.compile(r"([-+]?(0|[1-9][0-9]*)\.[0-9]*|\.[0-9]+)([eE][-+][0-9
 
 
 def as_path(path: Any) -> Path:
-    """Path of text or of a path; TypeError for anything else, ValueError for an address."""
+    """Path of text or of a path; TypeError for anything else, FileNotFoundError for an address."""
     if not isinstance(path, str | os.PathLike):
         kind = type(path).__name__
         raise TypeError(f"Invalid path {shown(path)}, a {kind}. Must be text or a path.")
     if "://" in os.fspath(path):
-        raise ValueError(f"Invalid path '{path}', an address. Must be of a file or folder here.")
+        raise FileNotFoundError(f"No file or folder '{path}', an address. Must be on this machine.")
     return Path(path)
 
 

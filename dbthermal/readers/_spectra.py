@@ -89,7 +89,7 @@ def ecostress(path: str | Path) -> xr.Dataset:
     ...     ecostress(path).emissivity.values.tolist()
     [0.96, 0.75, 0.9]
     """
-    path = Path(path)
+    path = texts.as_path(path)
     lines = texts.whole_lines(texts.read_text(path, encoding="latin-1"), path.name)
     blank = next((i for i, line in enumerate(lines) if not line.strip()), len(lines))
     header = _header(lines[:blank], path)
@@ -147,7 +147,7 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
     ...     slum(path)["A002"].emissivity.values.tolist()
     [0.89, 0.97]
     """
-    path = Path(path)
+    path = texts.as_path(path)
     titles, rows = _table(path)
     codes = titles[1:]
     if titles[0] != "wavelength" or not codes or len({*codes}) < len(codes):
@@ -188,7 +188,7 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
     ...     ucsb(path, reach=(8.0, 12.5)).emissivity.values.tolist()
     [0.985, 0.981]
     """
-    path = Path(path)
+    path = texts.as_path(path)
     titles, rows = _table(path)
     if titles[:2] != ["x1", "x2"] or not re.fullmatch("y_.+", ",".join(titles[2:])):
         raise ValueError(f"Invalid columns {titles} in '{path.name}'. Must be x1, x2, y_<name>.")

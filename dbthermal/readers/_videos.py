@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
@@ -97,7 +98,7 @@ def palette_video(
     >>> bool(abs(movie - wedge).max() < 0.05), movie.time.values.tolist()  # [1], [s]
     (True, [0.0, 0.1, 0.2])
     """
-    path = Path(path)
+    path = texts.as_path(path)
     colours = _palette(palette)
     video = _distinct(decode(path, None, memory, sha256))
     position, _, distance = _nearest(video.colours, colours)
@@ -158,7 +159,7 @@ def masked_palette_video(
     ...     masked_palette_video(f"{folder}/half.mp4").valid[0, 24, [10, 50]].values.tolist()
     [True, False]
     """
-    path = Path(path)
+    path = texts.as_path(path)
     colours = _palette(palette)
     video = _distinct(decode(path, width, memory, sha256))
     position, from_palette, distance = _nearest(video.colours, colours)

@@ -69,6 +69,8 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
         film = band[:, ::step, ::step].values.reshape(time.size, -1) / slope
         changes = np.diff(np.where(schema.measured(film), film, np.nan), axis=0)
         seen = joined & (np.isfinite(changes).sum(axis=1) > max(_FEWEST, 0.5 * changes.shape[1]))
+        if not seen.any():  # too few pixels tell it
+            return []
         low, middle, high = np.zeros((3, seen.size))
         low[seen], middle[seen], high[seen] = np.nanpercentile(changes[seen], [25, 50, 75], axis=1)
         mean = np.zeros(seen.size)
@@ -76,7 +78,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
         # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
         means.append(np.where(seen, mean - median_filter(mean, _AROUND), 0.0))
         medians.append(np.where(seen, middle - median_filter(middle, _AROUND), 0.0))
-        width = np.median((high - low)[seen]) if seen.any() else np.inf
+        width = np.median((high - low)[seen])
         noise.append(0.5 * MAD * width / np.sqrt(changes.shape[1]))
     # In proportion to what moves, as a median is not; which is the same if all pixels step.
     unseen = np.abs(means) + _SIGMAS * np.array(noise)[:, np.newaxis]

@@ -199,6 +199,8 @@ def _check(part: xr.Dataset) -> None:
                 found = f"Invalid attribute '{key}' of {label}, of type {type(value).__name__}"
                 raise TypeError(f"{found}. Must be text, numbers, or lists of these.") from error
     for name, one in part.variables.items():
+        if "/" in str(name):
+            raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
         text = one.dtype.kind == "O" and all(isinstance(it, str) for it in one.values.flat)
         if not (
             text

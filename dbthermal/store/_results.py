@@ -198,7 +198,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     text, path, provenance : str, str or Path, mapping
         Text, file ``*.md`` or ``*.html``; see `save`.
     """
-    suffix = ".html" if Path(path).suffix == ".html" else ".md"
+    suffix = ".html" if texts.as_path(path).suffix == ".html" else ".md"
     # A string in it can neither end the comment nor begin a tag.
     content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
     with whole(path, suffix) as part:
@@ -235,7 +235,7 @@ def save_figure(
     """
     from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
 
-    text, suffix = as_json(provenance), Path(path).suffix
+    text, suffix = as_json(provenance), texts.as_path(path).suffix
     metadata: dict[str, dict[str, Any]] = {
         ".pdf": {"Creator": "dbthermal", "Subject": text, "CreationDate": None},
         ".svg": {"Creator": "dbthermal", "Description": text, "Date": None},
