@@ -180,6 +180,6 @@ def test_unusual_but_good_input_passes() -> None:
     labels[0] = -5
     result = separation.separate(CORRECTED, RESPONSE, materials=labels)
     small = labels.where(labels < 2**40, 1).astype(int).clip(min=-1)
-    other = separation.separate(CORRECTED, RESPONSE, materials=small)
-    xr.testing.assert_equal(result.drop_vars("material"), other.drop_vars("material"))
+    again = separation.separate(CORRECTED, RESPONSE, materials=small)
+    xr.testing.assert_equal(result.drop_vars("material"), again.drop_vars("material"))
     assert not np.any(result["status"] & np.uint32(Status.DEAD_PIXEL))
