@@ -60,6 +60,7 @@ _VAGUE: Final = 0.3
 # Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
 # deviations; variance of a median of normal values over that of their mean.
 _UNLIKE, _CERTAIN = 0.2, 3.0
+_OWN: Final = 0.08  # from the ratio of the emissivities, where the object's own changes make it
 _MEDIAN: Final = np.pi / 2.0
 # Fewest pixels of a material: remainders at a border, which stand out by their errors, have fewer.
 _SMALLEST: Final = 16
@@ -249,7 +250,7 @@ def joined(
             here = found.roots()[cells[window]]
             sides = here == one, here == other
             ratios, both = (part.window(window) for part in own)
-            if _alike(*sides, ratios) and _continuous(*sides, both, _RESOLUTION):
+            if _alike(*sides, ratios, both) and _continuous(*sides, both, _RESOLUTION):
                 found.join(one, other)
                 grown = True
     return _labelled(cells, found, alone)
@@ -375,8 +376,11 @@ def step(
     return float(np.sum(heights[:, -1] ** 2 / variance))
 
 
-def _alike(one: Mask, other: Mask, ratios: Features) -> bool:
-    """Say that the ratios on both sides of a border (y, x) may be those of one material."""
+def _alike(one: Mask, other: Mask, ratios: Features, both: Features) -> bool:
+    """Say that the ratios on both sides of a border (y, x) may be those of one material.
+
+    Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
+    """
     told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
     sides = [told & part for part in (one, other)]
     if not all(part.any() for part in sides):
@@ -384,8 +388,21 @@ def _alike(one: Mask, other: Mask, ratios: Features) -> bool:
     middle = np.array([np.median(ratios.values[:, part], axis=1) for part in sides])
     variance = [np.median(ratios.variances[:, part], axis=1) / part.sum() for part in sides]
     error = np.sqrt(_MEDIAN * np.sum(variance, axis=0))
-    least = np.maximum(_CERTAIN * error, _UNLIKE * middle.mean(axis=0))
-    return bool(np.all(np.abs(middle[1] - middle[0]) <= least))
+
+    def near(expected: Array, found: Array, share: float) -> bool:
+        return bool(
+            np.all(np.abs(found - expected) <= np.maximum(_CERTAIN * error, share * expected))
+        )
+
+    if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
+        return True
+    for part, own, beside in zip(sides, middle, middle[::-1], strict=True):
+        first = both.values[-1, part]
+        if np.isfinite(first).any():
+            emissivity = np.nanmedian(first)
+            if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
+                return True
+    return False
 
 
 def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:
