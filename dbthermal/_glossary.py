@@ -187,7 +187,10 @@ MEASURED: Final = "measured"
 def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
     """Attribute `origin` of what is made of several inputs: simulated where one of them is.
 
-    Of the inputs' attributes; empty if no input states one.
+    Parameters
+    ----------
+    attrs : mapping
+        Attributes of each input. The result is empty if none of them states its origin.
     """
     stated = [str(one["origin"]) for one in attrs if "origin" in one]
     others = [one for one in stated if one != MEASURED]
