@@ -117,8 +117,8 @@ def seen_apart(field: xr.Dataset) -> bool:
     known = field["known"].values
     if not known.any():
         return False
-    medians = [np.median(np.abs(field[n].values[:, known]), axis=1) for n in ("shift", "shift_std")]
-    shift, std = medians
+    both = (np.abs(field[name].values[:, known]) for name in ("shift", "shift_std"))
+    shift, std = (np.median(part, axis=1) for part in both)
     return bool(np.any(shift > np.maximum(_SIGMAS * std, _LEAST_SHIFT)))
 
 

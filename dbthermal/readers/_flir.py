@@ -249,8 +249,9 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
             f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
             "as smooth. Must be stated: byte_order='little' or 'big'."
         )
-    swapped = bool(form.order) or recordings.byte_order(name, stated or "big") == "big"
-    if stated is not None and (found < 0 if swapped else found > 0):
+    # Decoded as stated, or as PNG has it: its highest byte first.
+    as_stated = bool(form.order) or stated is None or recordings.byte_order(name, stated) == ">"
+    if stated is not None and (found < 0 if as_stated else found > 0):
         raise ValueError(
             f"Invalid byte_order '{stated}' for '{name}': its images are smoother with their bytes "
             "swapped. Must be the other one."

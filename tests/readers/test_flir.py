@@ -215,6 +215,20 @@ def test_byte_order(path: Path) -> None:
         readers.flir(path, byte_order="middle")
 
 
+@pytest.mark.parametrize("form", ["raw", "png"])
+def test_the_wrong_byte_order_is_refused(path: Path, form: str) -> None:
+    """Images that are clearly smoother in the other order contradict what is stated."""
+    counts = scene(2)
+    path.write_bytes(sequence(counts, "png") if form == "png" else sequence(counts))
+    found = readers.flir(path)
+    right, wrong = ("little", "big")[:: 1 if found.attrs["byte_order"] == "little" else -1]
+    stated = readers.flir(path, byte_order=right)
+    assert_array_equal(stated.counts, found.counts)
+    assert stated.attrs["byte_order_by"] == "caller"
+    with pytest.raises(ValueError, match=f"Invalid byte_order '{wrong}'.*Must be the other one"):
+        readers.flir(path, byte_order=wrong)
+
+
 def test_parts_of_a_recording(path: Path) -> None:
     """Some frames of a recording whose end is cut off; how many can be read is said."""
     content = sequence(counts := scene(4))
