@@ -1,6 +1,7 @@
 """Materials from the data: borders are kept, and one material stays one region."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,14 @@ from scipy import ndimage
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
 from dbthermal.separation._pooling import feature_maps, region_merging
-from dbthermal.separation._pooling.materials import NONE, materials, step, without_borders
+from dbthermal.separation._pooling.materials import (
+    NONE,
+    _alike,
+    _both,
+    materials,
+    step,
+    without_borders,
+)
 from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.simulation import Rig
 
@@ -391,3 +399,20 @@ def test_a_pixel_beside_another_material_stays_only_if_its_ratio_tells(
     assert (shares[1] > 0.8) == (surer < 1.0)
     far = np.abs(np.arange(SMALL[1]) - column) > 1
     np.testing.assert_array_equal(kept[:, far], labels[:, far])
+
+
+@pytest.mark.parametrize(
+    ("ratio", "alike"), [(2.0, True), (2.2, True), (0.837, True), (0.944, False), (1.4, False)]
+)
+def test_ratios_beside_a_border(ratio: float, alike: bool) -> None:
+    """Glass goes on with its own ratio, or at rest with that of its emissivities, 0.72/0.86."""
+    one = np.arange(12) < 6 * np.ones((8, 1))
+    ratios = np.where(one, 2.0, ratio)[np.newaxis]
+    emissivity = np.where(one, 0.86, np.nan)[np.newaxis]
+    small = np.full_like(ratios, 1e-4)
+    both = _both(ratios, small, emissivity, small)
+    alone = Features(*(part[:1] for part in vars(both).values()))
+    assert _alike(one, ~one, alone, both) == alike
+    assert _alike(~one, one, alone, both) == alike
+    nothing = replace(alone, values=np.where(one, alone.values, np.nan))
+    assert _alike(one, ~one, nothing, both)
