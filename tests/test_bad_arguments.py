@@ -89,6 +89,7 @@ def of_flags(flag: int) -> xr.Dataset:
 ONE, NOTHING = np.ones((60, 3)), cast(Any, None)
 NEGATIVE = ALONE.assign(object_temperature_std=-ALONE["object_temperature_std"])
 IN_KELVIN = CORRECTED["counts"][:, 0].assign_attrs(units="K")
+EMPTY = CORRECTED.isel(y=slice(0, 0))  # so that what is refused is refused before the work
 STILL = recorded().isel(time=[0])
 CASES: list[tuple[Call, str]] = [
     (lambda: calibration.Bias(air_temperature=22.0), r"air_temperature \[K\] 22.0.*in kelvin"),
@@ -99,6 +100,7 @@ CASES: list[tuple[Call, str]] = [
     (lambda: simulation.Rig(offset=np.nan), "offset"),
     (lambda: completed(surroundings=295.0, surroundings_std=True), "surroundings_std"),
     (lambda: completed(surroundings_std=1e-30), "surroundings_std"),
+    (lambda: separation.separate(EMPTY, RESPONSE, surroundings_std=1e-30), "surroundings_std"),
     (lambda: completed(NEGATIVE), "object_temperature_std.*negative"),
     (lambda: streamed(np.datetime64("2024-01-01")), "time"),
     (lambda: streamed("0.1"), "time"),

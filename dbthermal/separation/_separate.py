@@ -120,6 +120,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
+    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
@@ -154,7 +155,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         hold(alone, result, materials, apart=reflection_shift is not None)
     if result is given:  # which is the caller's
         result = result.copy(deep=True)
-    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
+    beside = replace(beside, materials=materials, reflection_shift=reflection_shift)
     result = filled(result, corrected, response, beside, workers)
     if materials is not None:
         result["material"] = materials
