@@ -21,7 +21,8 @@ from dbthermal._arrays import Mask, empty, made_on_disk, on_disk, quotient, rele
 from dbthermal._warnings import warned
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
-from dbthermal.alignment._resampling import STEP, on_one_clock, registered
+from dbthermal.alignment._resampling import STEP, on_one_clock
+from dbthermal.alignment._views import registered
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate

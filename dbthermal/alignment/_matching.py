@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._products import BORDER, ROWS, Match, Movie, products
-from dbthermal.alignment._resampling import TAPS, interpolation
+from dbthermal.alignment._views import TAPS, interpolation
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter
 
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from dbthermal.alignment._resampling import TAPS, lagrange
+from dbthermal.alignment._views import TAPS, lagrange
 
 Movie = npt.NDArray[np.float32]
 Whole = npt.NDArray[np.int32]

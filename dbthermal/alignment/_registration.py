@@ -12,7 +12,7 @@ from dbthermal._arrays import Array, Mask
 from dbthermal._compiled import compiled
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._resampling import TRANSFORM, positions
+from dbthermal.alignment._views import TRANSFORM, positions
 from dbthermal.noise import MAD
 
 # Kinds of transform, of two, six and eight numbers.

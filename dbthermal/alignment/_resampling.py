@@ -1,42 +1,22 @@
-"""Resampling of all bands onto one clock and one pixel grid, the number of frames kept."""
+"""Resampling of all bands onto one clock, of views on one pixel grid (`_views`)."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
-from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _numbers, _rows, schema
 from dbthermal import noise as noises
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment import _views as views
 from dbthermal.alignment._offset import SEARCH, present, require_one_clock, sample, time_offset
+from dbthermal.alignment._views import Movie
 from dbthermal.noise import MAD
 
-Movie = npt.NDArray[np.float32]
-
-TRANSFORM: Final = schema.Variable(
-    ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
-)
-"""Transform of `register`: for each band a 3x3 homography on (x, y, 1), in pixels."""
-
-MAP: Final = schema.Variable(
-    ("band", "axis", "y", "x"), "float64", "pixel", "row and column of the first view's pixel here"
-)
-"""Transform of a curved surface: for each band where each pixel of the first view lies in it."""
-
-TAPS: Final = 6  # pixels a side that a sample between pixels is made of
-_ROUNDING: Final = 1e-7  # a weight that is none [1]
-_BEYOND: Final = 0.1  # so far outside the centre of the last pixel its line still holds [pixel]
-
 STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
-# A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
-_DIGITS: Final = 9
 
 
 def align(
@@ -129,7 +109,7 @@ def align(
     schema.check_corrected(corrected)
     if transform is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        corrected = registered(corrected, transform, lazy=lazy)
+        corrected = views.registered(corrected, transform, lazy=lazy)
     return on_one_clock(
         corrected,
         offset=offset,
@@ -159,7 +139,7 @@ def on_one_clock(
     if reflection_shift is not None:
         schema.check(reflection_shift, "reflection_shift")
     if reflection_shift is not None and offset is None:
-        alike, _ = _moved(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
+        alike, _ = views.moved(corrected, views.reflected(reflection_shift, corrected), lazy=lazy)
     offsets = _offsets(alike, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
@@ -181,7 +161,7 @@ def on_one_clock(
         movies = counts.isel(y=rows)
         result = np.empty(movies.shape, dtype=np.float32)
         for band, plan in enumerate(plans):
-            movie = _single(movies.isel(band=band).values)
+            movie = views.single(movies.isel(band=band).values)
             if missing[band].any():
                 movie = np.where(missing[band][:, None, None], np.float32(np.nan), movie)
             plan.apply(movie, result[band], _largest(steps * noise[band], movie))
@@ -205,79 +185,6 @@ def on_one_clock(
     )
 
 
-def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) -> xr.Dataset:
-    """Capture with all views on the first one's grid, each band on its own clock, see `align`."""
-    result, shares = _moved(corrected, _maps(transform, corrected), lazy=lazy)
-    factors = shares * (corrected["noise_factor"].values if "noise_factor" in corrected else 1.0)
-    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
-    if "pattern_std" in result:
-        result["pattern_std"] = result["pattern_std"] * shares
-        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
-    if "row" in transform.dims:
-        names = [str(name) for name in corrected["band"].values]
-        places = schema.band_positions(transform, names, "the transform")
-        result.attrs["transform"] = transform.values[places].ravel().tolist()
-    return result
-
-
-def interpolation(places: Array, taps: int) -> csr_array:
-    """Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
-
-    Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
-    what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
-    90 %. A place without so many has no weights, but for `_BEYOND`.
-    """
-    shape, inside, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
-    for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        here, first, weight = lagrange(place, size, taps)
-        inside &= here
-        factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
-    (down, row), (right, column) = factors
-    weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
-    pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
-    kept = inside[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
-    ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
-    return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
-
-
-def lagrange(place: Array, size: int, taps: int) -> tuple[Mask, npt.NDArray[np.int32], Array]:
-    """Places on a line of a size [pixel] with so many neighbours, the first, and all weights."""
-    nodes = np.arange(taps)
-    spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
-    inside = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
-    here = np.where(inside, place, 0.0)
-    first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
-    away = (here - first)[:, np.newaxis] - nodes
-    others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
-    return inside, first.astype(np.int32), np.prod(others / spacing, axis=2)
-
-
-def _weights(places: Array, bad: Mask) -> csr_array:
-    """Weights as `interpolation`, of lines near the border and near bad pixels."""
-    if np.array_equal(places, np.indices(bad.shape)):
-        return eye_array(bad.size, dtype=np.float32, format="csr")
-    fine = interpolation(places, TAPS)
-    near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
-    coarse = interpolation(places, 2)
-    keep, swap = (diags_array(part.astype(np.float32)) for part in (~near, near))
-    result = csr_array(keep @ fine + swap @ coarse)
-    result.eliminate_zeros()  # for a weight of 0 would pass a NaN on
-    return result
-
-
-def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
-    r"""Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
-
-    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
-    """
-    rows, columns = np.indices(shape, dtype=np.float64)
-    column, row, scale = np.einsum(
-        "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
-    )
-    scale = np.where(scale * matrix[2, 2] > 0, scale, np.nan)  # else behind the camera
-    return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
-
-
 def _offsets(
     corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str], search: int
 ) -> Array:
@@ -299,37 +206,6 @@ def _offsets(
             "first."
         )
     return values
-
-
-def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
-    """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
-    names = [str(name) for name in corrected["band"].values]
-    shape = corrected["counts"].shape[2:]
-    given = schema.check_numbers(transform, "transform")
-    expected = MAP if "axis" in given.dims else TRANSFORM
-    schema.check_variable(transform, expected, "the transform")
-    values = transform.values[schema.band_positions(transform, names, "the transform")]
-    if expected is MAP:
-        if values.shape[1:] != (2, *shape):
-            raise ValueError(
-                f"Invalid transform of shape {values.shape[1:]}. Must be {(2, *shape)} in each "
-                "band, as the image."
-            )
-        return [*values.astype(np.float64)]
-    if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
-        )
-    return [positions(matrix, shape) for matrix in values.astype(np.float64)]
-
-
-def _reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
-    """Rows and columns (2, y, x) in each band of one reflection; NaN where it is not known."""
-    field = laid_on(field, corrected, "the reflection shift", "the capture")
-    here = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
-    moved = here + field["shift"].where(field["known"]).transpose("axis", "y", "x").values
-    reference = str(field.attrs["reference_band"])
-    return [moved if str(band) == reference else here for band in corrected["band"].values]
 
 
 def _place(clock: str, names: list[str]) -> int:
@@ -360,55 +236,13 @@ def _noise(signals: Array, stamps: Array) -> Array:
     return np.array(levels).T
 
 
-def _missing(views: xr.DataArray) -> Mask:
+def _missing(films: xr.DataArray) -> Mask:
     """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
     parts = [
-        [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]
-        for rows in _rows.blocks(views.shape)
+        [clocks.missing(views.single(movie)) for movie in films.isel(y=rows).values]
+        for rows in _rows.blocks(films.shape)
     ]
     return np.asarray(np.all(parts, axis=0))
-
-
-def _single(counts: npt.NDArray[Any]) -> Movie:
-    """Counts in single precision, NaN where they are infinite or beyond it."""
-    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
-
-
-def _moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[xr.Dataset, Array]:
-    """All views, and the status, at other rows and columns; factor of each one's noise (band)."""
-    counts, status = corrected["counts"], corrected.get("status")
-    flags = np.zeros(counts.shape[2:], dtype=np.uint8) if status is None else status.values
-    weights = [_weights(places, flags > 0) for places in maps]
-
-    def views(rows: slice) -> Movie:
-        """Some rows of all bands."""
-        parts = [_warped(view, part, rows) for view, part in zip(counts, weights, strict=True)]
-        return np.stack(parts)
-
-    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
-    result = corrected.assign(counts=warped)
-    if status is not None:
-        result = result.assign(status=status.copy(data=_warped_status(flags, weights)))
-    # Independent noises of the pixels that a sample is made of: root mean square over the image.
-    squares = [(part**2).sum(axis=1)[np.diff(part.indptr) > 0] for part in weights]
-    return result, np.sqrt([np.mean(part) if part.size else 1.0 for part in squares])
-
-
-def _warped(view: xr.DataArray, weights: csr_array, rows: slice) -> Movie:
-    """Some rows (time, y, x) of the first view's pixels; NaN outside the view."""
-    height, width = view.shape[1:]
-    top, end, _ = rows.indices(height)
-    part = csr_array(weights[top * width : end * width])
-    result = np.full((len(view), end - top, width), np.nan, dtype=np.float32)
-    if part.nnz == 0:
-        return result
-    first, last = part.indices.min() // width, part.indices.max() // width
-    part = csr_array(part[:, first * width : (last + 1) * width])
-    frames = _single(view.isel(y=slice(first, last + 1)).values)
-    inside = np.diff(part.indptr).reshape(end - top, width) > 0
-    for frame, out in zip(frames, result, strict=True):
-        out[inside] = (part @ frame.ravel()).reshape(inside.shape)[inside]
-    return result
 
 
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
@@ -420,13 +254,3 @@ def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr
     result["counts"].attrs = {**corrected["counts"].attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
-
-
-def _warped_status(flags: npt.NDArray[Any], weights: Sequence[csr_array]) -> npt.NDArray[Any]:
-    """Bits (y, x) of every pixel that a warped one may be made of, in any of the views."""
-    result = np.zeros_like(flags)
-    for value in np.unique(flags[flags > 0]):
-        bad = (flags == value).ravel().astype(np.float32)
-        for part in weights:
-            result[(abs(part) @ bad).reshape(flags.shape) > 0] |= value
-    return result

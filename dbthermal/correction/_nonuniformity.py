@@ -161,8 +161,7 @@ def fit_correction(
     counts = schema.check(blackbody, "blackbody_frames")["counts"]
     if counts.sizes["temperature"] < 2:
         raise ValueError("Invalid blackbody frames of 1 temperature. Must have at least 2.")
-    kelvin = counts["temperature"].values
-    _numbers.real_numbers("temperature [K] of a blackbody", kelvin, _numbers.KELVIN)
+    _numbers.real_numbers("temperature [K]", counts["temperature"].values, _numbers.KELVIN)
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = (counts.sizes["y"], counts.sizes["x"])
@@ -173,11 +172,10 @@ def fit_correction(
     gain, offset, bad, residual, level = (np.stack(part) for part in zip(*parts, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
     values = {name: part.reshape(-1, *image) for name, part in maps.items()}
-    values |= {"residual": residual, "level": level}
-    values |= _residual_pattern(residual, level, blackbody)
+    values |= {"residual": residual, "level": level} | _residual_pattern(residual, level, blackbody)
     coords = {name: counts.coords[name] for name in counts.dims if name in counts.coords}
     attrs: dict[str, Any] = {"threshold": threshold, "detector_maximum": maximum}
-    attrs |= {"blackbody_temperatures": counts["temperature"].values.tolist()}
+    attrs["blackbody_temperatures"] = counts["temperature"].values.tolist()
     attrs |= schema.origin(blackbody.attrs)
     return xr.Dataset(schema.variables("correction", values), coords, attrs)
 
@@ -283,10 +281,9 @@ def correct(
     done = {
         f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
     }
-    by_camera = correction.attrs.get("by_camera", 0)
-    done |= {"gain_offset_corrected": 1 - by_camera, "detector_maximum": maximum}
+    done |= {"gain_offset_corrected": 1 - correction.attrs.get("by_camera", 0)}
     done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
-    done |= schema.origin(capture.attrs, correction.attrs)
+    done |= {"detector_maximum": maximum} | schema.origin(capture.attrs, correction.attrs)
     return schema.check(result.assign_attrs(done), "corrected")
 
 

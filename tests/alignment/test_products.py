@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import uniform_filter
 
 from dbthermal.alignment._products import BORDER, Match, products
-from dbthermal.alignment._resampling import TAPS, interpolation
+from dbthermal.alignment._views import TAPS, interpolation
 
 SHAPE, FRAMES = (9, 12), 40
 

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from dbthermal import alignment, schema, separation, simulation
 from dbthermal.alignment import _registration as registration
-from dbthermal.alignment import _resampling as resampling
+from dbthermal.alignment import _views as sampling
 from dbthermal.simulation import Rig
 
 pytest.importorskip("cv2")
@@ -37,7 +37,7 @@ def test_splines_and_motions_are_those_of_differences() -> None:
     images = rng.normal(size=(3, *shape))
     matrix = homography((0.7, -1.2), 1.5, 1.02)
     matrix[2, :2] = 2e-4, -1e-4
-    places = resampling.positions(matrix, shape)
+    places = sampling.positions(matrix, shape)
     inside = registration._inside(places, "9.5")
     splines = np.stack([spline_filter(one) for one in images], axis=-1)
     values, down, right = registration._sampled(splines, places[:, inside])
@@ -53,7 +53,7 @@ def test_splines_and_motions_are_those_of_differences() -> None:
         off = np.zeros((3, 3))
         off[row, column] = 1e-6 if row == 2 else 1e-4
         one, other = (
-            resampling.positions(it, shape)[:, inside] for it in (matrix + off, matrix - off)
+            sampling.positions(it, shape)[:, inside] for it in (matrix + off, matrix - off)
         )
         slope = (one - other) / (2.0 * off[row, column])
         np.testing.assert_allclose(motion[row, column], slope, rtol=1e-6, atol=1e-3)
@@ -72,7 +72,7 @@ def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.n
 def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
     """Two views of one plane, the second of other gain, offset and noise, with bad pixels."""
     rng = np.random.default_rng(seed)
-    (y, x), (row, column) = np.indices(SHAPE), resampling.positions(np.linalg.inv(matrix), SHAPE)
+    (y, x), (row, column) = np.indices(SHAPE), sampling.positions(np.linalg.inv(matrix), SHAPE)
     first, second = 100.0 * picture(x, y, seed), 3000.0 + 8.0 * picture(column, row, seed)
     counts = np.stack([np.stack([first] * frames), np.stack([second] * frames)])
     counts += rng.normal(0, [[[[1.0]]], [[[0.3]]]], counts.shape)
@@ -97,7 +97,7 @@ def test_object_registers(truth: tuple[tuple[float, float], float, float], model
     matrix = homography(*truth)
     for seed in range(3):
         found = alignment.register(views(matrix, seed), model=model)
-        apart = resampling.positions(found.values[1], SHAPE) - resampling.positions(matrix, SHAPE)
+        apart = sampling.positions(found.values[1], SHAPE) - sampling.positions(matrix, SHAPE)
         errors = np.hypot(*apart)
         print(
             f"{truth} {model}: {np.sqrt(np.mean(errors**2)):.3f}, at most {errors.max():.3f} pixel"
@@ -121,7 +121,7 @@ def test_a_warm_spot_tells_the_translation_alone() -> None:
             pattern = rng.normal(0, 0.125, (2, 1, *shape)) * noise
             capture["counts"] = capture["counts"] + pattern.astype(np.float32)
             found = alignment.register(capture).values[1]
-            errors.append(np.hypot(*(resampling.positions(found, shape) - np.indices(shape))).max())
+            errors.append(np.hypot(*(sampling.positions(found, shape) - np.indices(shape))).max())
         print(f"{shape}: {np.round(errors, 3)} pixel")
         assert np.median(errors) < 0.15  # [pixel]
 
@@ -145,11 +145,11 @@ def test_views_are_warped() -> None:
 def test_places_behind_the_camera_are_nan() -> None:
     """Pixels that a homography sends behind the camera have no place; an array is no transform."""
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.1, 0.0, 1.0]])
-    places = resampling.positions(horizon, (4, 20))
+    places = sampling.positions(horizon, (4, 20))
     assert np.isfinite(places[:, :, :10]).all()
     assert np.isnan(places[:, :, 10:]).all()
-    np.testing.assert_array_equal(places, resampling.positions(-horizon, (4, 20)))
-    assert np.isnan(resampling.positions(0 * horizon, (4, 20))).all()
+    np.testing.assert_array_equal(places, sampling.positions(-horizon, (4, 20)))
+    assert np.isnan(sampling.positions(0 * horizon, (4, 20))).all()
     with pytest.raises(TypeError, match="Invalid transform of type ndarray"):
         alignment.align(views(np.eye(3)), transform=np.eye(3))  # type: ignore[arg-type]
 

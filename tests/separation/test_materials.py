@@ -15,7 +15,6 @@ from dbthermal import separation, simulation
 from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.materials import (
     NONE,
-    _alike,
     _both,
     materials,
     step,
@@ -412,7 +411,7 @@ def test_ratios_beside_a_border(ratio: float, alike: bool) -> None:
     small = np.full_like(ratios, 1e-4)
     both = _both(ratios, small, emissivity, small)
     alone = Features(*(part[:1] for part in vars(both).values()))
-    assert _alike(one, ~one, alone, both) == alike
-    assert _alike(~one, one, alone, both) == alike
+    assert region_merging.alike(one, ~one, alone, both) == alike
+    assert region_merging.alike(~one, one, alone, both) == alike
     nothing = replace(alone, values=np.where(one, alone.values, np.nan))
-    assert _alike(one, ~one, nothing, both)
+    assert region_merging.alike(one, ~one, nothing, both)

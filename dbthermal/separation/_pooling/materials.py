@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import binary_dilation, distance_transform_cdt, find_objects
+from scipy.ndimage import find_objects
 from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
@@ -31,7 +31,7 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
-from dbthermal.separation._pooling import feature_maps, gradients, region_merging
+from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 from dbthermal.separation._subspace.reflection_ratio import ratio_variance
 from dbthermal.separation._tiles import Material
@@ -57,11 +57,6 @@ _TOLERANCE: Final = 0.0025
 # Standard deviation of a pixel's ratio, relative to it, beyond which it is left out [1]: neither
 # its own distribution nor that of the emissivity is a normal one there.
 _VAGUE: Final = 0.3
-# Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
-# deviations; variance of a median of normal values over that of their mean.
-_UNLIKE, _CERTAIN = 0.2, 3.0
-_OWN: Final = 0.08  # from the ratio of the emissivities, where the object's own changes make it
-_MEDIAN: Final = np.pi / 2.0
 # Fewest pixels of a material: remainders at a border, which stand out by their errors, have fewer.
 _SMALLEST: Final = 16
 # Square of the deviations by which a ratio tells two materials apart.
@@ -250,7 +245,9 @@ def joined(
             here = found.roots()[cells[window]]
             sides = here == one, here == other
             ratios, both = (part.window(window) for part in own)
-            if _alike(*sides, ratios, both) and _continuous(*sides, both, _RESOLUTION):
+            if region_merging.alike(*sides, ratios, both) and region_merging.continuous(
+                *sides, both, _RESOLUTION, _SPACINGS[0]
+            ):
                 found.join(one, other)
                 grown = True
     return _labelled(cells, found, alone)
@@ -374,48 +371,6 @@ def step(
     if np.any(residual > chdtri(pixels - design.shape[1], _BORDER_RATE)):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))
-
-
-def _alike(one: Mask, other: Mask, ratios: Features, both: Features) -> bool:
-    """Say that the ratios on both sides of a border (y, x) may be those of one material.
-
-    Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
-    """
-    told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
-    sides = [told & part for part in (one, other)]
-    if not all(part.any() for part in sides):
-        return True
-    middle = np.array([np.median(ratios.values[:, part], axis=1) for part in sides])
-    variance = [np.median(ratios.variances[:, part], axis=1) / part.sum() for part in sides]
-    error = np.sqrt(_MEDIAN * np.sum(variance, axis=0))
-
-    def near(expected: Array, found: Array, share: float) -> bool:
-        return bool(
-            np.all(np.abs(found - expected) <= np.maximum(_CERTAIN * error, share * expected))
-        )
-
-    if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
-        return True
-    for part, own, beside in zip(sides, middle, middle[::-1], strict=True):
-        first = both.values[-1, part]
-        if np.isfinite(first).any():
-            emissivity = np.nanmedian(first)
-            if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
-                return True
-    return False
-
-
-def _continuous(one: Mask, other: Mask, own: Features, resolution: float) -> bool:
-    """Say that the pixels' own features go on across the border of two regions (y, x)."""
-    border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
-    values, variances = own.values, own.variances
-    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= _SPACINGS[0])
-    both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
-    if not np.any(both):
-        return False
-    least = np.where(own.common, 0.0, resolution * np.abs(np.mean(values[:, both], axis=1)))
-    y, x = np.nonzero(both)
-    return gradients.continuous((y, x), values[:, both], variances[:, both], other[both], least)
 
 
 def _labelled(cells: Labels, regions: Regions, result: xr.Dataset) -> xr.DataArray:

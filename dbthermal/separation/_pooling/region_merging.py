@@ -1,19 +1,28 @@
 """Region merging: neighbouring cells are joined while their pooled features agree.
 
-The statistics of `materials`, apart from its maps: pooled features, the test of two regions, and
-the order in which they are joined.
+The statistics of `materials`, apart from its maps: pooled features, the tests of two regions and of
+their border, and the order in which they are joined.
 """
 
 import heapq
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_dilation, distance_transform_cdt
 from scipy.special import chdtri
 
 from dbthermal._arrays import Array, Mask
+from dbthermal.separation._pooling import gradients
 
 Labels = npt.NDArray[np.intp]
+
+# Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
+# deviations; variance of a median of normal values over that of their mean.
+_UNLIKE, _CERTAIN = 0.2, 3.0
+_OWN: Final = 0.08  # from the ratio of the emissivities, where the object's own changes make it
+_MEDIAN: Final = np.pi / 2.0
 
 
 @dataclass(frozen=True)
@@ -174,3 +183,45 @@ class Regions:
         for part in (self._total, self._first, self._count):
             part[:, first] += part[:, second]
             part[:, second] = 0.0
+
+
+def alike(one: Mask, other: Mask, ratios: Features, both: Features) -> bool:
+    """Say that the ratios on both sides of a border (y, x) may be those of one material.
+
+    Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
+    """
+    told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
+    sides = [told & part for part in (one, other)]
+    if not all(part.any() for part in sides):
+        return True
+    middle = np.array([np.median(ratios.values[:, part], axis=1) for part in sides])
+    variance = [np.median(ratios.variances[:, part], axis=1) / part.sum() for part in sides]
+    error = np.sqrt(_MEDIAN * np.sum(variance, axis=0))
+
+    def near(expected: Array, found: Array, share: float) -> bool:
+        return bool(
+            np.all(np.abs(found - expected) <= np.maximum(_CERTAIN * error, share * expected))
+        )
+
+    if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
+        return True
+    for part, own, beside in zip(sides, middle, middle[::-1], strict=True):
+        first = both.values[-1, part]
+        if np.isfinite(first).any():
+            emissivity = np.nanmedian(first)
+            if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
+                return True
+    return False
+
+
+def continuous(one: Mask, other: Mask, own: Features, resolution: float, reach: int) -> bool:
+    """Say that the pixels' own features go on across the border of two regions (y, x)."""
+    border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
+    values, variances = own.values, own.variances
+    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= reach)
+    both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
+    if not np.any(both):
+        return False
+    least = np.where(own.common, 0.0, resolution * np.abs(np.mean(values[:, both], axis=1)))
+    y, x = np.nonzero(both)
+    return gradients.continuous((y, x), values[:, both], variances[:, both], other[both], least)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _PARTS: Final = 5  # means over the latency
 _LOST: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
-_SLOWEST, _FASTEST = 1e-3, 1e5  # frame rates [Hz], and the reciprocals of times [s]
+_RATES, _SECONDS = (1e-3, 1e5), (1e-5, 1e3)  # frame rates [Hz] and times [s] that are taken
 _ROWS: Final = 16  # that a thread takes at once
 
 
@@ -124,10 +124,9 @@ class Stream:
         response_kind: str = "exact",
         workers: int = 2,
     ) -> None:
-        seconds = {"latency [s]": latency, "memory [s]": memory, "refresh [s]": refresh}
-        _numbers.real_number("frame_rate [Hz]", frame_rate, (_SLOWEST, _FASTEST))
-        for name, value in seconds.items():
-            _numbers.real_number(name, value, (1.0 / _FASTEST, 1.0 / _SLOWEST))
+        _numbers.real_number("frame_rate [Hz]", frame_rate, _RATES)
+        for name, value in (("latency", latency), ("memory", memory), ("refresh", refresh)):
+            _numbers.real_number(f"{name} [s]", value, _SECONDS)
         require_workers(workers)
         known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
