@@ -47,9 +47,11 @@ _FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 4, (8, 24), 4, 2.0
 _CERTAIN, _LEAST, _STRONG = 5.0, 0.3, 3.0
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
-    "time, and no shift of the reflections explains it. If the cameras stand apart, or their "
-    "clocks differ, the intervals of the other pixels are too small."
+    "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
+    "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
+    "small."
 )
+_MANY: Final = 0.2  # share of them from which a shift does not explain it
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
@@ -141,7 +143,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         source = "none" if reflection_shift is None else "found"
     else:
         alone = one(reflection_shift=reflection_shift) if alone is None else alone
-        source, doubts = "given", []
+        source, doubts = "given", _unexplained(alone)
     result = alone
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
@@ -200,9 +202,15 @@ def _apart(
             # An object that heats rapidly is apart in pixels that are paired by their reflections.
             left, moving = _pixels_apart(alone, shift)
             if left / moving < apart or _unflagged(alone) > good + _APART:
-                return alone, shift, []
+                return alone, shift, _unexplained(alone)
     first = one() if known is None else known
     return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
+
+
+def _unexplained(alone: xr.Dataset) -> list[str]:
+    """Doubt about a shift of the reflections with which bands are apart in many pixels."""
+    apart, moving = _pixels_apart(alone)
+    return [_UNEXPLAINED.format(apart / moving)] if apart > _MANY * moving else []
 
 
 def cameras_apart(

@@ -13,7 +13,7 @@ from dbthermal.separation._apart import displaced, equations, joint
 from dbthermal.separation._inputs import Inputs, Labels, check
 from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._tiles import Material
-from reproduction.experiments.pictures import Picture, smooth_shift
+from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 
 SHIFT = smooth_shift(SMALL.shape, 2.4, 1.2)
 HALVES = xr.DataArray(np.repeat([[0, 1]], 24, axis=1) + np.zeros((20, 1), int), dims=("y", "x"))
@@ -148,6 +148,24 @@ def test_a_rapid_object_does_not_hide_that_cameras_are_apart() -> None:
     assert result.attrs["reflection_shift"] == "found"
     assert good.mean() > 0.3
     assert inside.mean() > 0.9
+
+
+@pytest.mark.filterwarnings("ignore:The bands of")
+@pytest.mark.parametrize("depths", [(2.0, 2.0), (1.0, 4.0)])
+def test_two_depths_in_one_pixel_are_doubted(depths: tuple[float, float]) -> None:
+    """No shift of the reflections explains a window before a wall; of one depth nothing is said."""
+    picture, mirrored = Picture((32, 48), walkers=6), []
+    for seed, depth in enumerate(depths):
+        shift = np.stack([np.zeros(picture.shape), np.full(picture.shape, depth)])
+        mirrored.append(picture.draw(TIME[:200], GLASS, np.random.default_rng(seed), shift))
+    scene, other = mirrored
+    scene["background_temperature"] += other["background_temperature"] - ROOM
+    capture = simulation.observe(scene, RIG.response(), np.random.default_rng(2))
+    result = separation.separate(capture, RIG.response())
+    said = [one for one in result.attrs.get("warnings", []) if "no shift of the reflec" in one]
+    print(result.attrs["reflection_shift"], said)
+    assert result.attrs["reflection_shift"] == "found"
+    assert len(said) == (depths[0] != depths[1])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
