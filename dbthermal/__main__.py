@@ -18,6 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+from dbthermal import __version__
 from dbthermal._cli import is_source, leaves, unused
 
 __all__ = ["main"]
@@ -90,6 +91,7 @@ materials text*         as listed by 'data'; all by default
 --byte-order little|big of the numbers in raw files
 --header whole=0        before the first frame of raw files [byte]
 --frame-header whole=0  before each frame of raw files [byte]
+--simulated flag        no camera has recorded it: all that is made of it says so
 --variable text         name of an array in a file of several, or in a result
 --offset number         how much later the second camera began, or was exposed [s]; else found
 --simulate flag         use emulated devices
@@ -120,7 +122,7 @@ materials text*         as listed by 'data'; all by default
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
-_FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable"
+_FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"
 _COMMANDS: Final = f"""
 info files.info files {_FORM}
 say what a store or recording is: sizes, clock, bands, provenance, shares of the status
@@ -235,6 +237,7 @@ def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentPar
 def _parser() -> argparse.ArgumentParser:
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = _Parser("dbthermal", description=__doc__, **plain)
+    parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
     for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):

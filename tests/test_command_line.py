@@ -23,7 +23,7 @@ import tifffile
 import xarray as xr
 
 from dbthermal import __main__ as command_line
-from dbthermal import schema, simulation, store
+from dbthermal import __version__, schema, simulation, store
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -163,6 +163,25 @@ def test_info_of_stores_and_files(results: Path) -> None:
     assert one["stage"] == "recording of one band"
     assert one["attributes"]["byte_order"] == "little"
     assert "Missing --unit: 'a.tif' does not tell" in refused(results, "info", "a.tif")
+
+
+def test_simulated_files_make_simulated_results(results: Path) -> None:
+    """What no camera has recorded is said to be simulated, in all that is made of it."""
+    form = [*STATED, "--simulated", "--offset", "0", "-o", "simulated.zarr"]
+    done(results, "import", "a.tif", "b.tif", *form)
+    done(results, "correct", "simulated.zarr", "nuc.zarr", "-o", "simulated_corrected.zarr")
+    for name in ("simulated", "simulated_corrected"):
+        assert store.open_dataset(results / f"{name}.zarr").attrs["origin"] == "simulated"
+    assert store.open_dataset(results / "scene.zarr").attrs["origin"] == schema.MEASURED
+    _, told, _ = said(results, "info", "a.tif", "--unit", "count", "--clock", "10", "--simulated")
+    assert "simulated" in told
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    """The version of the package is told, as programs do."""
+    with pytest.raises(SystemExit, match="0"):
+        command_line.main(["--version"])
+    assert capsys.readouterr().out == f"dbthermal {__version__}\n"
 
 
 def test_raw_files_need_their_form(results: Path) -> None:

@@ -50,6 +50,12 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
+    """Recording of one camera, with its origin."""
+    made = _read(paths, options)
+    return made.assign_attrs(origin="simulated") if options.simulated else made
+
+
+def _read(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
     """Recording of one camera, by the kind of its files."""
     kind, clock = kind_of(paths[0], options), options.clock
     if kind == "FLIR":

@@ -13,9 +13,9 @@ _KINDS: Final = {
 }
 _FORM: Final = {
     "FLIR": "clock bands offset",
-    "TIFF": "clock bands offset unit",
-    "arrays": "clock bands offset unit variable",
-    "raw files": "clock bands offset unit shape byte_order header frame_header",
+    "TIFF": "clock bands offset unit simulated",
+    "arrays": "clock bands offset unit variable simulated",
+    "raw files": "clock bands offset unit shape byte_order header frame_header simulated",
 }
 """Kind of files -> the options that it takes."""
 
