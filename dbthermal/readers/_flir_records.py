@@ -97,7 +97,9 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     """Records of the frame that begins at a byte, and the byte after its last one."""
     size = len(content)
     if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:
-        raise ValueError(f"Invalid header {mark!r} of {place}. Must be FLIR's: 'FFF' or 'AFF'.")
+        other = "" if at else "; is it no recording of FLIR? Then export 16-bit counts as TIFF"
+        rule = f"Must be FLIR's: 'FFF' or 'AFF'{other}"
+        raise ValueError(f"Invalid header {mark!r} of {place}. {rule}.")
     orders = [o for o in "><" if 100 <= struct.unpack_from(f"{o}I", content, at + 20)[0] < 200]
     if not orders:
         version = content[at + 20 : at + 24].hex()
