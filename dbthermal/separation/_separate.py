@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import xarray as xr
-from scipy.linalg import eigh
 from scipy.ndimage import gaussian_filter
+from scipy.special import fdtrc
 
 from dbthermal import _smooth as smooth
 from dbthermal import alignment, schema
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
-from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
@@ -28,7 +27,7 @@ from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.held import hold
 from dbthermal.separation._solve import get_method, separated, solve
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
-from dbthermal.separation._tiles import Material
+from dbthermal.separation._tiles import Array, Material
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -41,10 +40,10 @@ _APART, _SIGMAS = 0.02, 3.0
 # Bits of pixels around an object, which a registration leaves without samples.
 _UNMEASURED: Final = np.uint32(schema.UNMEASURED)
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
-# displacement is looked for [pixel]; deviations and pixels from which it is one, and by how many
-# times their variance has to exceed that of noise, in every direction.
-_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 4, (8, 24), 4, 2.0
-_CERTAIN, _LEAST, _STRONG = 5.0, 0.3, 3.0
+# displacement is looked for [pixel]; chance below and pixels from which it is one, and by how many
+# times a window's changes have to exceed the noise, in variance.
+_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 24), 4, 2.0
+_CHANCE, _LEAST, _STRONG = 1e-3, 0.3, 3.0
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
@@ -252,15 +251,34 @@ def _step(corrected: xr.Dataset) -> int:
 
 
 def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
-    r"""Share of windows of the image in which the bands show rapid changes displaced; 0 if none do.
+    """Share of windows of the image in which the bands show rapid changes displaced; 0 if none do.
 
-    In each the displacement d is that of the regression of one band on another and its gradient
-    (Lucas and Kanade 1981), of both blurred, less what noise adds to the normal equations:
+    Their common displacement is seen if it is more than that of a poor registration, and beyond
+    chance by what it changes without one window after another (Hotelling's T-squared of the
+    jackknife): an object's own rapid changes displace a window, and so does a border of materials.
+    """
+    each = _displacements(corrected, response)
+    windows, (*tensor, gradient) = len(each), each.sum(axis=0)
+    if windows < _FEWEST or np.linalg.eigvalsh(tensor)[0] <= 0.0:
+        return 0.0
+    shift = np.linalg.solve(tensor, gradient)
+    without = [np.linalg.solve(one[:2], one[2]) for one in each.sum(axis=0) - each]
+    covariance = (windows - 1) ** 2 / windows * np.cov(np.transpose(without))
+    square = shift @ np.linalg.solve(covariance, shift)
+    chance = fdtrc(2, windows - 2, 0.5 * (windows - 2) / (windows - 1) * square)
+    if chance > _CHANCE or np.hypot(*shift) < _LEAST:
+        return 0.0
+    # Windows whose residual is smaller with it: 2 d g - d A d > 0.
+    return float(np.mean((2.0 * each[:, 2] - each[:, :2] @ shift) @ shift > 0.0))
 
-    .. math:: z_2 = \kappa \, (z_1 + d \cdot \nabla z_1)
 
-    It is seen if its median over the windows is beyond chance, for an object's own rapid changes
-    are displaced anyhow, and is more than that of a poor registration.
+def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> Array:
+    r"""Normal equations A d = g (window, 3, 2) of the displacement of windows with rapid changes.
+
+    Of the regression of one band on another and its gradient (Lucas and Kanade 1981), of both
+    blurred, with a ratio of each window that is eliminated, less what noise adds to them:
+
+    .. math:: z_2 = \kappa_w \, (z_1 + d \cdot \nabla z_1)
     """
     inputs = check(corrected, response, get_method("subspace"), "subspace")
     every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
@@ -285,18 +303,12 @@ def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
         normal, right = design @ design.T, design @ rapid[1].ravel()
         # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
         white = design.shape[1] * inputs.noise[inputs.bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
-        noise = white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
-        normal -= noise
-        if eigh(normal, noise, eigvals_only=True)[0] > _STRONG:
-            ratio, *shift = np.linalg.solve(normal, right)
-            found.append(np.array(shift) / ratio)
-    if len(found) < _FEWEST:
-        return 0.0
-    middle = np.median(found, axis=0)
-    error = MAD * np.median(np.abs(found - middle), axis=0) * np.sqrt(0.5 * np.pi / len(found))
-    if not np.any(np.abs(middle) > np.maximum(_CERTAIN * error, _LEAST)):
-        return 0.0
-    return float(np.mean(np.hypot(*np.transpose(found)) > _LEAST))
+        normal -= white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
+        if normal[0, 0] > _STRONG * white:
+            ratio, cross = right[0] / normal[0, 0], normal[0, 1:]
+            tensor = normal[1:, 1:] - np.outer(cross, cross) / normal[0, 0]
+            found.append([*ratio**2 * tensor, ratio * (right[1:] - ratio * cross)])
+    return np.array(found).reshape(-1, 3, 2)
 
 
 def _unflagged(result: xr.Dataset) -> float:

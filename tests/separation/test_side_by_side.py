@@ -150,6 +150,32 @@ def test_a_rapid_object_does_not_hide_that_cameras_are_apart() -> None:
     assert inside.mean() > 0.9
 
 
+@pytest.mark.parametrize("apart", [0.0, -4.0])
+def test_a_switched_lamp_shows_that_cameras_are_apart(apart: float) -> None:
+    """The bands of each pixel are simultaneous, with a false ratio: the outline tells."""
+    time, shape = TIME[:200], (40, 56)
+    rows, columns = np.indices(shape)
+    lit = sum((begin < time) & (time < begin + 2.0) for begin in (3.0, 8.0, 14.0))
+    views = []
+    for moved in (0.0, apart):
+        disc = 1.0 / (1.0 + np.exp(np.hypot(rows - 19.0, columns + moved - 27.0) - 11.0))
+        views.append(ROOM + 4.0 * np.multiply.outer(lit, disc))
+    warm = ROOM + 15.0 * simulation.heating(time, 0.0, 1.0, 8.0)[:, None, None] * np.ones(shape)
+    scene = simulation.scene(time, warm, views[0], GLASS)
+    scene["background_temperature"] = ("band", *scene["object_temperature"].dims), np.array(views)
+    scene["background_temperature"].attrs["units"] = "K"
+    capture = simulation.observe(scene, RIG.response(), np.random.default_rng(1))
+    result = separation.separate(capture, RIG.response())
+    good = (result["status"] == 0).values
+    score = (result["object_temperature"] - warm) / result["object_temperature_std"]
+    far = (score**2).mean("time").values[good] > 5.0**2
+    print(f"{good.mean():.2f} without a flag, {far.mean():.3f} of them far off")
+    assert result.attrs["reflection_shift"] == ("found" if apart else "none")
+    assert "warnings" not in result.attrs
+    assert good.mean() > 0.2
+    assert far.mean() < 0.02
+
+
 @pytest.mark.filterwarnings("ignore:The bands of")
 @pytest.mark.parametrize("depths", [(2.0, 2.0), (1.0, 4.0)])
 def test_two_depths_in_one_pixel_are_doubted(depths: tuple[float, float]) -> None:
