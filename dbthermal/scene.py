@@ -227,9 +227,14 @@ def _clocked(
         return aligned, field, 0.0
     # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock: the
     # clocks are compared at places of the same reflection, whose shift is then found anew.
+    first, frame = tried.copy(), float(np.median(np.diff(aligned["time"].values)))
     tried.clear()
-    aligned, field = at(reflection_shift=field)
-    frame = float(np.median(np.diff(aligned["time"].values)))
+    try:
+        aligned, field = at(reflection_shift=field)
+    except ValueError:  # the shift of clocks that are far off may be a false one
+        if not first or (offset := _next(first, frame)) is None:
+            raise
+        aligned, field = at(offset=offset)
     while tried and field is tried[-1].field:  # the last one told a delay
         if (offset := _next(tried, frame)) is None:
             break

@@ -64,10 +64,12 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(time.size)
     joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
     means, medians, noise, found = [], [], [], list[str]()
-    for band in counts:
-        slope = responses.curve(response, str(band["band"].item())).reference_slope
-        film = band[:, ::step, ::step].values.reshape(time.size, -1) / slope
-        changes = np.diff(np.where(schema.measured(film), film, np.nan), axis=0)
+    films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)
+    # Samples of all bands: one clock's resampling leaves out those of one band where much moves.
+    known = schema.measured(films).all(axis=0)
+    for name, film in zip(counts["band"].values, films, strict=True):
+        slope = responses.curve(response, str(name)).reference_slope
+        changes = np.diff(np.where(known, film / slope, np.nan), axis=0)
         seen = joined & (np.isfinite(changes).sum(axis=1) > max(_FEWEST, 0.5 * changes.shape[1]))
         if not seen.any():  # too few pixels tell it
             return []

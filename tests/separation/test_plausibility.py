@@ -63,6 +63,15 @@ def test_a_step_of_one_camera_is_told(corrected: xr.Dataset, band: int, kelvin: 
     both = corrected.copy(deep=True)
     both["counts"] += kelvin * late * xr.DataArray([115.0, 2 * 11.5], dims="band")
     assert of_one_camera(both, response) == []  # the room's light is switched
+    # A resampling of one band left out where most of the change is: what it keeps cancels.
+    kelvins = np.resize([4.0, -2.0, 4.0, 2.0, 4.0, 0.0, 4.0, -2.0, 2.0], both["counts"].shape[2:])
+    moved = xr.DataArray(kelvins, dims=("y", "x"))
+    partly = corrected.copy(deep=True)
+    change = late * xr.DataArray([115.0, 11.5], dims="band") * moved
+    partly["counts"] += change
+    kept = (partly["band"] != RIG.bands[1 - band]) | (partly["time"] < 5.0) | (moved < 4.0)
+    partly["counts"] = partly["counts"].where(kept)
+    assert of_one_camera(partly, response) == []
 
 
 def test_exchanged_blackbody_is_told_by_the_netd() -> None:
