@@ -208,6 +208,22 @@ def test_a_large_image_is_aligned_by_means(monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_allclose(aligned[1]["noise_factor"], aligned[0]["noise_factor"], rtol=0.02)
 
 
+@pytest.mark.slow
+def test_clocks_are_found_where_the_first_shift_is_false() -> None:
+    """At 50 Hz what moves by the cameras' shift is seen as a delay of many frames."""
+    rig: dict[str, Any] = {"shift": (-4.0, 0.8), "view": (-1, 4), "late": 2, "shutter": (0.76,)}
+    recording = whole.record((48, 62), (419, 50.0), 1, **rig, lost=(0.01, 0.01), steps=4, frames=16)
+    fitted, response = whole.calibrate(recording.movies)
+    corrected = correct_capture(recording.capture, fitted)
+    aligned, field = scene._aligned(
+        corrected, response, {"transform": whole.registration(rig["view"])}
+    )
+    print(f"clock {aligned.attrs['time_offset'][1]:.4f} s, true 0.02")
+    assert abs(aligned.attrs["time_offset"][1] - 0.02) < 0.002  # 0.1 of a frame
+    assert field is not None
+    assert field["known"].mean() > 0.8
+
+
 def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pixel that lacks samples does not step the mean; a bad one and a missing frame count."""
     rng, level = np.random.default_rng(2), np.array([20000.0, 21000.0])[:, None, None, None]
