@@ -35,6 +35,7 @@ _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography
 _NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
 # Deviation of rotation, scale, and perspective over the image, of equal cameras side by side [1].
 _RIGID: Final = 0.01
+_FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
 # Steps, and relative change of the correlation, at which the maximisation stops.
 _STEPS, _TOLERANCE = 200, 1e-7
@@ -226,19 +227,21 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
     # Residuals are alike over the blur, and at all times: one for each 4 pi blur^2 pixels.
     alike = 4.0 * np.pi * blur**2
     weights, variance = np.ones(shape), alike * count  # at first of images without a transform
+    # Of residuals over time: a pattern that a shutter event left rests, and spoils the mean alone.
+    white = np.eye(count)
     prior = np.where(span > 1.0, (_RIGID * span) ** -2, 0.0)  # [1/pixel^2], none on a translation
     for _ in range(_NEWTON):
         places = positions(matrix, shape)
         inside = _inside(places, band)
         first = pair[0][:, inside]
-        values, *slopes = _sampled(splines, places[:, inside])
+        values, *slopes = np.matmul(white, _sampled(splines, places[:, inside]))
         # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
         motion = _motion(matrix, places, inside)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = np.concatenate(
             [
                 -np.einsum("atp,nap->ntp", slopes, motion),
-                [first**power for power in range(1, _DEGREE + 1)],
-                np.repeat(np.eye(count)[:, :, np.newaxis], first.shape[1], axis=2),
+                np.matmul(white, [first**power for power in range(1, _DEGREE + 1)]),
+                np.repeat(white.T[:, :, np.newaxis], first.shape[1], axis=2),
             ]
         )
         weighted = design * weights[inside]
@@ -257,6 +260,10 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         limit = _CUT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
         weights[inside] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
         variance = alike * np.average(square, weights=weights[inside])
+        apart = np.linalg.solve(white, residual)
+        covariance = (apart * weights[inside]) @ apart.T / weights[inside].sum()
+        mean = np.trace(covariance) / count + np.finfo(np.float32).tiny
+        white = np.linalg.inv(np.linalg.cholesky(covariance / mean + _FLOOR * np.eye(count)))
         matrix = matrix.copy()
         matrix[rows, columns] += found[: len(free)] * unit
         matrix /= matrix[2, 2]
