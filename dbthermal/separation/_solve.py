@@ -363,6 +363,7 @@ def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -
     return xr.Dataset(arrays, coords=coordinates, attrs=kept)
 
 
+@np.errstate(over="ignore")  # a deviation beyond single precision is infinite
 def _write(
     result: xr.Dataset,
     bands: list[int],
