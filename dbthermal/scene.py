@@ -184,18 +184,18 @@ def _aligned(
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
     small = _of_squares(corrected)
     if small is corrected:
-        aligned, field, step = _clocked(corrected, response, options, align)
+        aligned, field, left = _clocked(corrected, response, options, align)
     else:  # what is of the whole image is found of the small one
         resample = partial(on_one_clock, steps=STEP * _side(corrected["counts"]))
-        aligned, field, step = _clocked(small, response, options, resample)
+        aligned, field, left = _clocked(small, response, options, resample)
         names = corrected["band"].values
         offset = xr.DataArray(aligned.attrs["time_offset"], {"band": names}, "band")
         aligned = align(corrected, **{**options, "offset": offset})
         field = None if field is None else _enlarged(field, corrected)
     if field is None or not (seen_apart(field) and cameras_apart(aligned, response)[0] > 0.0):
         return aligned, None
-    if not abs(step) <= _PRECISION:
-        off = f"{abs(step):.2g}" if np.isfinite(step) else "an unknown number of"
+    if not left <= _PRECISION:
+        off = f"{left:.2g}" if np.isfinite(left) else "an unknown number of"
         aligned = warned(
             aligned,
             f"The offset found between the cameras' clocks may be off by {off} frames, more than "
@@ -210,7 +210,7 @@ def _clocked(
     options: Mapping[str, Any],
     resample: Callable[..., xr.Dataset],
 ) -> tuple[xr.Dataset, xr.Dataset | None, float]:
-    """Capture on one clock, the shift of its reflections, and the clocks' last step [frame]."""
+    """Capture on one clock, the shift of its reflections, and what clocks are off by [frame]."""
     names, tried = corrected["band"].values, list[_Trial]()
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
 
@@ -242,7 +242,9 @@ def _clocked(
     best, step = _step(tried, frame) if tried else (None, np.nan)
     if best is not None and field is not best.field:
         aligned, field = resample(corrected, **{**options, "offset": best.offset}), best.field
-    return aligned, field, step / frame
+    # A delay that is not seen is known no better than by its deviation.
+    left = step if best is None else float(np.hypot(step, best.field.attrs["delay_std"]))
+    return aligned, field, left / frame
 
 
 @dataclass(frozen=True, eq=False)

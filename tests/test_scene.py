@@ -89,11 +89,16 @@ Seen = Callable[[float], tuple[float, int]]
 
 
 def clocks_tried(
-    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch, start: list[float], seen: Seen
+    plate: tuple[xr.Dataset, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    start: list[float],
+    seen: Seen,
+    std: float = 0.0,
 ) -> tuple[list[float], list[float], xr.Dataset]:
     """Offsets found, from those that what moves one way tells; those tried [frame]; the result.
 
-    By an offset of the other bands [frame] a camera is seen late [frame], and one is the reference.
+    By an offset of the other bands [frame] a camera is seen late [frame], with a deviation, and one
+    is the reference.
     """
     _, raw, fitted, response = plate
     corrected, frame, tried = correct_capture(raw, fitted), 0.1, list[float]()
@@ -108,7 +113,8 @@ def clocks_tried(
         offsets = np.array(aligned.attrs["time_offset"]) / frame
         tried.append(float(offsets[1:].mean()))
         late, reference = seen(tried[-1])
-        return xr.Dataset(attrs={"reference_band": bands[reference], "delay": late * frame})
+        told = {"delay": late * frame, "delay_std": std * frame}
+        return xr.Dataset(attrs={"reference_band": bands[reference], **told})
 
     monkeypatch.setattr(scene, "align", started)
     monkeypatch.setattr(scene, "_shift", shift)
@@ -160,6 +166,15 @@ def test_clocks_are_found_of_either_reference(
 
     (_, found), *_ = clocks_tried(plate, monkeypatch, [0.0, -0.3], seen)
     assert abs(found - 0.45) < 0.02
+
+
+def test_clocks_that_windows_tell_differently_are_doubted(
+    plate: tuple[xr.Dataset, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No delay is left, but parts of the image contradict one another."""
+    with pytest.warns(UserWarning, match=r"clocks may be off by 0\.2 frames"):
+        (_, found), *_ = clocks_tried(plate, monkeypatch, [0.0, 0.1], lambda c: (0.1 - c, 0), 0.2)
+    assert abs(found - 0.1) < 0.02
 
 
 @pytest.mark.parametrize("after", [0.3, np.nan])

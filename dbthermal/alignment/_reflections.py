@@ -75,7 +75,8 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         Stage `reflection_shift` of `schema`: `shift` (axis, y, x) [pixel], rows down and columns to
         the right, `shift_std`, and `known` (y, x), where texture tells the shift. It is
         extrapolated near by, and NaN farther off and where p + d(p) leaves the image. Attributes:
-        `reference_band`, `bands` (the others); `delay` [s] of these, beside the shift.
+        `reference_band`, `bands` (the others); `delay` [s] of these, beside the shift, and
+        `delay_std` [s].
 
     Raises
     ------
@@ -108,8 +109,9 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
-            late = matching.delay(level, field.on(level.centres()), times)
-            return _result(corrected, capture, field, data, spread).assign_attrs(delay=late)
+            late, std = matching.delay(level, field.on(level.centres()), times)
+            result = _result(corrected, capture, field, data, spread)
+            return result.assign_attrs(delay=late, delay_std=std)
 
 
 def seen_apart(field: xr.Dataset) -> bool:
