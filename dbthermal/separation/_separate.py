@@ -50,7 +50,7 @@ _UNEXPLAINED: Final = (
     "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
     "small."
 )
-_MANY: Final = 0.2  # share of them from which a shift does not explain it
+_MANY: Final = 0.3  # share of them from which a shift does not explain it
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
