@@ -291,6 +291,7 @@ def delay(movies: Movies, shift: Array, times: Array) -> tuple[float, float]:
         np.add.reduceat(np.add.reduceat(part, starts[0], axis=0), starts[1], axis=1)
         for part in (gradient, information)
     ]
-    without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
+    with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
+        without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
     std = np.sqrt((without.size - 1) * np.var(without))
     return float(gradient.sum() / information.sum()), float(std)

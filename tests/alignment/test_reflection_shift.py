@@ -53,6 +53,21 @@ def test_finds_a_smooth_field() -> None:
     assert field.attrs["bands"] == ["9.5"]
 
 
+def test_parts_that_are_late_differently_make_the_delay_uncertain() -> None:
+    """Half of the second view is a frame late, half early: no delay, but a large deviation."""
+    capture, _ = drawn(23, (2.4, 1.2), Picture(shape=(40, 56), walkers=5), 200)
+    torn, middle = capture.isel(time=slice(1, -1)).copy(deep=True), capture.sizes["x"] // 2
+    torn["counts"][1, :, :, :middle] = capture["counts"].values[1, 2:, :, :middle]
+    torn["counts"][1, :, :, middle:] = capture["counts"].values[1, :-2, :, middle:]
+    both = [alignment.reflection_shift(one, RESPONSE).attrs for one in (capture, torn)]
+    frames = [[10.0 * one[name] for name in ("delay", "delay_std")] for one in both]
+    print(f"delay and deviation {np.round(frames, 3).tolist()} frames")
+    assert abs(frames[0][0]) < 0.05
+    assert frames[0][1] < 0.05
+    assert abs(frames[1][0]) < 3.0 * frames[1][1]
+    assert frames[1][1] > 0.1
+
+
 def test_a_band_between_its_frames() -> None:
     """The rapid noise of a band that is interpolated half-way between its frames is not white."""
     rng, picture = np.random.default_rng(13), Picture(shape=(40, 56), walkers=5)
