@@ -1,4 +1,4 @@
-"""Readers of outside formats: recordings, thermal spectra, videos drawn in a palette, YAML.
+"""Readers of outside formats: recordings, thermal spectra, YAML.
 
 A reader takes a path and returns labelled data in SI units, or raises; it mends nothing. What it
 opens was written by others: it must be a regular file of a limited size.
@@ -10,14 +10,11 @@ from dbthermal.readers._flir import flir
 from dbthermal.readers._spectra import ecostress, slum, ucsb
 from dbthermal.readers._stacks import raw, tiff
 from dbthermal.readers._two_bands import two_bands
-from dbthermal.readers._videos import masked_palette_video, palette_video
 
 __all__ = [
     "array",
     "ecostress",
     "flir",
-    "masked_palette_video",
-    "palette_video",
     "raw",
     "read_yaml",
     "slum",

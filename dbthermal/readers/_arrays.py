@@ -15,8 +15,7 @@ import xarray as xr
 from dbthermal import schema
 from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
-from dbthermal.readers._decoding import MEMORY
-from dbthermal.readers._recording import Clock
+from dbthermal.readers._recording import MEMORY, Clock
 
 # Names of dims by their place, and those of an array without names, of any case.
 _DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")

@@ -16,9 +16,8 @@ from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask
 from dbthermal.readers import _flir_records as container
 from dbthermal.readers import _recording as recordings
-from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._flir_records import Content, Frame
-from dbthermal.readers._recording import Clock, Counts, FileFlag, Paths
+from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag, Paths
 
 # Place in the camera's record [byte], type, and limits beyond which a value is implausible.
 _FIELDS: Final = {

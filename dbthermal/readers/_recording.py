@@ -26,11 +26,12 @@ Paths = str | Path | Sequence[str | Path]
 Clock = float | npt.ArrayLike
 
 _EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
-_RECORD: Final = "its 8 bits are drawn, not measured: record 16-bit counts (readers.palette_video)"
+_RECORD: Final = "its 8 bits are drawn, not measured: record 16-bit counts"
 _REFUSED: Final = {
     **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".sfmov"), _EXPORT),
     **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
 }
+MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default [byte]
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _FASTEST: Final = 1e6  # frame rate of a camera [Hz]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame

@@ -13,8 +13,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal.readers import _recording as recordings
-from dbthermal.readers._decoding import MEMORY
-from dbthermal.readers._recording import Clock, Paths
+from dbthermal.readers._recording import MEMORY, Clock, Paths
 
 # What a page must say: the attribute of tifffile's page, or the tag, which is 1 where it is
 # missing; its name in messages, and the value.

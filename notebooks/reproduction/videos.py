@@ -16,8 +16,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from dbthermal import metrics, readers, separation
-from reproduction import parallax
+from dbthermal import metrics, separation
+from reproduction import palettes, parallax
 
 Array = npt.NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
     Raises a FileNotFoundError without such a video, a ValueError if the two differ in shape.
     """
     movies = [
-        readers.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
+        palettes.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
     ]
     if movies[0].shape != movies[1].shape:
         raise ValueError(
@@ -101,7 +101,7 @@ def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: i
     `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
     """
     path = _file(files, f"{name}_{kind}_Tbdiff_video.mp4")
-    return readers.masked_palette_video(path, "turbo", width)
+    return palettes.masked_palette_video(path, "turbo", width)
 
 
 def first_frame(

@@ -16,7 +16,7 @@ from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from dbthermal.readers._decoding import MEMORY, Film, decode
+from reproduction.palettes._decoding import MEMORY, Film, decode
 
 # Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
 # if it is nearer by a step of 8 bit.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbthermal import _text as texts
-from dbthermal.readers import _recording as recordings
+from dbthermal.planck import require_positive
 
 MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
 PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
@@ -37,12 +37,10 @@ class Film(NamedTuple):
 
 
 def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
-    """Decode a video left of `width` [pixel]; see `dbthermal.readers.palette_video`."""
+    """Decode a video left of `width` [pixel]; see `palette_video`."""
     import av  # noqa: PLC0415  (a spectrum needs no video codec)
 
-    recordings.check_number(memory, "memory")
-    if width is not None:
-        recordings.check_number(width, "width", whole=True)
+    require_positive("memory", memory)
     content = texts.regular_file(path, int(memory)).read_bytes()
     kinds = _CONTAINERS.items()
     form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)
