@@ -143,7 +143,7 @@ def _check_duration(container: Any, seconds: NDArray[Any], path: Path) -> None:
 
 
 def _check_segment(path: Path) -> None:
-    """Compare the size of a Matroska file with its segment's, which a cut frame leaves too large."""
+    """Compare a Matroska file's size with its segment's, which a cut leaves too large."""
     with path.open("rb") as stream:
         head = stream.read(300)
     if (place := head.find(b"\x18\x53\x80\x67", 0, 200) + 4) > 4:  # RFC 8794, section 4: sizes
