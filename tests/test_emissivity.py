@@ -12,7 +12,6 @@ from scipy.integrate import quad
 
 from dbthermal import emissivity, planck, readers, schema
 from dbthermal.bands import FILTERS, Band
-from dbthermal.emissivity import _filters
 
 GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
 
@@ -228,23 +227,15 @@ def test_noise_behind_filters() -> None:
         emissivity.filter_noise(-0.03, FILTERS)
 
 
-def test_single_frame_std_of_glass() -> None:
-    """Plate glass at 0.04 and 0.4 K of noise: 0.40 K, the figure of the closed form."""
+def test_single_frame_std() -> None:
+    """Plate glass at 0.04 and 0.4 K: 0.41 K; gray: infinite; others: the scatter of solutions."""
     noise = xr.DataArray([0.04, 0.4], coords={"band": ["8-14", "9.5"]}, dims="band")
-    result = _filters._single_frame_std(table(glass=[0.86, 0.72], gray=[0.9, 0.9]), noise, "8-14")
-    np.testing.assert_allclose(result[0], [0.408], rtol=0, atol=0.001)
-    assert np.isinf(result[1, 0])
-    assert result["band"].values.tolist() == ["9.5"]
-
-
-def test_single_frame_std_against_draws() -> None:
-    """The closed form is the scatter of the two equations' solution under drawn noise."""
-    noise = xr.DataArray([0.05, 0.2], coords={"band": ["8-14", "9.5"]}, dims="band")
-    mixing = np.array([[0.3, 0.7], [0.5, 0.5]])
-    drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * [[0.05], [0.2]]
-    spread = np.linalg.solve(mixing, drawn)[0].std()
-    result = _filters._single_frame_std(table(m=[0.3, 0.5]), noise, "8-14")
-    assert float(result[0, 0]) == pytest.approx(spread, rel=0.01)
+    drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * noise.values[:, np.newaxis]
+    scatter = np.linalg.solve(np.array([[0.3, 0.7], [0.5, 0.5]]), drawn)[0].std()
+    for pair, expected in (([0.86, 0.72], 0.408), ([0.9, 0.9], np.inf), ([0.3, 0.5], scatter)):
+        choice = emissivity.rank_filters(table(m=pair), noise)
+        assert choice["band"].values.tolist() == ["9.5"]
+        assert float(choice["object_temperature_std"][0]) == pytest.approx(expected, rel=0.01)
 
 
 def test_choice_weighs_condition_against_noise() -> None:

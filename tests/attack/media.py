@@ -64,7 +64,7 @@ def _values(found: Any) -> list[np.ndarray]:
 def _line(rng: Rng, whole: bytes, change: Callable[[list[bytes], int], Any]) -> bytes:
     """Change one line of the table, behind the header."""
     lines = whole.split(b"\n")
-    filled = [n for n, line in enumerate(lines) if line[:1].strip() and line.strip()[:1].isdigit()]
+    filled = [n for n, line in enumerate(lines) if line.strip()[:1].isdigit()]
     change(lines, filled[int(rng.integers(1, len(filled) - 1))])
     return b"\n".join(lines)
 
