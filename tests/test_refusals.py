@@ -389,8 +389,8 @@ def test_bands_go_by_name() -> None:
         xr.testing.assert_identical(calibrated(emissivity=known), exchanged)
     other = response.apparent_temperature(CAMERA, COUNTS.isel(band=swapped))
     xr.testing.assert_identical(other.isel(band=swapped), APPARENT)
-    exchanged = metrics.correlation(APPARENT, COUNTS.isel(band=swapped))
-    xr.testing.assert_identical(metrics.correlation(APPARENT, COUNTS), exchanged)
+    turned = metrics.correlation(APPARENT, COUNTS.isel(band=swapped))
+    xr.testing.assert_identical(metrics.correlation(APPARENT, COUNTS), turned)
     with pytest.raises(ValueError, match="Repeated band"):
         calibrated(emissivity=GLASS.assign_coords(band=["8-14", "8-14"]))
 

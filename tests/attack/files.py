@@ -25,7 +25,7 @@ from reproduction import cache, manifest, paths
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
-main: Final = entry_points(group="console_scripts")["dbthermal"].load()
+main: Final[Callable[[list[str]], int]] = entry_points(group="console_scripts")["dbthermal"].load()
 """The command line, as a shell finds it."""
 LINES: Final = "x" * 40  # an attribute of some length
 

@@ -1,5 +1,6 @@
 """Damaged files of every form: refused by name and rule, or read as what the file says."""
 
+import math
 import random
 import re
 import resource
@@ -39,7 +40,7 @@ def first_seed(number: int, fewest: int = 100) -> int:
 
 def at_most(share: float, number: int) -> float:
     """Largest count of a share, by chance exceeded less often than once in ten thousand runs."""
-    return share * number + 4 * (share * number) ** 0.5 + (1 if share else 0)
+    return share * number + 4 * math.sqrt(share * number) + (1 if share else 0)
 
 
 @pytest.mark.parametrize("number", SIZES)
