@@ -278,20 +278,6 @@ def test_readers_load_no_video_codec() -> None:
 
 
 @pytest.mark.data
-def test_every_spectrum_of_the_mirror(mirror: Path) -> None:
-    """All 993 spectra are read; only six hold values outside [0, 1]."""
-    spectra = [readers.ecostress(path) for path in (mirror / "ecostress").glob("*.spectrum.txt")]
-    spectra += readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv").values()
-    spectra += [
-        readers.ucsb(mirror / "ucsb" / f"{name}.csv")
-        for name in ("clybrkcm", "distd_wn", "oakface", "sndpgaz1")
-    ]
-    assert len(spectra) == 993
-    assert sum(spectrum.attrs["unphysical_values"] > 0 for spectrum in spectra) == 6
-    assert min(float(spectrum["wavelength"][-1]) for spectrum in spectra) > 12.39e-6
-
-
-@pytest.mark.data
 def test_published_scene(mirror: Path) -> None:
     """The published coffee pot fits plasma closely, its separated video turbo on the object."""
     movie = readers.palette_video(mirror / "scenes" / "coffeepot-0-bg.mp4")

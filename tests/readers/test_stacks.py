@@ -123,17 +123,12 @@ def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: 
         read(path)
 
 
-def test_tags_that_change_nothing(tmp_path: Path) -> None:
-    """A scale of 1, an offset of 0, a value of no data that does not occur, and the way up."""
+def test_unit_must_be_stated(tmp_path: Path) -> None:
+    """Temperatures are refused with what to do; tags that change nothing are not."""
     texts = {42112: GDAL.format("SCALE", "scale", "1.0"), 42113: "0"}
     tags = [(274, 3, 1, 1, False), *((code, 2, 0, text, False) for code, text in texts.items())]
     write(path := tmp_path / "a.tif", scene(), extratags=tags)
     assert_array_equal(read(path).counts, scene())
-
-
-def test_unit_must_be_stated(tmp_path: Path) -> None:
-    """Temperatures are refused with what to do."""
-    write(path := tmp_path / "a.tif", scene())
     with pytest.raises(ValueError, match=r"Invalid unit 'K' of 'a\.tif'.*Record or export raw"):
         readers.tiff(path, unit="K", clock=10)
     path.write_bytes(b"II*\0" + bytes(20))
