@@ -1,6 +1,5 @@
-"""FLIR recordings made from counts, in all forms that the format allows, and damage to them."""
+"""FLIR recordings made from counts, in all forms that the format allows."""
 
-import random
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -107,29 +106,3 @@ def jpeg(content: bytes, size: int = 3000) -> bytes:
     ]
     exif = b"\xff\xe1\x00\x08Exif\0\0"
     return b"\xff\xd8" + exif + b"".join(segments) + b"\xff\xda\x00\x02picture\xff\xd9"
-
-
-def damaged(content: bytes, seed: int) -> tuple[str, bytes]:
-    """One flipped bit, the end cut off, zeros, a huge number, or two pieces exchanged."""
-    rng, changed = random.Random(seed), bytearray(content)
-    kind = ("flip", "cut", "zero", "huge", "swap")[seed % 5]
-    # Half of the damage is where the file begins, which says how large all is.
-    reach = len(changed) if seed % 2 else min(len(changed), 600)
-    place = rng.randrange(reach)
-    size = min(rng.choice([1, 4, 16, 64]), reach - place)
-    if kind == "flip":
-        changed[place] ^= 1 << rng.randrange(8)
-    elif kind == "cut":
-        del changed[rng.randrange(len(changed)) :]
-    elif kind == "zero":
-        changed[place : place + size] = bytes(size)
-    elif kind == "huge":
-        place -= place % 4
-        changed[place : place + 4] = rng.choice(
-            [b"\xff" * 4, b"\xff\xff\xff\x7f", b"\x7f\xff\xff\xff", b"\0\0\0\x80", b"\x40\0\0\0"]
-        )[: len(changed) - place]
-    else:
-        other = rng.randrange(len(changed) - size)
-        first, second = changed[place : place + size], changed[other : other + size]
-        changed[place : place + size], changed[other : other + size] = second, first
-    return kind, bytes(changed)

@@ -87,18 +87,10 @@ def test_linear_response_is_off(name: str, reading: float) -> None:
 def test_temperature_inverts_radiance(name: str, temperature: float) -> None:
     """Temperature to radiance and back is the temperature, to rounding."""
     band = FILTERS[name]
-    back = float(band.temperature(band.radiance(temperature)))
+    radiance = band.radiance(temperature)
+    back = float(band.temperature(radiance))
     assert back == pytest.approx(temperature, rel=1e-13)
-
-
-@given(NAMES, st.floats(1e-6, 0.999999))
-def test_radiance_inverts_temperature(name: str, share: float) -> None:
-    """Radiance to temperature and back is the radiance, to rounding."""
-    band = FILTERS[name]
-    lowest, highest = band.radiance(TEMPERATURE_RANGE)
-    radiance = float(lowest + share * (highest - lowest))
-    again = float(band.radiance(band.temperature(radiance)))
-    assert again == pytest.approx(radiance, rel=1e-12)
+    assert float(band.radiance(back)) == pytest.approx(float(radiance), rel=1e-12)
 
 
 def test_images_keep_their_shape() -> None:
@@ -116,21 +108,17 @@ def test_nodes_span_the_band() -> None:
     assert weights.sum() == pytest.approx(1.5e-6, rel=1e-12)
 
 
-@pytest.mark.parametrize("temperature", [99.9, 2000.1, np.nan, 25.0])
-def test_temperature_outside_the_range(temperature: float) -> None:
-    """A temperature outside the range raises a ValueError that gives it, the band and the range."""
-    message = f"Invalid temperature [K] in band '9.5' {temperature}. Must lie in [100.0, 2000.0]."
+@pytest.mark.parametrize("bad", [99.9, 2000.1, np.nan, 25.0, -1.0, 0.0, 1e9])
+def test_values_outside_the_range(bad: float) -> None:
+    """A temperature or radiance outside the range is named with band and range, not clipped."""
+    message = f"Invalid temperature [K] in band '9.5' {bad}. Must lie in [100.0, 2000.0]."
     for function in (FILTERS["9.5"].radiance, FILTERS["9.5"].slope):
         with pytest.raises(ValueError, match=re.escape(message)):
-            function([300.0, temperature])
-
-
-@pytest.mark.parametrize("radiance", [-1.0, 0.0, np.nan, 1e9])
-def test_radiance_outside_the_range(radiance: float) -> None:
-    """A radiance outside the range raises a ValueError; it is not clipped."""
-    message = f"Invalid radiance [W m-2 sr-1] in band '8-14' {radiance}. Must lie in ["
-    with pytest.raises(ValueError, match=re.escape(message)):
-        FILTERS["8-14"].temperature([50.0, radiance])
+            function([300.0, bad])
+    if not 0.0 < bad < 1e6:
+        message = f"Invalid radiance [W m-2 sr-1] in band '8-14' {bad}. Must lie in ["
+        with pytest.raises(ValueError, match=re.escape(message)):
+            FILTERS["8-14"].temperature([50.0, bad])
 
 
 @pytest.mark.parametrize(
@@ -158,9 +146,5 @@ def test_filters_of_the_paper() -> None:
     for name, values in expected.items():
         assert found[name] == pytest.approx(values, abs=1e-9)
         assert get(name).name == name
-
-
-def test_unknown_filter() -> None:
-    """An unknown filter raises an error that lists the known ones."""
     with pytest.raises(KeyError, match=re.escape("Unknown band '9.25'. Must be one of ['10.6'")):
         get("9.25")

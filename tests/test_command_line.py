@@ -48,7 +48,10 @@ def said(folder: Path, *arguments: str) -> tuple[int, str, str]:
     """Exit status, output and error of a command, in this process, which has imported all."""
     out, error = StringIO(), StringIO()
     with chdir(folder), redirect_stdout(out), redirect_stderr(error):
-        status = command_line.main(arguments)
+        try:
+            status = command_line.main(arguments)
+        except SystemExit as usage:
+            status = int(usage.code or 0)
     return status, out.getvalue(), error.getvalue()
 
 
@@ -106,8 +109,9 @@ def results(files: Path) -> Path:
         program, *arguments = commands[:end]
         commands = commands[end + 1 :]
         assert program == "dbthermal"
-        found = run(files, *arguments)
-        assert found.returncode == 0, found.stderr
+        with warnings.catch_warnings(action="always"):
+            status, _, error = said(files, *arguments)
+        assert status == 0, error
     return files
 
 
@@ -162,7 +166,6 @@ def test_info_of_stores_and_files(results: Path) -> None:
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording of one band"
     assert one["attributes"]["byte_order"] == "little"
-    assert "Missing --unit: 'a.tif' does not tell" in refused(results, "info", "a.tif")
 
 
 def test_simulated_files_make_simulated_results(results: Path) -> None:
@@ -259,10 +262,6 @@ def test_curves_films_pictures(results: Path) -> None:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
-    line = refused(results, "export", "result.zarr", "-o", "out.xyz")
-    assert "Must end in one of ['.csv', '.tif', '.nc', '.png', '.pdf', '.svg']" in line
-    line = refused(results, "export", "result.zarr", "--pixel", "24", "0", "-o", "no.csv")
-    assert "Must lie in the image of 24 x 32" in line
 
 
 def test_report_and_explorer(results: Path) -> None:
@@ -289,7 +288,6 @@ def test_plan_and_data(tmp_path: Path) -> None:
     listed = json.loads(run(tmp_path, "data", "--json").stdout)
     assert listed["filters_um"]["9.5"] == [9.25, 9.75]
     assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
-    assert "Unknown material 'gold'" in refused(tmp_path, "plan", "gold", "--noise", "0.03")
 
 
 def test_record_names_the_devices(tmp_path: Path) -> None:
@@ -323,7 +321,6 @@ def test_nothing_is_overwritten(results: Path) -> None:
     line = refused(results, "calibrate", "--blackbody", "scene.zarr", *twice)
     assert "Invalid output 'new.zarr': it is another one" in line
     assert not (results / "new.zarr").exists()
-    assert "No file or folder 'none.zarr'" in refused(results, "info", "none.zarr")
 
 
 def test_no_correction_must_be_stated(results: Path) -> None:
@@ -365,11 +362,7 @@ def test_refusals_are_one_line(results: Path) -> None:
     with pytest.raises(ValueError, match="Unknown dates"):
         said(results, *command, "--traceback")
     for wrong in (["separate", "scene.zarr"], ["complete", *"abc", "--surroundings", "22"], ["no"]):
-        with pytest.raises(SystemExit, match="2"):
-            said(results, *wrong)
-    assert (
-        run(results, "complete", "a", "b", "c", "--surroundings", "22", "-o", "d").returncode == 2
-    )
+        assert said(results, *wrong)[0] == 2
     assert run(results, "nothing").returncode == 2
 
 
@@ -429,8 +422,8 @@ REFUSED = {
 }
 
 
-def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
-    """Every message that docs/own_captures.md lists is what a command answers to such a mistake."""
+def test_mistakes_with_files_are_named(results: Path) -> None:
+    """A command answers with the message of docs/own_captures.md to each such mistake."""
     stack = tifffile.imread(results / "b.tif")
     mistakes = {"8": stack.astype("u1"), "f": stack / np.float32(100), "small": stack[:, :-1]}
     kelvin = np.linspace(29300, 29700, stack[0].size).reshape(stack[0].shape).astype("u2")
@@ -444,9 +437,6 @@ def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
     (results / "text.tif").write_text("hello", encoding="utf-8")
-    page = (ROOT / "docs" / "own_captures.md").read_text(encoding="utf-8")
-    table = page.partition("| the message begins")[2]
-    assert re.findall(r"(?m)^\| `(.+?)` \|", table) == [*REFUSED]
     for message, commands in REFUSED.items():
         for command in commands.split("; "):
             with warnings.catch_warnings(action="always"):
@@ -502,6 +492,29 @@ def test_the_explorer_says_what_it_lacks(results: Path) -> None:
         ),
         ("explore response.zarr -o x.ipynb", "Invalid result 'response.zarr' of stage 'response'."),
         ("explore result.zarr nuc.zarr -o x.ipynb", "Missing variable 'counts' in the capture"),
+        ("export aligned.zarr -o x.csv", "No variable with times and pixels in 'aligned.zarr'"),
+        ("record nothing.yaml recordings", "No file or folder 'nothing.yaml'"),
+        (
+            "export result.zarr --variable emissivity -o x.csv",
+            "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper",
+        ),
+        (
+            "export result.zarr --variable noise -o x.tif",
+            "Unknown variable 'noise' for .tif. Must be one of ['background_temper",
+        ),
+        ("report response.zarr -o x.html", "Invalid result 'response.zarr' of stage 'response'"),
+        (
+            "separate aligned.zarr response.zarr --method calibrated --emissivity 0.9 -o x.zarr",
+            "Invalid --emissivity [0.9]. Must be one for each of the bands",
+        ),
+        # A minus begins a temperature, as of a blackbody outdoors or the sky, and no option.
+        ("calibrate --at -5C no.tif b.tif -o x.zarr", "No file or folder 'no.tif'"),
+        ("complete no b c --surroundings -40C -o x.zarr", "No file or folder 'no'"),
+        ("info nothing.zarr", "No file or folder 'nothing.zarr'"),
+        ("plan gold --noise 0.03", "Unknown material 'gold'"),
+        ("export result.zarr -o out.xyz", "Must end in one of ['.csv', '.tif', '.nc', '.png'"),
+        ("export result.zarr --pixel 24 0 -o x.csv", "Must lie in the image of 24 x 32"),
+        ("info a.tif", "Missing --unit: 'a.tif' does not tell"),
     ],
 )
 def test_mistakes_are_explained_in_words_of_the_commands(
@@ -565,9 +578,9 @@ def test_options_without_effect_are_refused(
 )
 def test_a_misspelt_name_is_recognised(results: Path, arguments: str, meant: str) -> None:
     """A command, an option, a choice, or a name that the library knows: the nearest is named."""
-    found = run(results, *arguments.split())
-    assert found.returncode > 0
-    assert found.stderr.rstrip().endswith(f"Did you mean '{meant}'?")
+    status, _, error = said(results, *arguments.split())
+    assert status > 0
+    assert error.rstrip().endswith(f"Did you mean '{meant}'?")
 
 
 def test_a_warning_is_said_once(results: Path) -> None:
@@ -580,46 +593,21 @@ def test_a_warning_is_said_once(results: Path) -> None:
     assert found.stderr.count("Warning: 3 rows and 0 columns of band") == 2
 
 
-def test_what_has_no_time_makes_no_curve(results: Path) -> None:
-    """The names for a curve are those over time, which a map is not."""
-    line = refused(results, "export", "aligned.zarr", "-o", "x.csv")
-    assert "No variable with times and pixels in 'aligned.zarr'" in line
-    line = refused(results, "record", "nothing.yaml", "recordings")
-    assert "No file or folder 'nothing.yaml'" in line
-    line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")
-    assert "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper" in line
-    line = refused(results, "export", "result.zarr", "--variable", "noise", "-o", "x.tif")
-    assert "Unknown variable 'noise' for .tif. Must be one of ['background_temper" in line
-    line = refused(results, "report", "response.zarr", "-o", "x.html")
-    assert "Invalid result 'response.zarr' of stage 'response'" in line
-    apart = ["--method", "calibrated", "--emissivity", "0.9", "-o", "x.zarr"]
-    line = refused(results, "separate", "aligned.zarr", "response.zarr", *apart)
-    assert "Invalid --emissivity [0.9]. Must be one for each of the bands" in line
-
-
-def test_temperatures_below_zero(tmp_path: Path) -> None:
-    """A minus begins a temperature, as of a blackbody outdoors or the sky, and no option."""
-    line = refused(tmp_path, "calibrate", "--at", "-5C", "a.tif", "b.tif", "-o", "a.zarr")
-    assert "No file or folder 'a.tif'" in line
-    line = refused(tmp_path, "complete", *"abc", "--surroundings", "-40C", "-o", "d.zarr")
-    assert "No file or folder 'a'" in line
-    found = run(tmp_path, "calibrate", "--at", "5c", "a.tif", "b.tif", "-o", "a.zarr")
-    assert "Invalid temperature '5c'. Must be a number, with a decimal point, and" in found.stderr
-    found = run(tmp_path, "calibrate", "--at", "25,0C", "a.tif", "b.tif", "-o", "a.zarr")
-    assert "Invalid temperature '25,0C'. Must be a number, with a decimal point" in found.stderr
-
-
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reading"),
     [
         ("278C", "551.15 K; kelvin are written 278K"),
         ("22K", "-251.15 degrees Celsius; these are written 22C"),
     ],
 )
-def test_a_doubtful_unit_is_noticed(text: str, said: str, tmp_path: Path) -> None:
+def test_a_doubtful_unit_is_noticed(text: str, reading: str, tmp_path: Path) -> None:
     """Celsius that look like kelvin, and the reverse, are taken as written, with a warning."""
-    found = run(tmp_path, "complete", *"abc", "--surroundings", text, "-o", "d.zarr")
-    assert f"Warning: {text} is {said}.\n" in found.stderr
+    with warnings.catch_warnings(action="always"):
+        _, _, error = said(tmp_path, "complete", *"abc", "--surroundings", text, "-o", "d.zarr")
+    assert f"Warning: {text} is {reading}.\n" in error
+    for wrong in ("5c", "25,0C"):
+        _, _, error = said(tmp_path, "calibrate", "--at", wrong, "a.tif", "b.tif", "-o", "a.zarr")
+        assert f"Invalid temperature '{wrong}'. Must be a number, with a decimal point" in error
 
 
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:

@@ -44,32 +44,24 @@ def capture() -> xr.Dataset:
 
 @pytest.mark.parametrize("stage", schema.STAGES)
 def test_every_stage_takes_its_own(stage: str) -> None:
-    """A dataset made by the definitions passes, and is returned as it is."""
+    """A dataset made by the definitions passes as it is; a variable less is named."""
     dataset = example(stage)
     before = dataset.copy(deep=True)
     assert schema.check(dataset, stage) is dataset
     xr.testing.assert_identical(dataset, before)
-
-
-@pytest.mark.parametrize("stage", schema.STAGES)
-def test_every_variable_is_needed(stage: str) -> None:
-    """A missing variable raises an error with its name."""
     for name in schema.STAGES[stage]:
         with pytest.raises(ValueError, match=f"Missing variable '{name}' in the {stage}"):
-            schema.check(example(stage).drop_vars(name), stage)
+            schema.check(dataset.drop_vars(name), stage)
 
 
 def test_another_stage_is_named() -> None:
-    """A response where a correction is wanted is said to be one."""
-    with pytest.raises(ValueError, match=r"Missing variable 'gain' .*, as has a response\."):
-        schema.check(example("response"), "correction")
-
-
-def test_absent_units_are_the_agreed_ones(capture: xr.Dataset) -> None:
-    """An array without a unit passes, and so does any real dtype."""
+    """A response for a correction is said to be one; a capture may lack its units."""
+    capture = example("capture")
     counts = capture["counts"].drop_attrs(deep=False).astype(np.float32)
     changed = capture.assign(counts=counts)
     assert schema.check(changed, "capture") is changed
+    with pytest.raises(ValueError, match=r"Missing variable 'gain' .*, as has a response\."):
+        schema.check(example("response"), "correction")
 
 
 Change = Callable[[xr.Dataset], xr.Dataset]
@@ -107,17 +99,6 @@ Change = Callable[[xr.Dataset], xr.Dataset]
             lambda ds: ds.assign_coords(time=[1.0, 1.0, 2.0]),
             "1.0 s is followed by 1.0 s. Must increase strictly",
         ),
-    ],
-)
-def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
-    """Each rule of a capture has its error, with the name, the value and the rule."""
-    with pytest.raises(ValueError, match=re.escape(message)):
-        schema.check(change(capture), "capture")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
         (lambda ds: ds.astype(complex), "Invalid dtype complex128 of 'counts'"),
         (lambda ds: ds.astype(bool), "Invalid dtype bool of 'counts'"),
         (lambda ds: ds.astype(str), "Invalid dtype <U5 of 'counts'"),
@@ -129,16 +110,10 @@ def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
         (lambda ds: ds["counts"], "Invalid capture of type DataArray. Must be a Dataset"),
     ],
 )
-def test_bad_types(capture: xr.Dataset, change: Change, message: str) -> None:
-    """Arrays that are not real numbers, and objects that are not datasets, raise a TypeError."""
-    with pytest.raises(TypeError, match=re.escape(message)):
+def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
+    """Each rule of a capture has its error, with the name, the value and the rule."""
+    with pytest.raises((TypeError, ValueError), match=re.escape(message)):
         schema.check(change(capture), "capture")
-
-
-def test_unknown_stage(capture: xr.Dataset) -> None:
-    """An unknown stage raises an error that lists the known ones."""
-    with pytest.raises(ValueError, match=re.escape("Unknown stage 'raw'. Must be one of ['black")):
-        schema.check(capture, "raw")
 
 
 def test_coordinates_of_other_stages() -> None:
@@ -147,6 +122,8 @@ def test_coordinates_of_other_stages() -> None:
         turned = example(stage)
         with pytest.raises(ValueError, match=f"Unordered '{name}' of"):
             schema.check(turned.isel({name: slice(None, None, -1)}), stage)
+    with pytest.raises(ValueError, match=re.escape("Unknown stage 'raw'. Must be one of ['black")):
+        schema.check(example("capture"), "raw")
 
 
 def test_units_are_si() -> None:

@@ -4,12 +4,13 @@ import json
 import os
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal import _text as texts
+from dbthermal import readers
 from dbthermal.readers import read_yaml
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]))
@@ -19,18 +20,18 @@ LEAVES = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(0.
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"a\nb\xffc", r"a\.txt, line 2, column 2: Invalid byte 0xff. Must be text in utf-8"),
-        (b"a\r\nb\x00", r"a\.txt, line 2, column 2: Invalid control character '\\x00'"),
-        (b"\xff\xfea\x00", r"a\.txt, line 1, column 1: Invalid byte 0xff"),
-        (b"x" * 33, r"Invalid size 33 bytes of '.*a\.txt'. Must be at most 32"),
+        (b"a\nb\xffc", r"a\.yaml, line 2, column 2: Invalid byte 0xff. Must be text in utf-8"),
+        (b"a\r\nb\x00", r"a\.yaml, line 2, column 2: Invalid control character '\\x00'"),
+        (b"\xff\xfea\x00", r"a\.yaml, line 1, column 1: Invalid byte 0xff"),
+        (b"x" * 10**8, r"Invalid size 100000000 bytes of '.*a\.yaml'. Must be at most"),
     ],
 )
 def test_text_is_refused_with_its_place(tmp_path: Path, content: bytes, message: str) -> None:
     """Bytes that are no text are named with line and column, a large file with its size."""
-    path = tmp_path / "a.txt"
+    path = tmp_path / "a.yaml"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=message):
-        texts.read_text(path, limit=32)
+        read_yaml(path)
 
 
 def test_only_regular_files_are_opened(tmp_path: Path) -> None:
@@ -38,37 +39,41 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path, kind in ((tmp_path, "folder"), (tmp_path / "pipe", "pipe"), ("/dev/zero", "pipe")):
         with pytest.raises(ValueError, match=f"a {kind}.* Must be a regular file"):
-            texts.read_text(path)
+            read_yaml(path)
     with pytest.raises(FileNotFoundError, match=r"absent\.txt"):
-        texts.read_text(tmp_path / "absent.txt")
+        read_yaml(tmp_path / "absent.txt")
 
 
-def test_marks_and_line_ends_are_no_content(tmp_path: Path) -> None:
-    """A byte-order mark is taken off, and every kind of line end is a newline."""
-    path = tmp_path / "a.txt"
-    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n")
-    assert texts.read_text(path) == "a\nb\nc\n"
+def emissivity(folder: Path, text: str) -> float:
+    """Number in a table of spectra, after a byte-order mark, with line ends of all kinds."""
+    path = folder / "f.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + f"wavelength,A1\r\n8,{text}\r14,0.5\n".encode())
+    return float(readers.slum(path)["A1"]["emissivity"][0])
 
 
-@pytest.mark.parametrize("text", ["1", "-1.5", ".5", "3.", "1e3", "1E-3", " 7\t"])
-def test_decimal_numbers(text: str) -> None:
+@pytest.mark.parametrize("text", ["1", "0.75", ".5", "1.", "1e0", "5E-1", " 0.7\t"])
+def test_decimal_numbers(tmp_path: Path, text: str) -> None:
     """Decimal numbers have Python's value."""
-    assert texts.number(text, "a") == float(text)
+    assert emissivity(tmp_path, text) == float(text)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "nan", "inf", "1e999", "1_000", "1,5", "1 000", "1,000.0", "0x10", "١٢", "1d3"]
+    "text", ["", "nan", "inf", "1e999", "1_000", "1 000", "0x10", "\u0661\u0662", "1d3"]
 )
-def test_what_is_no_decimal_number(text: str) -> None:
+def test_what_is_no_decimal_number(tmp_path: Path, text: str) -> None:
     """Words, separators, other digits and what is beyond the floats are refused by place."""
-    with pytest.raises(ValueError, match=f"^f, line 3: Invalid number {re.escape(repr(text))}"):
-        texts.number(text, "f, line 3")
+    message = f"f.csv, line 2, column 2: Invalid number {text!r}"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        emissivity(tmp_path, text)
 
 
 @given(st.dictionaries(WORDS, st.recursive(LEAVES, st.lists, max_leaves=20)))
 def test_yaml_of_json_is_read_back(content: dict[str, object]) -> None:
     """What json writes, which is YAML, is read back as it was."""
-    assert texts.parse_yaml(json.dumps(content, ensure_ascii=False), "a") == content
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "a.yaml")
+        path.write_text(json.dumps(content, ensure_ascii=False), encoding="utf-8", newline="")
+        assert read_yaml(path) == content
 
 
 @pytest.mark.parametrize(
@@ -95,14 +100,17 @@ def test_yaml_of_json_is_read_back(content: dict[str, object]) -> None:
         ("[1, 2]", "Invalid content [1, 2]. Must be a mapping"),
         ("x" * 500, "xxx... (502 characters). Must be a mapping"),
         ("a: [1", "line 2, column 1: Must be YAML"),
-        ("a: \t- b: \x01", "Must be YAML"),
-        ("a: '\ud800'", "Must be YAML"),
+        ("a: \t- b: c", "Must be YAML"),
     ],
 )
-def test_yaml_is_refused_in_one_line(text: str, message: str) -> None:
+def test_yaml_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
+) -> None:
     """Repeated keys, ambiguous values, references and tags are refused by place and rule."""
+    monkeypatch.chdir(tmp_path)
+    Path("f.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        texts.parse_yaml(text, "f.yaml")
+        read_yaml("f.yaml")
     assert str(error.value).startswith("f.yaml")
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300
@@ -113,37 +121,3 @@ def test_project_files_are_plain_yaml() -> None:
     root = Path(__file__).parents[1]
     files = [*(root / "params").rglob("*.yaml"), root / "data_manifest.yaml"]
     assert all(read_yaml(path) for path in files)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"a": 1,\n "a": 2}', "f.json: Repeated key 'a'. Must be listed once"),
-        ('{"a": NaN}', "f.json: Invalid number 'NaN'. Must be finite"),
-        ('{"a": 1e999}', "f.json: Invalid number '1e999'. Must be finite"),
-        ('{"a": ' + "9" * 5000 + "}", "f.json: Invalid number '9999"),
-        ('{"a": 1,\n', "f.json, line 2, column 1: Must be JSON"),
-        ("[" * 100_000, "f.json: Invalid nesting. Must be less deep"),
-    ],
-)
-def test_json_is_refused_by_place(text: str, message: str) -> None:
-    """Repeated keys, numbers that are not finite and text that is no JSON name the file."""
-    with pytest.raises(ValueError, match=re.escape(message)):
-        texts.parse_json(text, "f.json")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a,b\n1,2\n3", "f.csv, line 3: Truncated line '3'. Must end with a line end"),
-        ('a,b\n1,"2\n', "f.csv, line 2: Must be comma-separated values"),
-        ("a,b\n1,2,3\n", "f.csv, line 2: Invalid row ['1', '2', '3']. Must be 2 numbers"),
-        ("a,b\n\n", "f.csv, line 2: Invalid row [].* Must be 2 numbers".replace(".*", ".")),
-        ("a,b\n1,2\n1,2_0\n", "f.csv, line 3, column 2: Invalid number '2_0'. Must be finite"),
-        ("a,b\n", "Empty table in 'f.csv'. Must hold at least one row"),
-    ],
-)
-def test_tables_are_refused_by_place(text: str, message: str) -> None:
-    """Rows that are cut, short or no numbers are named by line and column."""
-    with pytest.raises(ValueError, match=re.escape(message)):
-        texts.numbers(texts.table_rows(text, "f.csv")[1:], 2, "f.csv")

@@ -109,6 +109,9 @@ def array(
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
+    if recordings.smoother(counts) < 0:  # as after a flipped bit of the header
+        rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
+        raise ValueError(f"Invalid counts of '{label}': {rule}.")
     fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
     recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
     return recordings.clocked(counts, clock, label, format="array", **schema.origin(own))

@@ -3,8 +3,10 @@
 import argparse
 import os
 import re
+import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 from attack.runner import CLASSES, attack_all, only, table
@@ -42,7 +44,11 @@ def write(page: Path, lines: list[str], command: str) -> None:
     """Put a table between the marks of a page."""
     begin, end = _MARKS
     data = ", with the public spectra" if os.environ.get("DBTHERMAL_DATA") else ""
-    text = "\n".join([begin, f"`python -m attack {command}`{data}:", "", *lines, "", end])
+    git = ["git", "-C", str(page.resolve().parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    stamp = f"{datetime.now(UTC):%Y-%m-%d}, commit {commit or 'unknown'}"
+    said = f"`python -m attack {command}`{data}, {stamp}:"
+    text = "\n".join([begin, said, "", *lines, "", end])
     content = page.read_text(encoding="utf-8")
     marked = re.compile(f"{begin}.*{end}", re.DOTALL)
     page.write_text(marked.sub(lambda _: text, content), encoding="utf-8")

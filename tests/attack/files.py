@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from functools import cache as once
+from importlib.metadata import entry_points
 from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
@@ -18,13 +19,14 @@ from attack.oracle import Attack, Verdict
 from attack.scenes import pick, scene
 from attack.stages import wrong
 from dbthermal import schema, store
-from dbthermal.__main__ import main
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
 from reproduction import cache, manifest, paths
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
+main: Final[Callable[[list[str]], int]] = entry_points(group="console_scripts")["dbthermal"].load()
+"""The command line, as a shell finds it."""
 LINES: Final = "x" * 40  # an attribute of some length
 
 

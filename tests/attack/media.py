@@ -1,62 +1,36 @@
 """Hostile spectra and videos: look-alikes of the public files, or these themselves, damaged."""
 
 import os
-import struct
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-import av
+import hostile_files as hostile
 import numpy as np
-from matplotlib import colormaps
 
 from attack.files import flip, workplace
 from attack.oracle import Attack, Verdict
+from attack.scenes import pick
 from attack.stages import RIGHT, wrong
 from dbthermal import readers
 
 Rng = np.random.Generator
 
-_HEADER: Final = """Name: Plate Glass
-Type: manmade
-Measurement: Hemispherical reflectance
-X Units: Wavelength (micrometers)
-Y Units: Reflectance (percent)
-First X Value: {first:.4f}
-Last X Value: {last:.4f}
-Number of X Values: {number}
-Additional Information: none
-
-"""
-
 
 @cache
 def _whole(kind: str) -> tuple[bytes, ...]:
     """Files of a library: a look-alike, and some of the public ones where they are."""
-    wavelength = 1e4 / np.linspace(2850, 670, 110)  # 3.5 to 14.9 um, in even steps as in FTIR
-    values = 0.85 + 0.1 * np.sin(wavelength)
-    rows = list(zip(wavelength, values, strict=True))
-    if kind == "ecostress":
-        ends = {"first": wavelength[0], "last": wavelength[-1], "number": len(wavelength)}
-        text = _HEADER.format(**ends) + "".join(f"{w:.4f} {100 - 100 * v:.4f}\n" for w, v in rows)
-        pattern = "ecostress/*.txt"
-    elif kind == "slum":
-        text = "wavelength,A001,A002\n" + "".join(f"{w:.4f},{v:.4f},{v:.5f}\n" for w, v in rows)
-        pattern = "slum/LUMA*.csv"
-    else:
-        text = "x1,x2,y_glass\n" + "".join(f"{w:.4f},{1e4 / w:.4f},{v:.4f}\n" for w, v in rows)
-        pattern = "ucsb/*[!T].csv"
     folder = os.environ.get("DBTHERMAL_DATA")
-    public = sorted(Path(folder).glob(pattern))[::40] if folder else []
-    return (text.encode("latin-1"), *(path.read_bytes() for path in public))
+    pattern = {"ecostress": "*.txt", "slum": "LUMA*.csv", "ucsb": "*[!T].csv"}[kind]
+    public = sorted(Path(folder, kind).glob(pattern))[::40] if folder else []
+    return (hostile.tables()[kind], *(path.read_bytes() for path in public))
 
 
 def spectra(rng: Rng) -> Attack:
     """Spectra of three libraries: cut, with rows lost, swapped or spoilt, of other text."""
     kind = str(rng.choice(["ecostress", "slum", "ucsb"]))
-    choices = _whole(kind)
-    whole = choices[int(rng.integers(len(choices)))]
+    whole = pick(rng, _whole(kind))
     path = workplace() / f"{kind}.spectrum"
     what = str(rng.choice(list(_TABLES)))
     spoilt = _TABLES[what](rng, whole)
@@ -90,7 +64,7 @@ def _values(found: Any) -> list[np.ndarray]:
 def _line(rng: Rng, whole: bytes, change: Callable[[list[bytes], int], Any]) -> bytes:
     """Change one line of the table, behind the header."""
     lines = whole.split(b"\n")
-    filled = [n for n, line in enumerate(lines) if line[:1].strip() and line.strip()[:1].isdigit()]
+    filled = [n for n, line in enumerate(lines) if line.strip()[:1].isdigit()]
     change(lines, filled[int(rng.integers(1, len(filled) - 1))])
     return b"\n".join(lines)
 
@@ -142,48 +116,31 @@ _TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
 @cache
 def _film() -> bytes:
     """A small video of a wave drawn in plasma."""
-    time, y, x = np.ogrid[:24, :48, :64]
-    wave = 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
-    return _encoded(colormaps["plasma"](np.rint(wave * 255).astype(int), bytes=True)[..., :3])
+    return hostile.video(workplace() / "whole.mp4").read_bytes()
 
 
 @cache
 def _large() -> bytes:
     """A video of a few kB, whose pictures take a gigabyte."""
-    plain = np.array([204, 71, 120], np.uint8)
-    return _encoded(np.broadcast_to(plain, (72, 1080, 1920, 3)), "ultrafast")
+    plain = np.broadcast_to(np.array([204, 71, 120], np.uint8), (72, 1080, 1920, 3))
+    return hostile.video(workplace() / "whole.mp4", plain, preset="ultrafast").read_bytes()
 
 
-def _encoded(frames: Any, preset: str = "medium") -> bytes:
-    path = workplace() / "whole.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "preset": preset})
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = "yuv420p"
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-    return path.read_bytes()
-
-
-def _spoil(rng: Rng, content: bytearray, what: str) -> None:
-    """Damage the bytes of a video."""
+def _spoil(rng: Rng, content: bytes, what: str) -> bytes:
+    """Video with its bytes damaged."""
+    place = int(rng.integers(len(content) - 100))
     if what == "noise":
         first = content.index(b"mdat") + 4 + int(rng.integers(50, 1500))
-        content[first : first + 20] = rng.bytes(20)
-    elif what == "cut":
-        del content[int(rng.integers(len(content))) :]
-    elif what == "size":
-        # The width and height that the container states; the stream has its own.
-        place = content.index(b"avc1", content.index(b"stsd") + 12) + 28
-        content[place : place + 4] = struct.pack(">HH", 32000, 32000)
-    elif what == "text":
-        content = bytearray(
-            b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
-        )
-    elif what == "zeros":
-        place = int(rng.integers(len(content) - 100))
-        content[place : place + 100] = bytes(100)
+        return content[:first] + rng.bytes(20) + content[first + 20 :]
+    if what == "cut":
+        return content[:place]
+    if what == "size":
+        return hostile.falsely_sized(content)
+    if what == "text":
+        return b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
+    if what == "zeros":
+        return content[:place] + bytes(100) + content[place + 100 :]
+    return content
 
 
 def videos(rng: Rng) -> Attack:
@@ -195,10 +152,8 @@ def videos(rng: Rng) -> Attack:
     truth = readers.palette_video(path).values
     what = str(rng.choice(["flipped"] * 4 + ["noise", "cut", "size", "address", "text", "zeros"]))
     large = rng.random() < 0.05
-    content, given = bytearray(_large() if large else whole), str(path)
-    what = "large" if large else what
-    _spoil(rng, content, what)
-    path.write_bytes(bytes(content))
+    what, given = "large" if large else what, str(path)
+    path.write_bytes(_spoil(rng, _large() if large else whole, what))
     if what == "flipped":
         flip(rng, path)
     if what == "address":
@@ -220,11 +175,6 @@ def videos(rng: Rng) -> Attack:
 
 
 _ADDRESSES: Final = (
-    *(
-        "file://{}",
-        "concat:{0}|{0}",
-        "subfile,,start,0,end,900,,:{}",
-        "http://localhost:9/film.mp4",
-    ),
-    *("data:video/mp4;base64,AAAA film", "pipe:0 film", "cache:{}", "lavfi:testsrc film"),
+    *("file://{}", "concat:{0}|{0}", "subfile,,start,0,end,900,,:{}", "lavfi:testsrc film"),
+    *("data:video/mp4;base64,AAAA film", "pipe:0 film", "cache:{}", "http://localhost:9/film.mp4"),
 )

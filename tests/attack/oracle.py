@@ -26,7 +26,8 @@ LIMIT: Final = "limit"
 
 SECONDS: Final = 60
 MEGABYTES: Final = 500
-"""Bounds of one input, in time and beyond the memory held before it; inputs are a few MB."""
+"""Bounds of one input, in time of the processor and beyond the memory held before it; inputs are a
+few MB. A machine that is busy with other work makes nothing late."""
 
 _REFUSALS: Final = (ValueError, TypeError, OSError)
 # Of the libraries, those that name what does not fit: a model's field, a coordinate.
@@ -128,7 +129,7 @@ def _verdict(attack: Attack) -> Verdict:
         with _within(SECONDS):
             result = attack.act()
     except Late:
-        return Verdict("hang", f"more than {SECONDS} s")
+        return Verdict("hang", f"more than {SECONDS} s of the processor")
     except MemoryError as error:
         return Verdict("memory", str(error))
     except Warning as error:
@@ -165,13 +166,13 @@ def _within(seconds: float) -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> None:
         raise Late(number, frame)
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _reset_peak() -> None:

@@ -120,7 +120,7 @@ class Worker:
         self._pipe.send((name, seed))
         outcome = None
         try:
-            if self._pipe.poll(3 * SECONDS):
+            if self._pipe.poll(20 * SECONDS):  # for what waits, and works not
                 outcome = self._pipe.recv()
         except (EOFError, ConnectionError):
             self.process.join()

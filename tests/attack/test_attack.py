@@ -1,21 +1,21 @@
 """Hostile inputs of every class end well, and the oracle tells when they do not."""
 
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
+from hostile_files import seed_of_week
 
 from attack import oracle
 from attack.oracle import Attack, Verdict, carry_out
 from attack.runner import CLASSES, Worker, attack_all, table
 
-SHORT, LONG = 300, 6000
-"""Inputs of the run in the quick tests, and of the slow one."""
-
-UNMENDED: dict[str, str] = {}
-"""Class with inputs that still end badly -> why; none that does not is in it."""
+SHORT, WEEKLY, LONG = 300, 1500, 6000
+"""Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
 
 
 @pytest.fixture(scope="module")
@@ -26,15 +26,7 @@ def worker() -> Iterator[Worker]:
     made.close()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=UNMENDED[name], strict=True))
-        if name in UNMENDED
-        else name
-        for name in CLASSES
-    ],
-)
+@pytest.mark.parametrize("name", CLASSES)
 def test_short_attack(worker: Worker, name: str) -> None:
     """No input of a class ends badly."""
     total = sum(share for _, share in CLASSES.values())
@@ -43,18 +35,34 @@ def test_short_attack(worker: Worker, name: str) -> None:
     assert not {seed: one for seed, one in outcomes.items() if one.kind in oracle.BAD}
 
 
-@pytest.mark.slow
-def test_long_attack() -> None:
-    """Of 6,000 inputs 99 % end well, and of the pixels without a flag at most 0.1 % are wrong."""
-    tallies = dict(attack_all(list(CLASSES), LONG, 1001))
-    print("", *table(tallies), sep="\n")
+@pytest.mark.parametrize(
+    ("number", "seed"),
+    [
+        pytest.param(WEEKLY, 1000 * seed_of_week(), marks=pytest.mark.slow, id="of this week"),
+        pytest.param(LONG, 1001, marks=pytest.mark.long, id="long"),
+    ],
+)
+def test_many_attacks(number: int, seed: int) -> None:
+    """99 % of the inputs end well, and of the pixels without a flag at most 0.1 % are wrong.
+
+    Of 1,500 inputs, which are too few for the second, at most 0.5 % are silent, and the share of
+    pixels is not surely above it: wrong pixels come by inputs, so the sum of their squares is the
+    variance of their number.
+    """
+    tallies = dict(attack_all(list(CLASSES), number, seed))
+    print(f"DBTHERMAL_SEED={seed_of_week()}, first seed {seed}", *table(tallies), sep="\n")
     for tally in tallies.values():
         print(*tally.bad_lines(), sep="\n")
     outcomes = [one for tally in tallies.values() for one in tally.outcomes.values()]
     assert sum(one.kind in oracle.BAD for one in outcomes) <= 0.01 * len(outcomes)
+    assert sum(one.kind == "silent" for one in outcomes) <= 0.005 * len(outcomes)
     judged = [one for one in outcomes if one.unflagged > 1]  # pixels; of others, one is the whole
-    assert sum(one.wrong for one in judged) <= 0.001 * sum(one.unflagged for one in judged)
+    wrong, total = (sum(getattr(one, n) for one in judged) for n in ("wrong", "unflagged"))
     whole = sum(one.kind == "silent" for one in outcomes if one.unflagged <= 1)
+    if number < LONG:
+        wrong -= 1.64 * sum(one.wrong**2 for one in judged) ** 0.5
+        whole = 0
+    assert wrong <= 0.001 * total
     assert whole <= 0.001 * len(outcomes)
 
 
@@ -95,3 +103,16 @@ def test_dead_process_is_told(worker: Worker) -> None:
     os.kill(worker.process.pid or 0, 9)
     assert worker.run("metrics", 1).kind == "crash"
     assert worker.run("metrics", 1).kind != "crash"
+
+
+def test_time_of_the_processor_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What works without end is a hang; what waits for a while, as on a busy machine, is not."""
+    monkeypatch.setattr(oracle, "SECONDS", 0.1)
+
+    def endless() -> None:
+        while True:
+            pass
+
+    assert carry_out(Attack("", endless, lambda _: Verdict("right"))).kind == "hang"
+    wait = partial(time.sleep, 0.3)
+    assert carry_out(Attack("", wait, lambda _: Verdict("right"))).kind == "right"

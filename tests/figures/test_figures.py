@@ -157,15 +157,12 @@ def test_every_figure_is_tested() -> None:
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_figure(name: str) -> None:
-    """A figure of measured data is drawn without a warning, has units, and is its caller's."""
+    """A figure of measured data is drawn without a warning, has units, and is its caller's.
+
+    The title names simulated data and drawn pictures as such.
+    """
     draw, labels = DRAWN[name]
     check_measured(draw(origin="measured", radiometric=1), labels)
-
-
-@pytest.mark.parametrize("name", DRAWN)
-def test_title_says_what_the_data_are(name: str) -> None:
-    """The title names simulated data and drawn pictures as such."""
-    draw, _ = DRAWN[name]
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
 

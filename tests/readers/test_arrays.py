@@ -1,9 +1,6 @@
 """Arrays of counts: files of NumPy without objects, and what other libraries have opened."""
 
 import json
-import resource
-import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from flir_files import damaged, scene
+from flir_files import scene
+from hostile_files import write
 from numpy.testing import assert_allclose, assert_array_equal
 from zarr.codecs import BloscCodec
 
@@ -223,25 +221,10 @@ def test_clocks_of_no_numbers(clock: Any) -> None:
         read(scene(), clock=milliseconds)
 
 
-def written(path: Path, form: str) -> Path:
-    """Three frames in a file of a container, named "frames"."""
-    frames = xr.DataArray(scene(), dims=("t", "y", "x"), name="frames", attrs={"units": "count"})
-    if form == "h5":
-        with pytest.importorskip("h5py").File(path, "w") as file:
-            file.create_dataset("entry/frames", data=scene())
-    elif form == "nc":
-        signed = frames.astype("i2").assign_attrs(_Unsigned="true")
-        signed.to_netcdf(path, engine="scipy")
-    else:
-        group = zarr.open_group(path, mode="w", zarr_format=2 if form == "zarr2" else 3)
-        group.create_array("frames", data=scene(), chunks=(1, 24, 32)).attrs["units"] = "count"
-    return path
-
-
 @pytest.mark.parametrize("form", ["h5", "nc", "zarr2", "zarr3"])
 def test_containers_by_path(tmp_path: Path, form: str) -> None:
     """HDF5, NetCDF and zarr by path: the counts as they are, the array named if it is missing."""
-    path = written(tmp_path / f"a.{form}", form)
+    path = write(tmp_path / f"a.{form}", form)
     assert_array_equal(read(path).counts, scene())
     with pytest.raises(ValueError, match=r"Missing array 'film' .* one of \['(entry/)?frames'\]"):
         read(path, "film")
@@ -278,11 +261,11 @@ def test_other_units_dims_and_files_are_refused(tmp_path: Path) -> None:
 
 def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     """A store of pickled objects is not read, and a chunk that is missing is no image of zeros."""
-    path = written(tmp_path / "a.zarr", "zarr3")
+    path = write(tmp_path / "a.zarr", "zarr3")
     (path / "frames" / "c" / "1" / "0" / "0").unlink()
     with pytest.raises(ValueError, match="Missing 1 chunks of 'frames'"):
         read(path)
-    path = written(tmp_path / "b.zarr", "zarr2")
+    path = write(tmp_path / "b.zarr", "zarr2")
     about = json.loads((path / "frames" / ".zarray").read_text())
     about["compressor"] = {"id": "pickle", "protocol": 5}
     (path / "frames" / ".zarray").write_text(json.dumps(about))
@@ -341,44 +324,3 @@ def test_objects_are_not_loaded(tmp_path: Path) -> None:
     path.write_bytes(b"nothing at all")
     with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy, \.npz, HDF5"):
         read(path)
-
-
-@pytest.mark.parametrize(
-    "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("form", ["npy", "npz", "raw", "nc", "h5"])
-def test_damage(tmp_path: Path, form: str, number: int) -> None:
-    """Damaged files are refused, or read as they are; a .npz has checksums."""
-    path, counts, found = tmp_path / f"a.{form}", scene(), Counter[str]()
-    if form == "raw":
-        counts.tofile(path)
-    elif form in {"nc", "h5"}:
-        written(path, form)
-    else:
-        (np.save if form == "npy" else np.savez_compressed)(path, counts)
-    whole = path.read_bytes()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for seed in range(number):
-        kind, changed = damaged(whole, seed)
-        path.write_bytes(changed)
-        begun = time.perf_counter()
-        try:
-            if form == "raw":
-                options: Any = {"byte_order": "little", "unit": "count", "clock": 10.0}
-                taken = readers.raw(path, (24, 32), **options).counts.values
-            else:
-                taken = read(path).counts.values
-        except ValueError as refusal:
-            found["refused" if "Must " in str(refusal) else f"unclear: {refusal}"] += 1
-        else:
-            order = ">u2" if form == "nc" else "<u2"
-            start, pixels = whole.find(counts.astype(order).tobytes()), counts.tobytes()
-            if start >= 0:  # but in a .npz, which is compressed
-                there = np.frombuffer(changed[start : start + counts.nbytes], order)
-                pixels = there.astype("<u2").tobytes()
-            found[f"{'same' if taken.tobytes() == pixels else 'other'}, {kind}"] += 1
-        assert time.perf_counter() - begun < 5  # [s]
-    taken_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    print(form, dict(found), f"{taken_memory} KiB")
-    assert taken_memory < 2**20  # KiB
-    assert not [key for key in found if key.startswith(("unclear", "other"))]

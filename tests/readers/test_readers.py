@@ -6,34 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import av
 import numpy as np
 import pytest
+from hostile_files import coloured, ecostress, video, wave
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib import colormaps
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 
 from dbthermal import readers
-from dbthermal.readers import _videos
-
-HEADER = """Name: Plate  Glass
-Type: manmade
-Class: Glass
-Sample No.: 7
-Description: a pane: clear, Na\xb7Ca
-Measurement: Directional (10 Degree) Hemispherical Reflectance
-X Units: Wavelength (micrometers)
-Y Units:Reflectence (percent)
-First X Value: {first:.4f}
-Last X Value: {last:.4f}
-Number of X Values: {number}
-Additional Information: none
-
-"""
-
-Floats = NDArray[np.float64]
 
 
 def library_file(
@@ -41,41 +21,14 @@ def library_file(
 ) -> Path:
     """Write a spectrum as the library does."""
     path = folder / "glass.spectrum.txt"
-    rows = (f" {w:.4f}\t {r:.4f}\n" for w, r in zip(wavelength, reflectance, strict=True))
-    ends = {"first": wavelength[0], "last": wavelength[-1], "number": len(wavelength)}
-    text = HEADER.format(**ends) + "".join(rows)
-    path.write_bytes(text.replace("\n", newline).encode("latin-1"))
+    path.write_bytes(ecostress(wavelength, reflectance, newline))
     return path
-
-
-def film(path: Path, frames: NDArray[np.uint8]) -> Path:
-    """Encode RGB frames (time, y, x, 3) as the published videos are: H.264, 10 frames/s."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18"})
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = "yuv420p"
-        for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-    return path
-
-
-def coloured(position: Floats, palette: str) -> NDArray[np.uint8]:
-    """Draw positions in a palette."""
-    colours: NDArray[np.uint8] = colormaps[palette](np.rint(position * 255).astype(int), bytes=True)
-    return colours[..., :3]
-
-
-def wave() -> Floats:
-    """Positions (time, y, x) of a smooth wave that moves."""
-    time, y, x = np.ogrid[:12, :48, :64]
-    return 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
 
 
 @pytest.fixture(scope="module")
 def plasma(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Video of the wave in plasma."""
-    return film(tmp_path_factory.mktemp("film") / "plasma.mp4", coloured(wave(), "plasma"))
+    return video(tmp_path_factory.mktemp("film") / "plasma.mp4")
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +37,7 @@ def masked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = np.full((12, 48, 80, 3), 90, dtype=np.uint8)
     frames[:, :, :32] = coloured(wave(), "turbo")[:, :, :32]
     frames[:, :, 64:] = coloured(np.linspace(0, 1, 48), "turbo")[:, None]
-    return film(tmp_path_factory.mktemp("film") / "masked.mp4", frames)
+    return video(tmp_path_factory.mktemp("film") / "masked.mp4", frames)
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
@@ -189,6 +142,9 @@ def test_slum(tmp_path: Path) -> None:
             r"slum\.csv, line 2, column 2: Invalid number ''. Must be finite",
         ),
         ("wavelength,A001\n8\n", "line 2: Invalid row .* Must be 2 numbers"),
+        ("wavelength,A001\n8,0.9\n9", r"slum\.csv, line 3: Truncated line '9'. Must end with"),
+        ('wavelength,A001\n8,"2\n', r"slum\.csv, line 2: Must be comma-separated values"),
+        ("wavelength,A001\n\n", r"slum\.csv, line 2: Invalid row \[\]. Must be 2 numbers"),
         ("wavelength,A001\n8,94\n", "emissivity 94 in 'A001'"),
         ("wavelength,A001\n8000,0.94\n", "wavelength 8000 in 'A001'"),
     ],
@@ -245,22 +201,6 @@ def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
     assert_allclose(movie["time"], np.arange(12) / 10, rtol=0, atol=1e-9)
 
 
-def test_colours_are_projected_onto_a_palette() -> None:
-    """A colour between two of a palette is its own; any other's distance is that of all points."""
-    palette, rng = _videos._palette("plasma"), np.random.default_rng(6)
-    between = 0.5 * (palette[1:] + palette[:-1])
-    position, distance, away = _videos._nearest(between, palette)
-    assert_allclose(position, (np.arange(255) + 0.5) / 255, atol=1e-6)
-    assert_allclose(distance, 0.0, atol=1e-9)
-    assert_allclose(away, 0.0, atol=1e-9)
-    others = rng.uniform(0.0, 255.0, (50, 3))
-    share = np.linspace(0.0, 1.0, 200)[:, np.newaxis, np.newaxis]
-    dense = ((1.0 - share) * palette[:-1] + share * palette[1:]).reshape(-1, 3)
-    apart = _videos._ycc(others)[:, np.newaxis] - _videos._ycc(dense)
-    expected = np.linalg.norm(apart, axis=2).min(axis=1)
-    assert_allclose(_videos._nearest(others, palette)[1], expected, rtol=1e-3)
-
-
 def test_palette_video_says_that_it_is_not_radiometric(plasma: Path) -> None:
     """Values of a video are marked, with the palette and how well it fits."""
     attrs = readers.palette_video(plasma).attrs
@@ -283,7 +223,7 @@ def test_noisy_video_is_accepted(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     for noise in (0.06, 0.1):  # 1
         noisy = np.clip(wave() + noise * rng.standard_normal(wave().shape), 0, 1)
-        path = film(tmp_path / "noisy.mp4", coloured(noisy, "plasma"))
+        path = video(tmp_path / "noisy.mp4", coloured(noisy, "plasma"))
         attrs = readers.palette_video(path).attrs
         print(f"noise {noise}: {attrs['palettes_compared']}")
         assert 20 < attrs["palette_residual"] < 35
@@ -297,35 +237,6 @@ def test_unknown_palette(plasma: Path, palette: str) -> None:
     """A name that matplotlib does not know, or of a few separate colours, is refused."""
     with pytest.raises(ValueError, match=f"Unknown palette '{palette}'"):
         readers.palette_video(plasma, palette)
-
-
-def test_damaged_video(plasma: Path, tmp_path: Path) -> None:
-    """A file whose last frames are lost is refused by name."""
-    path = tmp_path / "cut.mp4"
-    whole = plasma.read_bytes()
-    index = whole.index(b"moov") - 4  # the encoder writes it after the frames
-    path.write_bytes(whole[: index - 900] + bytes(900) + whole[index:])
-    with pytest.raises(ValueError, match=r"Damaged video 'cut\.mp4': .* Must decode"):
-        readers.palette_video(path)
-
-
-def test_truncated_video(plasma: Path, tmp_path: Path) -> None:
-    """A file that ends before its last declared frame is refused, with both numbers."""
-    path = tmp_path / "short.mp4"
-    whole = plasma.read_bytes()
-    play = whole.index(b"elst") + 12  # the length of the play [ms]
-    path.write_bytes(whole[:play] + (500).to_bytes(4) + whole[play + 4 :])
-    with pytest.raises(ValueError, match=r"'short\.mp4': 5 frames decoded, 12 present"):
-        readers.palette_video(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"no video", b"\0" * 5000])
-def test_no_video(tmp_path: Path, content: bytes) -> None:
-    """A file that cannot be decoded as video raises a ValueError with its name."""
-    path = tmp_path / "text.mp4"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"Invalid video 'text\.mp4'\. Must be MP4, MOV, Matroska"):
-        readers.palette_video(path)
 
 
 def test_masked_palette_video(masked: Path) -> None:
@@ -354,7 +265,7 @@ def test_masked_palette_that_does_not_fit(masked: Path) -> None:
 
 def test_masked_palette_video_without_colour(tmp_path: Path) -> None:
     """A gray video shows no object."""
-    path = film(tmp_path / "gray.mp4", np.full((3, 16, 16, 3), 90, dtype=np.uint8))
+    path = video(tmp_path / "gray.mp4", np.full((3, 16, 16, 3), 90, dtype=np.uint8))
     with pytest.raises(ValueError, match=r"No coloured pixel in 'gray\.mp4'"):
         readers.masked_palette_video(path)
 
@@ -364,20 +275,6 @@ def test_readers_load_no_video_codec() -> None:
     code = "import sys, dbthermal.readers; print({'av', 'matplotlib'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
-
-
-@pytest.mark.data
-def test_every_spectrum_of_the_mirror(mirror: Path) -> None:
-    """All 993 spectra are read; only six hold values outside [0, 1]."""
-    spectra = [readers.ecostress(path) for path in (mirror / "ecostress").glob("*.spectrum.txt")]
-    spectra += readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv").values()
-    spectra += [
-        readers.ucsb(mirror / "ucsb" / f"{name}.csv")
-        for name in ("clybrkcm", "distd_wn", "oakface", "sndpgaz1")
-    ]
-    assert len(spectra) == 993
-    assert sum(spectrum.attrs["unphysical_values"] > 0 for spectrum in spectra) == 6
-    assert min(float(spectrum["wavelength"][-1]) for spectrum in spectra) > 12.39e-6
 
 
 @pytest.mark.data

@@ -66,6 +66,9 @@ def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
     assert corner["nearest"][0]["material"] == "plate window glass"
     assert "plate window glass" in page
     assert ">simulated<" in page
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)  # all of the page is in it
+    assert sources
+    assert all(one.startswith(("data:", "#")) for one in sources)
 
 
 def test_only_measured_pixels_count(tmp_path: Path) -> None:
@@ -105,15 +108,6 @@ def test_words_stay_words(tmp_path: Path) -> None:
     assert HOSTILE in numbers(page)["regions"]
 
 
-def test_nothing_outside_is_asked_for(tmp_path: Path) -> None:
-    """Every source of the page is in it."""
-    dbthermal.report(scene(), tmp_path / "scene.html")
-    page = (tmp_path / "scene.html").read_text("utf-8")
-    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
-    assert sources
-    assert all(one.startswith(("data:", "#")) for one in sources)
-
-
 @pytest.mark.parametrize(
     ("data", "name", "message"),
     [
@@ -125,14 +119,10 @@ def test_bad_input_is_named(data: xr.Dataset, name: str, message: str, tmp_path:
     """Another ending, and data without a temperature, are refused before anything is written."""
     with pytest.raises(ValueError, match=re.escape(message)):
         dbthermal.report(data, tmp_path / name)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_no_region_is_refused(tmp_path: Path) -> None:
-    """Numbers in place of a region are refused with a region as an example."""
     regions: Any = {"left": (10, 40, 5, 30)}
     with pytest.raises(TypeError, match=r"region 'left', \(10, 40, 5, 30\)\. Must be an explorer"):
         dbthermal.report(scene(), tmp_path / "scene.html", regions=regions)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,16 +1,11 @@
-"""Input of `solve`: invalid arguments, bad pixels, and their status."""
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+"""Input of `solve`: order, bad pixels and frames, and their status; test_refusals has the rest."""
 
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
 
-from dbthermal import alignment, schema, separation
 from dbthermal import response as responses
+from dbthermal import schema, separation
 from dbthermal.separation._tiles import Estimate
 from dbthermal.simulation import Rig
 
@@ -54,85 +49,6 @@ def test_temperature_outside_the_response_is_flagged(
     assert float(np.sqrt((error**2).mean())) < 0.5  # [K]
 
 
-BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
-    "unknown method": (
-        lambda c, r: separation.solve(c, r, "magic"),
-        r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated', 'dbvt'",
-    ),
-    "unknown kind": (
-        lambda c, r: separation.solve(c, r, response_kind="cubic"),
-        "Unknown kind of response 'cubic'",
-    ),
-    "one band": (lambda c, r: separation.solve(c.isel(band=[0]), r), "Must be two or more"),
-    "missing band": (
-        lambda c, r: separation.solve(c, r.isel(band=[0])),
-        "Missing band '9.5' in the response",
-    ),
-    "dims": (
-        lambda c, r: separation.solve(c.transpose("time", "band", "y", "x"), r),
-        r"Invalid dims \('time', 'band', 'y', 'x'\) of 'counts'",
-    ),
-    "units": (
-        lambda c, r: separation.solve(c.assign(counts=c["counts"].assign_attrs(units="K")), r),
-        "Invalid units 'K' of 'counts' of the corrected. Must be 'count'",
-    ),
-    "time": (
-        lambda c, r: separation.solve(c.isel(time=[*range(40), 39, *range(40, 80)]), r),
-        "Unordered 'time' of 'counts' of the corrected: 3.9 s is followed by 3.9 s",
-    ),
-    "workers": (lambda c, r: separation.solve(c, r, workers=0), "Invalid number of workers 0"),
-    "half a worker": (
-        lambda c, r: separation.separate(c, r, workers=1.5),  # type: ignore[arg-type]
-        r"Invalid number of workers 1.5. Must be a whole number",
-    ),
-    "emissivity 1.2": (
-        lambda c, r: separation.solve(c, r, "calibrated", emissivity=emissivity_of(0.8, 1.2)),
-        r"Invalid emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",
-    ),
-    "gray": (
-        lambda c, r: separation.solve(c, r, "calibrated", emissivity=emissivity_of(0.8, 0.8)),
-        "the same in both bands. Must differ",
-    ),
-    "noise in kelvin": (
-        lambda c, r: separation.solve(c, r.assign(noise=r["noise"].assign_attrs(units="K"))),
-        "Invalid units 'K' of 'noise' of the response. Must be 'count'",
-    ),
-    "noise without bands": (
-        lambda c, r: separation.solve(c, r.assign(noise=3.0)),
-        "Invalid dims .. of 'noise' of the response",
-    ),
-    "status dims": (
-        lambda c, r: separation.solve(
-            c.assign(status=(("x", "y"), np.zeros((5, 4), np.uint16))), r
-        ),
-        "Invalid dims .'x', 'y'. of 'status' of the corrected",
-    ),
-    "status bits": (
-        lambda c, r: separation.solve(
-            c.assign(status=(("y", "x"), np.full((4, 5), 2**21, np.uint32))), r
-        ),
-        "Unknown bits 2097152 in the status",
-    ),
-    "noise": (
-        lambda c, r: separation.solve(c, r.assign(noise=("band", [1.0, -1.0]))),
-        "Invalid noise .count. -1.0 in band '9.5'. Must be finite and positive",
-    ),
-    "coefficient": (
-        lambda c, r: separation.solve(c, r.assign(offset=("band", [np.nan, 0.0]))),
-        "Invalid offset of the response in band '8-14'. Must be finite",
-    ),
-}
-
-
-@pytest.mark.parametrize("what", BAD)
-def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
-    """Invalid input raises an error with the name, the value and the rule."""
-    call, message = BAD[what]
-    _, capture, response = glass
-    with pytest.raises(ValueError, match=message):
-        call(capture, response)
-
-
 def test_saturated_counts_are_flagged(glass: Glass) -> None:
     """Counts that heap at the end of a type, or below it, are flagged where they occur."""
     _, capture, response = glass
@@ -142,17 +58,6 @@ def test_saturated_counts_are_flagged(glass: Glass) -> None:
     whole = capture.assign(counts=(capture["counts"].dims, counts.astype(np.float32)))
     flagged = separation.solve(whole, response)["status"].values & schema.Status.SATURATED != 0
     np.testing.assert_array_equal(np.argwhere(flagged), [[1, 1], [2, 3]])
-
-
-def test_raw_counts_are_refused(glass: Glass) -> None:
-    """Whole numbers are raw counts, and the error says both ways on."""
-    _, capture, response = glass
-    raw = capture.assign(counts=capture["counts"].astype(np.uint16))
-    message = r"correct_capture, of a camera that corrects itself with correction.corrected_by"
-    with pytest.raises(TypeError, match=message):
-        separation.solve(raw, response)
-    with pytest.raises(TypeError, match=message):
-        alignment.align(raw, offset=0.0)
 
 
 def test_masked_samples_do_not_saturate_a_pixel(glass: Glass) -> None:
@@ -201,57 +106,3 @@ def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> No
     status = found.check_range(responses.curve(RIG.response(), RIG.bands[0])).status
     assert status[0] == before[0] or name is None
     assert status[0] != 0
-
-
-@pytest.mark.parametrize(
-    ("settings", "values", "named"),
-    [
-        (
-            separation.SubspaceSettings,
-            {"background_drift": None},
-            "Invalid background_drift",
-        ),
-        (
-            separation.SubspaceSettings,
-            {"background_drift": "3"},
-            "Invalid background_drift",
-        ),
-        (separation.CalibratedSettings, {"smooth": "false"}, "Invalid smooth 'false' of method"),
-        (separation.BcpSettings, {"patch": "15"}, "Invalid patch '15' of method"),
-        (separation.BcpSettings, {"patch": 15.0}, "Must be a whole number"),
-        (separation.NaiveSettings, {"starts": 2.5}, "Invalid starts 2.5 of method"),
-        (separation.DbvtSettings, {"batch": 2.5}, "Must be a whole number"),
-        (separation.NaiveSettings, {"starts": True}, "Invalid starts True of method"),
-        (separation.RatioSettings, {"order": 2.5}, "Invalid order 2.5 of method"),
-        (separation.DbvtSettings, {"start": None}, "Invalid start None of method"),
-    ],
-)
-def test_settings_of_another_type(
-    settings: Callable[..., object], values: dict[str, object], named: str
-) -> None:
-    """A setting of a wrong type is named, with its method."""
-    with pytest.raises(TypeError, match=named):
-        settings(**values)
-
-
-def test_a_wrong_seed_leaves_nothing_of_a_run(tmp_path: Path, glass: Glass) -> None:
-    """It is refused before anything is made, and the right call then goes through."""
-    _, capture, response = glass
-    wrongs: tuple[dict[str, Any], ...] = ({"seed": "3"}, {"memory": "2e9"}, {"provenance": "x"})
-    for wrong in wrongs:
-        with pytest.raises((TypeError, ValueError), match="Invalid"):
-            separation.run(capture, tmp_path / "a.zarr", response, **wrong)
-    assert not list(tmp_path.iterdir())
-
-
-def test_reflected_change_of_other_results(glass: Glass) -> None:
-    """Emissivities in per cent, other dims, and missing variables are named."""
-    _, capture, response = glass
-    result = separation.solve(capture, response)
-    apparent = responses.apparent_temperature(response, capture["counts"])
-    with pytest.raises(ValueError, match="not per cent"):
-        separation.reflected_change(apparent, result.assign(emissivity=100 * result["emissivity"]))
-    with pytest.raises(ValueError, match="Invalid dims"):
-        separation.reflected_change(apparent.rename(y="row"), result)
-    with pytest.raises(ValueError, match="Missing variable 'emissivity'"):
-        separation.reflected_change(apparent, result.drop_vars("emissivity"))

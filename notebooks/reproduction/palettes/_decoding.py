@@ -109,6 +109,7 @@ def _frames(
     if not np.all(np.diff(seconds, prepend=seconds[0] - 1) > 0):
         raise ValueError(f"Unordered timestamps in '{path.name}'. Must increase strictly.")
     _check_duration(container, seconds, path)
+    _check_segment(path)
     return Film(codes, seconds - seconds[0])
 
 
@@ -137,6 +138,18 @@ def _check_duration(container: Any, seconds: NDArray[Any], path: Path) -> None:
     for value in declared:
         if abs(value - length) > interval / 2:
             _refuse_truncated(path, f"{length:g} s of frames, {value:g} s declared")
+
+
+def _check_segment(path: Path) -> None:
+    """Compare a Matroska file's size with its segment's, which a cut leaves too large."""
+    with path.open("rb") as stream:
+        head = stream.read(300)
+    if (place := head.find(b"\x18\x53\x80\x67", 0, 200) + 4) > 4:  # RFC 8794, section 4: sizes
+        width = 9 - head[place].bit_length()
+        size, unknown = int.from_bytes(head[place : place + width]), 1 << 7 * width
+        end = place + width + size - unknown
+        if size + 1 < 2 * unknown and end > path.stat().st_size:
+            _refuse_truncated(path, f"{path.stat().st_size} bytes, {end} declared")
 
 
 def _refuse_truncated(path: Path, lengths: str) -> NoReturn:

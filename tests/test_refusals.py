@@ -1,0 +1,454 @@
+"""Arguments that do not fit: each is named, with the value and the rule, before any work.
+
+One table of calls and messages for the rooms of the package, and one of the arrays that must lie on
+the same coordinates as another one; what is stage by stage is in test_schema.py.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import xarray as xr
+from captures import emissivity_of
+
+from dbthermal import (
+    alignment,
+    calibration,
+    correction,
+    figures,
+    limits,
+    metrics,
+    mixing,
+    noise,
+    readers,
+    response,
+    separation,
+    simulation,
+    store,
+)
+from dbthermal import emissivity as emissivities
+from dbthermal.scene import separate_capture
+from dbthermal.schema import Status
+
+RIG = simulation.Rig(bad_fraction=0.0)
+CAMERA = RIG.response()
+BANDS = list(RIG.bands)
+SHAPE = (6, 8)
+RNG = np.random.default_rng(1)
+TIME = np.arange(60) / 10.0
+PLACE = {"y": 100 + np.arange(6), "x": 200 + np.arange(8)}
+GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": BANDS})
+SCENE = simulation.walkers(TIME, SHAPE, GLASS, RNG).assign_coords(PLACE)
+CAPTURE = simulation.observe(SCENE, CAMERA, RNG)
+DETECTOR = simulation.pattern(RIG, SHAPE, RNG).assign_coords(SCENE[["y", "x"]].coords)
+RAW = simulation.capture(CAPTURE, DETECTOR)
+MOVIES = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 3), 16, DETECTOR, RNG)
+STATISTICS = correction.blackbody_statistics(MOVIES)
+CORRECTION = correction.fit_correction(STATISTICS)
+RESULT = separation.solve(CAPTURE, CAMERA, workers=1)
+APPARENT = response.apparent_temperature(CAMERA, CAPTURE["counts"])
+CHANGE = separation.reflected_change(APPARENT, RESULT)
+OBJECT = RESULT["object_temperature"]
+PIXELS = xr.DataArray(np.ones(SHAPE, dtype=bool), PLACE, dims=("y", "x"))
+FRAMES = xr.DataArray(np.ones(60, dtype=bool), {"time": TIME}, dims="time")
+CLOSED = FRAMES & (FRAMES["time"] > 3.05) & (FRAMES["time"] < 3.25)
+MAPS = PIXELS * GLASS.transpose("band")
+MAPS = MAPS.transpose("band", "y", "x")
+TABLE = emissivities.embedded_table()
+NOISE = emissivities.filter_noise(0.03, [str(name) for name in TABLE["band"].values])
+CONTACT = TABLE.sel(band=BANDS)[["emissivity"]].assign(
+    emissivity_std=0.01 + 0.0 * TABLE["emissivity"].sel(band=BANDS)
+)
+STEPS = xr.DataArray([0.0, 0.1], {"band": BANDS}, dims="band")
+TRANSFORM = xr.DataArray(
+    np.stack([np.eye(3)] * 2), {"band": BANDS}, dims=("band", "row", "column"), attrs={"units": "1"}
+)
+solve = partial(separation.solve, CAPTURE, CAMERA)
+calibrated = partial(solve, method="calibrated")
+completed = partial(separation.complete, RESULT, CAPTURE, CAMERA)
+Call = Callable[[], Any]
+Labelled = xr.DataArray | xr.Dataset
+
+
+def recorded(band: int = 0, **attrs: str) -> xr.Dataset:
+    """Recording of one band."""
+    counts = RAW["counts"].isel(band=band, drop=True).assign_attrs(attrs)
+    return readers.array(counts.drop_vars(["y", "x"]), unit="count", clock=10.0)
+
+
+def paired(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
+    """Two recordings as one capture."""
+    return readers.two_bands(first, second, bands=("8-14", "9.5"), offset=0.0)
+
+
+def streamed(time: Any, frames: Any = None, segment: Any = 0, **options: Any) -> Any:
+    """Frames that a stream takes."""
+    stream = separation.Stream(CAPTURE.isel(time=[0]), CAMERA, frame_rate=10.0, **options)
+    first = CAPTURE["counts"].values[:, 0] if frames is None else frames
+    return stream.update(time, first, segment=segment)
+
+
+def whole(**options: Any) -> xr.Dataset:
+    """All steps from raw counts."""
+    return separate_capture(RAW, CORRECTION, CAMERA, registration=None, **options)
+
+
+def captured(**changes: Any) -> Call:
+    """`solve` of the capture with other variables."""
+    return lambda: separation.solve(CAPTURE.assign(**changes), CAMERA)
+
+
+def viewed(**changes: Any) -> Call:
+    """`solve` with a response of other variables."""
+    return lambda: separation.solve(CAPTURE, CAMERA.assign(**changes))
+
+
+def units(array: xr.DataArray, unit: str) -> xr.DataArray:
+    """The array in another unit."""
+    return array.assign_attrs(units=unit)
+
+
+ONE, NOTHING = np.ones((60, 3)), cast(Any, None)
+COUNTS, KELVIN = CAPTURE["counts"], units(CAPTURE["counts"], "K")
+EMPTY = CAPTURE.isel(y=slice(0, 0))  # so that what is refused is refused before the work
+STILL = recorded().isel(time=[0])
+FLAGGED = recorded().assign(frame_flags=("time", np.full(60, 65536)))
+FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
+TURNED = CAPTURE.transpose("time", "band", "y", "x")
+REST = 0.0 * MAPS[0] + 1.0
+SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
+    (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
+    (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
+    (separation.CalibratedSettings, {"smooth": "false"}, "smooth 'false' of method"),
+    (separation.BcpSettings, {"patch": "15"}, "patch '15' of method"),
+    (separation.BcpSettings, {"patch": 15.0}, "whole number"),
+    (separation.NaiveSettings, {"starts": 2.5}, "starts 2.5 of method"),
+    (separation.NaiveSettings, {"starts": True}, "starts True of method"),
+    (separation.DbvtSettings, {"batch": 2.5}, "whole number"),
+    (separation.DbvtSettings, {"start": None}, "start None of method"),
+    (separation.RatioSettings, {"order": 2.5}, "order 2.5 of method"),
+]
+CASES: list[tuple[Call, str]] = [
+    (lambda: calibration.Bias(air_temperature=22.0), r"air_temperature \[K\] 22.0.*in kelvin"),
+    (
+        lambda: simulation.walkers(TIME, SHAPE, GLASS, RNG, temperatures=(22.0, 32.0, 60.0)),
+        "temperatures.*in kelvin",
+    ),
+    (
+        lambda: correction.fit_correction(STATISTICS.assign_coords(temperature=[2.0, 40.0, 70.0])),
+        "temperature.*in kelvin",
+    ),
+    (lambda: simulation.Background(level=22.0), r"level \[K\] 22.0.*in kelvin"),
+    (lambda: simulation.Background(drift=np.nan), "drift"),
+    (lambda: simulation.Rig(offset=np.nan), "offset"),
+    (lambda: completed(surroundings=295.0, surroundings_std=True), "surroundings_std"),
+    (lambda: completed(surroundings_std=1e-30), "surroundings_std"),
+    (lambda: separation.separate(EMPTY, CAMERA, surroundings_std=1e-30), "surroundings_std"),
+    (
+        lambda: separation.complete(
+            RESULT.assign(object_temperature_std=-RESULT["object_temperature_std"]), CAPTURE, CAMERA
+        ),
+        "object_temperature_std.*negative",
+    ),
+    (lambda: streamed(np.datetime64("2024-01-01")), "time"),
+    (lambda: streamed("0.1"), "time"),
+    (lambda: streamed(0.1, segment=1.5), "segment"),
+    (lambda: streamed(0.1, KELVIN[:, 0]), "units 'K'"),
+    (lambda: streamed(0.1, memory=[10.0]), "memory"),
+    (lambda: streamed(0.1, latency=1e9), "latency"),
+    (lambda: paired(STILL, STILL), "Same counts"),
+    (lambda: paired(FLAGGED, recorded(1)), "frame_flags"),
+    (lambda: mixing.matrix([86.0, 72.0]), "emissivity 86.0"),
+    (lambda: mixing.condition_number(0.9), "two bands"),
+    (lambda: noise.estimate(ONE.astype(complex), ONE, TIME), "signal"),
+    (lambda: noise.second_difference(ONE[:4], [0.0, 1.0, 1.0, 2.0]), "Must rise"),
+    (lambda: alignment.align(CAPTURE, offset=0.0, reflection_shift=cast(Any, 3)), "shift"),
+    (lambda: alignment.align(RAW, offset=0.0), "correct_capture, of a camera that corrects itself"),
+    (lambda: correction.correct_capture(RAW, CORRECTION, shutter=NOTHING), "shutter"),
+    (lambda: whole(correcting=None), "correct_capture.*mapping"),
+    (lambda: whole(aligning={"ofset": 0.0}), "ofset.*offset"),
+    (lambda: store.open_dataset(NOTHING), "path"),
+    (lambda: readers.flir(NOTHING), "path"),
+    (lambda: separation.separate(NOTHING, CAMERA), "corrected"),
+    (lambda: separation.separate(CAPTURE, CAMERA, workers=cast(Any, 1.5)), "workers 1.5.*whole"),
+    (lambda: separation.solve(RAW, CAMERA), "correct_capture.*correction.corrected_by"),
+    (lambda: solve("magic"), r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated'"),
+    (lambda: solve(response_kind="cubic"), "Unknown kind of response 'cubic'"),
+    (lambda: solve(workers=0), "Invalid number of workers 0"),
+    (lambda: separation.solve(CAPTURE.isel(band=[0]), CAMERA), "Must be two or more"),
+    (lambda: separation.solve(TURNED, CAMERA), r"dims \('time', 'band', 'y', 'x'\) of 'counts'"),
+    (lambda: separation.solve(FALLING, CAMERA), "'time' of 'counts' .*: 3.9 s is followed by 3.9"),
+    (
+        lambda: calibrated(emissivity=emissivity_of(0.8, 1.2)),
+        r"emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",
+    ),
+    (lambda: calibrated(emissivity=emissivity_of(0.8, 0.8)), "same in both bands. Must differ"),
+    (captured(counts=KELVIN), "units 'K' of 'counts' of the corrected. Must be 'count'"),
+    (captured(status=(("x", "y"), np.zeros((8, 6), np.uint16))), "dims .'x', 'y'. of 'status'"),
+    (captured(status=(("y", "x"), np.full(SHAPE, 2**21, np.uint32))), "Unknown bits 2097152"),
+    (viewed(noise=units(CAMERA["noise"], "K")), "units 'K' of 'noise' of the response"),
+    (viewed(noise=3.0), "Invalid dims .. of 'noise' of the response"),
+    (viewed(noise=("band", [1.0, -1.0])), "noise .count. -1.0 in band '9.5'. Must be finite"),
+    (viewed(offset=("band", [np.nan, 0.0])), "offset of the response in band '8-14'. Must be fin"),
+    (
+        lambda: separation.reflected_change(
+            APPARENT, RESULT.assign(emissivity=100 * RESULT["emissivity"])
+        ),
+        "not per cent",
+    ),
+    (lambda: separation.reflected_change(APPARENT.rename(y="row"), RESULT), "Invalid dims"),
+    (
+        lambda: separation.reflected_change(APPARENT, RESULT.drop_vars("emissivity")),
+        "Missing variable 'emissivity'",
+    ),
+    *((partial(make, **values), named) for make, values, named in SETTINGS),
+]
+"""Call that is refused -> what its message says."""
+
+
+@pytest.mark.parametrize(("call", "message"), CASES)
+def test_a_wrong_argument_is_named(call: Call, message: str) -> None:
+    """A TypeError or ValueError that says what, which value, and what it must be."""
+    with pytest.raises((TypeError, ValueError), match=message) as caught:
+        call()
+    assert "Must" in str(caught.value)
+
+
+def few(part: xr.DataArray) -> xr.DataArray:
+    """Two frames."""
+    return part.isel(time=slice(0, 2))
+
+
+def film(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> list[Any]:
+    """A film of two frames."""
+    return list(figures.separated_film(few(APPARENT), few(emission), few(change), title="a"))
+
+
+def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
+    """A figure of two frames."""
+    labels = ("a [K]", "b [K]", "c [K]")
+    parts = (few(APPARENT), few(emission), few(change))
+    return figures.separated_frames(*parts, title="plate", labels=labels)
+
+
+FIRST, SECOND = CAPTURE["counts"]
+FLAT = 20000.0 * xr.ones_like(MAPS)
+PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
+EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
+LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
+    "solve mask of pixels": (lambda it: solve(mask=it), PIXELS, "y x"),
+    "solve mask of frames": (lambda it: solve(mask=it), FRAMES, "time"),
+    "solve mask": (lambda it: solve(mask=it), FRAMES & PIXELS, "time y x"),
+    "solve pool": (lambda it: solve(pool=it), PIXELS.astype(int), "y x"),
+    "solve emissivity": (lambda it: calibrated(emissivity=it), MAPS, "y x band"),
+    "solve emissivity_std": (
+        lambda it: calibrated(emissivity=MAPS, emissivity_std=0.1 * it),
+        MAPS,
+        "y x band",
+    ),
+    "solve response": (lambda it: separation.solve(CAPTURE, it), CAMERA, "band"),
+    "materials": (
+        lambda it: separation.materials(it, CAPTURE, CAMERA),
+        RESULT,
+        "time y x band",
+    ),
+    "reflected_change": (
+        lambda it: separation.reflected_change(it, RESULT),
+        APPARENT,
+        "time y x",
+    ),
+    "apparent": (lambda it: response.apparent_temperature(it, COUNTS), CAMERA, "band"),
+    "fit_response": (
+        lambda it: calibration.fit_response(CAMERA["counts"], it),
+        CAMERA["noise"],
+        "band",
+    ),
+    "correct": (lambda it: correction.correct(EVEN, it), PLAIN, "y x band"),
+    "renew_offset": (lambda it: correction.renew_offset(PLAIN, it), FLAT, "y x band"),
+    "correct_capture flat": (
+        lambda it: correction.correct_capture(EVEN, PLAIN, flat=it),
+        FLAT,
+        "y x band",
+    ),
+    "correct_capture drift_reference": (
+        lambda it: correction.correct_capture(EVEN, PLAIN, drift_reference=it),
+        PIXELS,
+        "y x",
+    ),
+    "undo_drift": (lambda it: correction.undo_drift(CAPTURE, it), PIXELS, "y x"),
+    "undo_lag": (lambda it: correction.undo_lag(CAPTURE, 0.01 + 0.01 * it), STEPS, "band"),
+    "find_shutter": (lambda it: correction.find_shutter(CAPTURE, closed=it), CLOSED, "time"),
+    "align offset": (lambda it: alignment.align(CAPTURE, offset=it), STEPS, "band"),
+    "align transform": (
+        lambda it: alignment.align(CAPTURE, offset=0.0, transform=it),
+        TRANSFORM,
+        "band",
+    ),
+    "bounds": (lambda it: limits.bounds(SCENE.isel(y=[0]), it), CAMERA, "band"),
+    "plan": (lambda it: limits.plan(TABLE.isel(material=[0]), it), NOISE, "band"),
+    "rank_filters": (lambda it: emissivities.rank_filters(TABLE, it), NOISE, "band"),
+    "correlation": (lambda it: metrics.correlation(COUNTS, it), APPARENT, "time y x band"),
+    "correlation mask": (lambda it: metrics.correlation(FIRST, SECOND, it), PIXELS, "y x"),
+    "relative_error_celsius": (
+        lambda it: metrics.relative_error_celsius(OBJECT, it),
+        SCENE["object_temperature"],
+        "time y x",
+    ),
+    "truth_and_estimate": (
+        lambda it: figures.truth_and_estimate(it, RESULT, (1, 1)),
+        SCENE,
+        "y x",
+    ),
+    "separated_frames emission": (lambda it: rows(emission=it), OBJECT, "time y x"),
+    "separated_frames reflection": (lambda it: rows(change=it), CHANGE, "time y x"),
+    "separated_film emission": (lambda it: film(emission=it), OBJECT, "time y x"),
+    "separated_film change": (lambda it: film(change=it), CHANGE, "time y x"),
+    "emissivity_by_contact": (
+        lambda it: figures.emissivity_by_contact(CONTACT, it),
+        CONTACT["emissivity"],
+        "material band",
+    ),
+    "observe": (lambda it: simulation.observe(SCENE, it, RNG), CAMERA, "band"),
+    "capture": (lambda it: simulation.capture(CAPTURE, it), DETECTOR, "y x band"),
+}
+"""Function of a second array, that array, and its dims whose coordinates count."""
+
+
+def moved(array: Labelled, dim: str) -> Labelled:
+    """The same values on other coordinates: those of the window beside, or other names."""
+    values = array[dim].values
+    other = values + 1 if values.dtype.kind in "if" else np.char.add(values.astype(str), "'")
+    return array.assign_coords({dim: (dim, other, array[dim].attrs)})
+
+
+@pytest.mark.parametrize("name", LAID)
+def test_coordinates_must_agree(name: str) -> None:
+    """On the same coordinates, rounded or without those that may be missing, it runs.
+
+    Others, another order, as mirrored, and another size are refused by the dim or band and value.
+    """
+    call, array, dims = LAID[name]
+    rounded = {
+        dim: (dim, array[dim].values * (1 + 2e-16), array[dim].attrs)
+        for dim in {*dims.split()} & {"time", "y", "x"}
+    }
+    call(array.assign_coords(rounded))
+    if isinstance(array, xr.DataArray):
+        call(array.drop_vars([dim for dim in ("y", "x") if dim in array.coords]))
+    for dim in dims.split():
+        other = moved(array, dim)
+        message = f"Invalid '{dim}' of .*: {other[dim].values[0]} at"
+        with pytest.raises(ValueError, match="Missing band '" if dim == "band" else message):
+            call(other)
+        if dim in {"time", "y", "x"}:
+            with pytest.raises(ValueError, match=f"'{dim}'"):
+                call(array.isel({dim: slice(None, None, -1)}))
+        if dim in {"time", "y", "x"} and "separated_f" not in name and "frames" not in name:
+            with pytest.raises(ValueError, match=f"Invalid size .* of '{dim}'"):
+                call(array.isel({dim: slice(1, None)}))
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "same"),
+    [
+        (np.arange(60), np.arange(60.0) + 1e-13, True),
+        (np.cumsum(np.full(60, 0.1)), 0.1 * np.arange(1, 61), True),
+        (TIME.astype(np.float32), TIME, True),
+        (1.7e9 + TIME, 1.7e9 + TIME + 1 / 60, False),
+        (TIME, np.where(TIME == 3.0, np.nan, TIME), False),
+        (2**53 + 2 * np.arange(60), 2**53 + 2 + 2 * np.arange(60), False),
+    ],
+)
+def test_times_differ_beyond_rounding(here: Any, there: Any, *, same: bool) -> None:
+    """Coordinates are the same within rounding, whatever their type and size."""
+    first, second = (FIRST.drop_vars("time").assign_coords(time=time) for time in (here, there))
+    if same:
+        assert metrics.correlation(first, second).notnull().all()
+    else:
+        with pytest.raises(ValueError, match="Invalid 'time' of "):
+            metrics.correlation(first, second)
+
+
+def test_shutter_events_of_another_capture_are_refused() -> None:
+    """Events whose times are not those of their frames are of another capture."""
+    events = correction.find_shutter(CAPTURE, closed=CLOSED)
+    assert correction.mark_shutter(CAPTURE, events).attrs["shutter_events"] == 2
+    other = events.assign(start=events["start"] + 5.0)
+    with pytest.raises(ValueError, match=r"of the events: 8\.1 at position 0, where .* 3\.1"):
+        correction.mark_shutter(CAPTURE, other)
+
+
+def test_bands_go_by_name() -> None:
+    """In another order of bands the result is the same."""
+    swapped = [1, 0]
+    for known in (MAPS, GLASS):
+        exchanged = calibrated(emissivity=known.isel(band=swapped))
+        xr.testing.assert_identical(calibrated(emissivity=known), exchanged)
+    other = response.apparent_temperature(CAMERA, COUNTS.isel(band=swapped))
+    xr.testing.assert_identical(other.isel(band=swapped), APPARENT)
+    turned = metrics.correlation(APPARENT, COUNTS.isel(band=swapped))
+    xr.testing.assert_identical(metrics.correlation(APPARENT, COUNTS), turned)
+    with pytest.raises(ValueError, match="Repeated band"):
+        calibrated(emissivity=GLASS.assign_coords(band=["8-14", "8-14"]))
+
+
+def test_a_foreign_folder_stays(tmp_path: Path) -> None:
+    """What is no store of ours is not replaced, nor the parts of a run; ours is."""
+    mine, foreign, parts = (tmp_path / n for n in ("mine.zarr", "foreign.zarr", "all.zarr.parts"))
+    for folder in (mine, foreign, parts):
+        folder.mkdir()
+    store.save(SCENE, mine, {})  # an empty folder
+    store.save(CAPTURE, mine, {})
+    assert "counts" in store.open_dataset(mine)
+    (foreign / "notes.txt").write_text("precious")
+    (parts / "precious.txt").write_text("precious")
+    calls: tuple[Call, ...] = (
+        lambda: store.save(SCENE, foreign, {}),
+        lambda: whole(target=foreign),
+        lambda: separation.run(mine, tmp_path / "all.zarr", CAMERA),
+    )
+    for call in calls:
+        with pytest.raises(ValueError, match="Foreign folder"):
+            call()
+    assert (foreign / "notes.txt").read_text() == (parts / "precious.txt").read_text() == "precious"
+    with pytest.raises(FileNotFoundError, match="an address"):
+        store.save(SCENE, "s3://bucket/a.zarr", {})
+    with pytest.raises(ValueError, match="Must have no '/'"):
+        store.save(SCENE.rename(emissivity="a/b"), tmp_path / "a.zarr", {})
+
+
+def test_a_wrong_argument_leaves_nothing_of_a_run(tmp_path: Path) -> None:
+    """It is refused before anything is made."""
+    wrongs: tuple[dict[str, Any], ...] = ({"seed": "3"}, {"memory": "2e9"}, {"provenance": "x"})
+    for wrong in wrongs:
+        with pytest.raises((TypeError, ValueError), match="Invalid"):
+            separation.run(CAPTURE, tmp_path / "a.zarr", CAMERA, **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_was_simulated_stays_simulated() -> None:
+    """By a reader, in a pair with a recording, and by a correction of simulated movies."""
+    simulated, measured = recorded(origin="simulated"), recorded(1, origin="measured")
+    assert simulated.attrs["origin"] == "simulated"
+    assert measured.attrs["origin"] == "measured"
+    assert paired(simulated, measured).attrs["origin"] == "simulated"
+    capture = RAW.assign_attrs(origin="measured")
+    assert correction.correct(capture, CORRECTION).attrs["origin"] == "simulated"
+
+
+def test_unusual_but_good_input_passes() -> None:
+    """Counts of the other byte order, and labels of any size, below 0 for none."""
+    swapped = RAW.assign(counts=RAW["counts"].astype(">u2"))
+    one, other = (correction.correct(raw, CORRECTION)["counts"] for raw in (RAW, swapped))
+    np.testing.assert_array_equal(one, other)
+    labels = xr.DataArray(np.zeros(SHAPE, np.int64), dims=("y", "x"))
+    labels[:, 4:] = 2**40
+    labels[0] = -5
+    result = separation.separate(CAPTURE, CAMERA, materials=labels)
+    small = labels.where(labels < 2**40, 1).astype(int).clip(min=-1)
+    again = separation.separate(CAPTURE, CAMERA, materials=small)
+    xr.testing.assert_equal(result.drop_vars("material"), again.drop_vars("material"))
+    assert not np.any(result["status"] & np.uint32(Status.DEAD_PIXEL))
