@@ -14,6 +14,7 @@ from attack.oracle import Attack, Verdict
 from attack.scenes import pick
 from attack.stages import RIGHT, wrong
 from dbthermal import readers
+from reproduction import palettes
 
 Rng = np.random.Generator
 
@@ -149,7 +150,7 @@ def videos(rng: Rng) -> Attack:
     folder.mkdir(exist_ok=True)
     path = folder / "film.mp4"
     path.write_bytes(whole)
-    truth = readers.palette_video(path).values
+    truth = palettes.palette_video(path).values
     what = str(rng.choice(["flipped"] * 4 + ["noise", "cut", "size", "address", "text", "zeros"]))
     large = rng.random() < 0.05
     what, given = "large" if large else what, str(path)
@@ -170,7 +171,7 @@ def videos(rng: Rng) -> Attack:
 
     limit = "H.264 has no checksum" if what in ("flipped", "noise", "zeros") else ""
     told = given if what == "address" else ""
-    act = lambda: readers.palette_video(given)  # noqa: E731
+    act = lambda: palettes.palette_video(given)  # noqa: E731
     return Attack(f"video {what} {told}", act, judge, (f"film|{Path(given).name}",), limit=limit)
 
 

@@ -20,6 +20,7 @@ import xarray as xr
 from numpy.testing import assert_array_equal
 
 from dbthermal import readers, store
+from reproduction import palettes
 
 Read = Callable[[Path], xr.Dataset | dict[str, xr.Dataset]]
 
@@ -172,13 +173,13 @@ def test_videos(tmp_path: Path, ending: str, number: int) -> None:
     Of VP8, the most patient, up to two in five pass; of the others one in five.
     """
     path = hostile.video(tmp_path / f"copy.{ending}")
-    content, whole, counts = path.read_bytes(), readers.palette_video(path), Counter[str]()
+    content, whole, counts = path.read_bytes(), palettes.palette_video(path), Counter[str]()
     first = first_seed(number, 30)
     for seed in range(first, first + number):
         kind, changed = hostile.damaged(content, seed)
         path.write_bytes(changed)
         try:
-            frames = readers.palette_video(path)
+            frames = palettes.palette_video(path)
         except ValueError as refusal:
             clear = re.search("copy.*Must ", str(refusal))
             counts["refused" if clear else f"unclear: {refusal}"] += 1
@@ -196,13 +197,13 @@ def test_checksum_excludes_damage(tmp_path: Path) -> None:
     """With the file's checksum no damaged file passes, also one that decodes without complaint."""
     path = hostile.video(tmp_path / "a.mp4")
     whole, checksum = path.read_bytes(), store.checksum(path)
-    assert readers.palette_video(path, sha256=checksum).sizes["time"] == 12
+    assert palettes.palette_video(path, sha256=checksum).sizes["time"] == 12
     for seed in range(30):
         path.write_bytes(changed := hostile.damaged(whole, seed)[1])
         assert changed != whole or seed % 5 == 2  # a block of zeros may be where zeros were
         if changed != whole:
             with pytest.raises(ValueError, match=rf"Wrong SHA-256 .* Must be {checksum}"):
-                readers.palette_video(path, sha256=checksum)
+                palettes.palette_video(path, sha256=checksum)
 
 
 def test_marked_frames_are_refused(tmp_path: Path) -> None:
@@ -219,7 +220,7 @@ def test_marked_frames_are_refused(tmp_path: Path) -> None:
         if any(frame.is_corrupt for frame in frames):
             marked += 1
             with pytest.raises(ValueError, match=r"is marked corrupt|Truncated|Damaged"):
-                readers.palette_video(path)
+                palettes.palette_video(path)
     assert marked > 2
 
 
@@ -228,10 +229,10 @@ def test_size_is_known_before_memory_is_taken(tmp_path: Path) -> None:
     path = hostile.video(tmp_path / "a.mp4", np.zeros((20, 1080, 1920, 3), dtype=np.uint8))
     assert path.stat().st_size < 30_000
     code = (
-        "import resource, sys; from dbthermal import readers\n"
+        "import resource, sys; from reproduction import palettes\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "readers.palette_video(sys.argv[1]); before = peak()\n"
-        "try: readers.palette_video(sys.argv[2], memory=3e8)\n"
+        "palettes.palette_video(sys.argv[1]); before = peak()\n"
+        "try: palettes.palette_video(sys.argv[2], memory=3e8)\n"
         "except ValueError as error: print(error)\n"
         "print(peak() - before)"
     )
@@ -256,7 +257,7 @@ def test_declared_frames_are_counted(tmp_path: Path) -> None:
     ):
         path.write_bytes(changed)
         with pytest.raises(ValueError, match=message):
-            readers.palette_video(path)
+            palettes.palette_video(path)
 
 
 @pytest.mark.parametrize(
@@ -278,7 +279,7 @@ def test_playlists_are_no_videos(tmp_path: Path, content: bytes) -> None:
     hostile.video(tmp_path / "a.mp4")
     (tmp_path / "list.mp4").write_bytes(content)
     with pytest.raises(ValueError, match=r"Invalid video 'list\.mp4'. Must be MP4, MOV, Matroska"):
-        readers.palette_video(tmp_path / "list.mp4")
+        palettes.palette_video(tmp_path / "list.mp4")
 
 
 @pytest.mark.parametrize(
@@ -289,20 +290,20 @@ def test_addresses_are_no_files(tmp_path: Path, name: str, monkeypatch: pytest.M
     monkeypatch.chdir(tmp_path)
     hostile.video(tmp_path / "1.mp4")
     with pytest.raises(FileNotFoundError):
-        readers.palette_video(name)
+        palettes.palette_video(name)
     for path in (tmp_path, "/dev/zero"):
         with pytest.raises(ValueError, match="Must be a regular file"):
-            readers.palette_video(path)
+            palettes.palette_video(path)
 
 
 def test_what_a_file_names_is_not_opened(tmp_path: Path) -> None:
     """A QuickTime file whose data lie in another file does not open that one."""
     path = hostile.video(tmp_path / "a.mov")
-    plain = readers.palette_video(path)
+    plain = palettes.palette_video(path)
     content = path.read_bytes().replace(b"url \x00\x00\x00\x01", b"url \x00\x00\x00\x00")
     assert content != path.read_bytes()
     path.write_bytes(content)
     try:
-        assert_array_equal(readers.palette_video(path), plain)  # its data are in itself
+        assert_array_equal(palettes.palette_video(path), plain)  # its data are in itself
     except ValueError as refusal:
         assert "Must" in str(refusal)  # noqa: PT017
