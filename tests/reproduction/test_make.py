@@ -218,29 +218,64 @@ def test_values_are_refused(
     assert not (checkout / "results").exists()
 
 
-def test_an_interrupted_install_is_done_anew(checkout: Path, started: Start) -> None:
-    """What a killed pip left goes, for pip would take it for whole; `installed` comes last."""
-    shutil.rmtree(checkout / ".venv")
-    # A Python whose environment has a pip that first leaves half a package, and then succeeds.
-    pip = 'if test -e hold; then mkdir -p .venv/lib/half; sleep 60; else echo "$@" >> calls; fi'
+@pytest.fixture
+def python(checkout: Path) -> str:
+    """Setting of a Python that makes environments whose pip does what the file `pip` says."""
+    pip = 'if test "$2" = pip; then echo "$@" >> calls; . ./pip; fi'
     venv = f"mkdir -p .venv/bin; printf '#!/bin/sh\\n%s\\n' '{pip}' > .venv/bin/python"
-    python = script(
+    script(
         checkout / "fake python",
         f'if test "$2" = venv; then {venv}; chmod +x .venv/bin/python\n'
         f'else exec {sys.executable} "$@"; fi',
     )
-    (checkout / "hold").touch()
-    process = started("install", f"PYTHON=./{python.name}")
-    wait_for(checkout / ".venv/lib/half")
+    return "PYTHON=./fake python"
+
+
+def state(root: Path) -> dict[str, int]:
+    """Files of the environment but that of the fake pip, with their times [ns]."""
+    every = (one for one in root.glob(".venv/**/*") if one.name not in {"bin", "python", "lib"})
+    return {one.name: one.stat().st_mtime_ns for one in every if one.is_file()}
+
+
+def test_an_update_that_fails_leaves_the_environment(checkout: Path, python: str) -> None:
+    """Without a network an older environment stays whole, however often it is tried."""
+    script(checkout / ".venv/lib/package", "")
+    os.utime(checkout / ".venv/installed", (1e9, 1e9))
+    before = state(checkout)
+    for pip in ("exit 1", "mkdir -p .venv/lib && exit 2"):
+        (checkout / "pip").write_text(pip)
+        failed = make("check", python)
+        assert failed.returncode == 2
+        assert ".venv is not up to date, and as it was" in failed.stderr
+        assert state(checkout) == before
+    (checkout / "pip").write_text("exit 0")
+    assert make("install", python).returncode == 0
+    assert state(checkout).keys() == before.keys()
+    assert state(checkout)["installed"] > before["installed"]
+    assert "is up to date" not in make("install", python).stderr
+
+
+def test_an_interrupted_install_is_done_anew(
+    checkout: Path, python: str, started: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    """What a killed pip left is put aside until a new environment is whole, then it goes."""
+    (checkout / "pip").write_text("mkdir -p .venv/lib/half; touch .venv/lib/half/file; sleep 60")
+    os.utime(checkout / ".venv/installed", (1e9, 1e9))
+    process = started("install", python)
+    wait_for(checkout / ".venv/lib/half/file")
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert not (checkout / ".venv/installed").exists()
-    (checkout / "hold").unlink()
-    done = make("install", f"PYTHON=./{python.name}")
+    assert state(checkout).keys() == {"installing", "file"}
+    for _ in range(2):  # without a network
+        (checkout / "pip").write_text("exit 1")
+        assert make("install", python).returncode == 2
+        assert state(checkout).keys() == {"installing", "file"}
+    (checkout / "pip").write_text("exit 0")
+    (checkout / "calls").unlink()
+    done = make("install", python)
     assert done.returncode == 0, done.stderr
-    assert not (checkout / ".venv/lib/half").exists()
-    assert (checkout / ".venv/installed").exists()
-    assert not (checkout / ".venv/installing").exists()
+    assert state(checkout).keys() == {"installed"}
+    assert not (checkout / ".venv-interrupted").exists()
     assert len((checkout / "calls").read_text().splitlines()) == 2  # pip itself, then the packages
 
 
