@@ -22,7 +22,7 @@ $(MAKECMDGOALS): under-lock ; @:
 under-lock:
 	+@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { printf "Invalid Python '%s'. Must be 3.11 or newer: make PYTHON=python3.12\n" "$$PYTHON" >&2; exit 1; }; \
-	    exec "$$PYTHON" -I notebooks/reproduction/locked.py "$(MAKE)"
+	    exec "$$PYTHON" -I notebooks/reproduction/locked.py "$(MAKE)" "$$PPID"
 else
 
 python := .venv/bin/python
@@ -113,6 +113,7 @@ reproduce: export MALLOC_MMAP_MAX_ := 0
 reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
 # One notebook more than processors, for 00_acquisition waits for its emulated instruments most of the time.
 reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, one more at a time than JOBS
+	@$(python) -m reproduction.integrity full rig
 	JOBS=$$((JOBS + 1)) && $(parallel) full
 
 full: $(foreach one,$(early),$(filter results/$(one).ipynb,$(full) $(rig))) $(full) $(rig)

@@ -1,13 +1,16 @@
 """Tasks of the Makefile, in a small checkout of its own: killed, two at a time, odd names."""
 
+import fcntl
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import nbformat
@@ -130,44 +133,63 @@ def test_a_killed_notebook_runs_again(checkout: Path, started: Start) -> None:
     assert "up to date" in make(TARGET).stdout
 
 
+SIGNALS = {name: getattr(signal, f"SIG{name}") for name in ("TERM", "INT", "HUP", "KILL")}
+
+
+def wait_for_end(root: Path, process: "subprocess.Popen[bytes]", numbers: list[int]) -> None:
+    """Wait until a make and all that it started are no more, and its lock is free."""
+    process.wait(60)
+    end = time.monotonic() + 60
+    with (root / locked.LOCK).open() as file:
+        while True:
+            with suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not {*numbers} & {*locked.descendants(0)}:
+                    return
+            assert time.monotonic() < end, numbers
+            time.sleep(0.05)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("victim", "moment"),
-    [
-        ("kernel", "01_tiny.json"),
-        *((victim, ".01_tiny.part.ipynb") for victim in ("make", "group", "ctrl-c", "terminate")),
-        *((victim, "01_tiny.json") for victim in ("make", "ctrl-c", "terminate")),
-    ],
-)
+@pytest.mark.parametrize("moment", [".01_tiny.part.ipynb", "01_tiny.json"])
+@pytest.mark.parametrize("victim", [*SIGNALS, "ctrl-c", "group", "kernel"])
 def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment: str) -> None:
     """Without make, the runner or the kernel nothing goes on, and the next make does all anew."""
     (checkout / "hold").touch()
     process = started(TARGET)
-    wait_for(checkout / "results/full" / moment)
+    wait_for(checkout / "results/full" / (moment if victim != "kernel" else "01_tiny.json"))
+    running = locked.descendants(process.pid)
+    assert len(running) >= 3
     if victim == "kernel":
-        (kernel,) = kernels(checkout)
-        os.kill(kernel, signal.SIGKILL)
-    elif victim in {"make", "terminate"}:
-        process.send_signal(signal.SIGKILL if victim == "make" else signal.SIGTERM)
+        os.kill(int((checkout / "kernels").read_text()), signal.SIGKILL)
+    elif victim in SIGNALS:
+        process.send_signal(SIGNALS[victim])
     else:
         os.killpg(process.pid, signal.SIGINT if victim == "ctrl-c" else signal.SIGKILL)
-    assert process.wait(60) != 0
+    wait_for_end(checkout, process, running)
+    assert process.returncode != 0
     (checkout / "hold").unlink()
     assert not (checkout / TARGET).exists()
     again = make(TARGET)
     assert again.returncode == 0, again.stderr
     assert numbers(checkout) == {"number": 2}
-    assert not kernels(checkout)
 
 
-def kernels(root: Path) -> list[int]:
-    """Process numbers of the kernels of a checkout that still run."""
-    states = {}
-    for number in (root / "kernels").read_text().split():
-        command = ["ps", "-o", "stat=", "-p", number]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        states[int(number)] = done.stdout.strip()
-    return [number for number, state in states.items() if state and not state.startswith("Z")]
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(40))
+def test_killed_at_any_moment(checkout: Path, started: Start, seed: int) -> None:
+    """Ten random moments of each signal: all ends, and the next make goes on to the end."""
+    rng, name = random.Random(seed), [*SIGNALS][seed % 4]
+    process = started(TARGET)
+    time.sleep(rng.uniform(0.0, 12.0))  # the whole takes some ten seconds
+    running = locked.descendants(process.pid)
+    process.send_signal(SIGNALS[name])
+    start = time.monotonic()
+    wait_for_end(checkout, process, running)
+    print(f"{name} to {len(running)} processes: all ended after {time.monotonic() - start:.1f} s")
+    again = make(TARGET)
+    assert again.returncode == 0, again.stderr
+    assert numbers(checkout) == {"number": 2}
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
