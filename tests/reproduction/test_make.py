@@ -44,6 +44,16 @@ def script(path: Path, text: str) -> Path:
     return path
 
 
+def write_notebook(root: Path, stem: str, text: str) -> None:
+    """Make a notebook of two cells, and its parameters."""
+    small = nbformat.v4.new_code_cell('results = "smoke"\nnumber = 1')
+    small.metadata["tags"] = ["parameters"]
+    notebook = nbformat.v4.new_notebook(cells=[small, nbformat.v4.new_code_cell(text)])
+    notebook.metadata.kernelspec = {"name": "python3", "language": "python", "display_name": ""}
+    nbformat.write(notebook, root / f"notebooks/{stem}.ipynb")
+    (root / f"params/{stem}.yaml").write_text("results: full\nnumber: 2\n")
+
+
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Checkout with one notebook, which waits while the file `hold` is there; its name is odd."""
@@ -52,13 +62,8 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copy(ROOT / "Makefile", root)
     for name in ("data_manifest.yaml", "pyproject.toml", "requirements.lock"):
         (root / name).touch()
-    small = nbformat.v4.new_code_cell('results = "smoke"\nnumber = 1')
-    small.metadata["tags"] = ["parameters"]
-    notebook = nbformat.v4.new_notebook(cells=[small, nbformat.v4.new_code_cell(NOTEBOOK)])
-    notebook.metadata.kernelspec = {"name": "python3", "language": "python", "display_name": ""}
-    nbformat.write(notebook, root / "notebooks/01_tiny.ipynb")
     (root / "params/recorded").mkdir(parents=True)
-    (root / "params/01_tiny.yaml").write_text("results: full\nnumber: 2\n")
+    write_notebook(root, "01_tiny", NOTEBOOK)
     packages = f'PYTHONPATH="$PYTHONPATH:{ROOT}" exec {sys.executable} "$@"'
     script(root / ".venv/bin/python", packages)
     (root / ".venv/share/ipython").mkdir(parents=True)
@@ -190,6 +195,46 @@ def test_killed_at_any_moment(checkout: Path, started: Start, seed: int) -> None
     again = make(TARGET)
     assert again.returncode == 0, again.stderr
     assert numbers(checkout) == {"number": 2}
+
+
+MAKER = """\
+import xarray as xr
+from reproduction.run import Run
+
+run = Run("01_calibration", globals())
+run.save(xr.Dataset({"counts": ("time", range(50))}), "_response")
+run.finish({"frames": 50})
+"""
+READER = """\
+from reproduction.run import Run
+
+run = Run("02_emissivity", globals())
+read = run.open("01_calibration", "_response")
+run.finish({"sum": int(read["counts"].sum())})
+"""
+
+
+@pytest.mark.slow
+def test_what_is_spoilt_is_mended(checkout: Path) -> None:
+    """A reader names the notebook of a spoilt input; the next make makes both, by itself."""
+    (checkout / "notebooks/01_tiny.ipynb").unlink()
+    for stem, text in (("01_calibration", MAKER), ("02_emissivity", READER)):
+        write_notebook(checkout, stem, text)
+    assert make("reproduce").returncode == 0
+    folder = checkout / "results/full"
+    (folder / "01_calibration_response.zarr/counts/c/0").write_bytes(b"spoilt")
+    (folder / "02_emissivity.ipynb").unlink()
+    failed = make("full")
+    assert failed.returncode == 2
+    assert "'make results/full/01_calibration.ipynb'" in failed.stderr + failed.stdout
+    assert make("reproduce").returncode == 0
+    for path in (folder / "02_emissivity.json", folder / "01_calibration.json"):
+        whole = json.loads(path.read_text())["numbers"]
+        path.unlink()
+        mended = make("reproduce")
+        assert mended.returncode == 0
+        assert f"Missing file '{path}'. The notebook is run again." in mended.stderr
+        assert json.loads(path.read_text())["numbers"] == whole
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
