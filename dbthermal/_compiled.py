@@ -82,7 +82,7 @@ class _Cache(FunctionCache):
         if not self._impl.check_cachable(data):
             return
         path, digest = self._place(sig, data.codegen)
-        content = dumps(self._impl.reduce(data))
+        content = dumps(self._impl.reduce(data))  # type: ignore[no-untyped-call]
         part = path.with_name(f".{path.name}.{uuid4().hex}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

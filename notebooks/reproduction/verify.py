@@ -36,7 +36,7 @@ def read_run(run: str) -> dict[str, Numbers]:
     RuntimeError if one of the notebooks is running, was interrupted, or has left other numbers,
     FileNotFoundError if all are missing.
     """
-    stems = [path.stem for path in paths.results(run).glob("*.ipynb")]
+    stems = [path.stem for path in paths.results(run).glob("[0-9][0-9]_*.ipynb")]
     listed = {
         file for stem in stems for file in integrity.files(run, stem) if file.suffix == ".json"
     }

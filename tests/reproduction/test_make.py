@@ -228,13 +228,13 @@ def test_what_is_spoilt_is_mended(checkout: Path) -> None:
     assert failed.returncode == 2
     assert "'make results/full/01_calibration.ipynb'" in failed.stderr + failed.stdout
     assert make("reproduce").returncode == 0
-    for path in (folder / "02_emissivity.json", folder / "01_calibration.json"):
-        whole = json.loads(path.read_text())["numbers"]
-        path.unlink()
-        mended = make("reproduce")
-        assert mended.returncode == 0
-        assert f"Missing file '{path}'. The notebook is run again." in mended.stderr
-        assert json.loads(path.read_text())["numbers"] == whole
+    path = folder / "02_emissivity.json"
+    numbers = json.loads(path.read_text())["numbers"]
+    path.unlink()
+    mended = make("reproduce")
+    assert mended.returncode == 0
+    assert f"Missing file '{path}'. The notebook is run again." in mended.stderr
+    assert json.loads(path.read_text())["numbers"] == numbers
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:

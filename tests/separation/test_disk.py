@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -150,12 +151,13 @@ def test_a_source_of_other_values_is_another(path: Path, tmp_path: Path, kind: s
     for warmer in (0.0, 500.0):  # count
         capture["counts"][..., 5, 7] += warmer
         store.save(capture, source, {})
-        opened = {
+        sources: dict[str, Callable[[], Any]] = {
             "folder": lambda: source,
             "zarr": lambda: store.open_dataset(source),
             "dask": lambda: dask_backed(source),
             "memory": lambda: capture,
-        }[kind]
+        }
+        opened = sources[kind]
         separation.run(opened(), target, RIG.response(), memory=MEMORY)
         made = (target / "zarr.json").stat().st_mtime_ns
         separation.run(opened(), target, RIG.response())
