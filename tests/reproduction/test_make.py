@@ -132,6 +132,7 @@ def test_a_killed_notebook_runs_again(checkout: Path, started: Start) -> None:
     assert again.returncode == 0, again.stderr
     assert numbers(checkout) == {"number": 2}
     assert sorted(path.name for path in (checkout / "results/full").iterdir()) == [
+        ".01_tiny.sums",
         "01_tiny.ipynb",
         "01_tiny.json",
     ]
