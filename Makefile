@@ -22,7 +22,7 @@ $(MAKECMDGOALS): under-lock ; @:
 under-lock:
 	+@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { printf "Invalid Python '%s'. Must be 3.11 or newer: make PYTHON=python3.12\n" "$$PYTHON" >&2; exit 1; }; \
-	    exec "$$PYTHON" -I notebooks/reproduction/locked.py "$(MAKE)"
+	    exec "$$PYTHON" -I notebooks/reproduction/locked.py "$(MAKE)" "$$PPID"
 else
 
 python := .venv/bin/python
@@ -62,7 +62,7 @@ export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record report data docs lab bench attack lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow test-long reproduce full verify record report data docs lab bench attack lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -100,8 +100,11 @@ test: .venv/installed ## check lint, types, the quick tests, and every notebook 
 	$(parallel) smoke
 
 test-slow: .venv/documenting ## run the long tests, and the notebooks on the recordings of the emulated rig
-	$(python) -m pytest --numprocesses="$$JOBS" -m slow
+	$(python) -m pytest --numprocesses="$$JOBS" -m 'slow and not long'
 	$(parallel) chain
+
+test-long: .venv/installed ## run the long counts, for which nobody waits: many seeds, every kind of kill
+	$(python) -m pytest --numprocesses="$$JOBS" -m long
 
 # A process keeps the memory that it has freed, in one heap for all threads (GNU's C library; others ignore this): the arrays of
 # films are made anew so often that clearing their pages takes half of all the time spent in the system otherwise.
@@ -110,6 +113,7 @@ reproduce: export MALLOC_MMAP_MAX_ := 0
 reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
 # One notebook more than processors, for 00_acquisition waits for its emulated instruments most of the time.
 reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, one more at a time than JOBS
+	@$(python) -m reproduction.integrity full rig
 	JOBS=$$((JOBS + 1)) && $(parallel) full
 
 full: $(foreach one,$(early),$(filter results/$(one).ipynb,$(full) $(rig))) $(full) $(rig)
@@ -147,19 +151,26 @@ lock: .venv/installed ## write both locks anew from pyproject.toml, keeping the 
 	$(compile) --no-config --generate-hashes --constraint requirements.lock --output-file requirements-hashes.lock pyproject.toml
 
 clean: ## remove all that make made: results, environment, caches
-	rm -rf results docs/api docs/notebooks .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf results docs/api docs/notebooks .venv .venv-interrupted .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find dbthermal tests notebooks -name __pycache__ -prune -exec rm -rf {} +
 
-# The lock constrains the package's own build too; pip renamed the variable for that. What an install that was interrupted left may look
-# whole to pip, so it goes first.
+# The lock constrains the package's own build too; pip renamed the variable for that. One in which an install fails, as without a
+# network, is as it was. What one that was interrupted left may look whole to pip: it is put aside, and goes when a new one is whole.
 .venv/installed: pyproject.toml requirements.lock
-	@if test -e .venv/installing; then find .venv -mindepth 1 -not -path .venv/installing -delete; fi
-	@mkdir -p .venv && touch .venv/installing && rm -f $@
-	"$$PYTHON" -m venv .venv
-	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet pip
-	PIP_CONSTRAINT=requirements.lock PIP_BUILD_CONSTRAINT=requirements.lock \
-	    $(python) -m pip install --quiet --editable '.[notebooks,test]'
-	@sync && touch $@ && rm -f .venv/installing
+	@trap 'exit 130' HUP INT TERM; \
+	if test -e .venv/installing; then \
+	    if test -e .venv-interrupted; then rm -rf .venv; else mv .venv .venv-interrupted; fi; \
+	fi; \
+	mkdir -p .venv; whole=; if test -e $@; then whole=yes; mv $@ .venv/installing; else touch .venv/installing; fi; \
+	export PIP_CONSTRAINT=requirements.lock; \
+	if "$$PYTHON" -m venv .venv && $(python) -m pip install --quiet pip && PIP_BUILD_CONSTRAINT=requirements.lock \
+	    $(python) -m pip install --quiet --editable '.[notebooks,test]'; then \
+	    sync && touch .venv/installing && mv .venv/installing $@ && rm -rf .venv-interrupted; \
+	else \
+	    if test -e .venv-interrupted; then rm -rf .venv; mv .venv-interrupted .venv; \
+	    elif test "$$whole"; then mv .venv/installing $@; else rm -f .venv/installing; fi; \
+	    echo "The environment .venv is not up to date, and as it was: see above. It is made by 'make install'." >&2; exit 1; \
+	fi
 
 # What the site needs; an environment in which this is interrupted counts as interrupted, and one in which it fails is as it was.
 .venv/documenting: .venv/installed

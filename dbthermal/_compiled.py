@@ -1,20 +1,213 @@
-"""Compilation of loops that as passes over arrays would take several times as long."""
+"""Compiled functions, and files that keep their machine code from process to process.
 
-from collections.abc import Callable
+A file has a checksum, and the digest of the code that it was compiled of: of the function and of
+all compiled functions and constants that it uses, in any module, but not of comments, docstrings
+and lines. What is damaged, or of other code, is compiled again; processes that need the same at the
+same time wait for the first to compile it.
+"""
+
+import dis
+import hashlib
+import logging
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, Final
+from uuid import uuid4
 
+import numba
+import numpy as np
 from numba import njit
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+
+try:
+    import fcntl
+except ImportError:  # Windows: there each process compiles by itself
+    fcntl = None  # type: ignore[assignment]
+
+_LOGGER: Final = logging.getLogger(__name__)
+_SIZE: Final = 32  # of a SHA-256 [byte]
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call; where a folder may be written it is kept there.
+def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator that compiles a function at its first call, and keeps its machine code.
 
-    Sums may be taken in any order; NaN stays NaN. It must not call compiled functions of
-    other files, of which a change would not be seen.
+    Without a folder that may be written each process compiles. `options` are those of `numba.njit`.
     """
-    flags = {"reassoc", "contract", "nsz", "arcp"}
-    result = njit(nogil=True, error_model="numpy", fastmath=flags)(function)
-    with suppress(RuntimeError):  # without such a folder each process compiles
-        result.enable_caching()
-    return result
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        result: Any = njit(**options)(function)
+        with suppress(RuntimeError):
+            result._cache = cache = _Cache(result)
+            result.compile = cache.in_turn(result.compile)
+        decorated: Callable[..., Any] = result
+        return decorated
+
+    return decorate
+
+
+compiled: Final = kept(
+    nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
+)
+"""Decorator of loops that as passes over arrays would take several times as long.
+
+Sums may be taken in any order; NaN stays NaN.
+"""
+
+
+class _Cache(FunctionCache):
+    """Files of a compiled function, one for each kind of arguments and processor."""
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function.py_func)  # type: ignore[no-untyped-call]
+        self._function, self._locks = function, list[int]()
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Machine code for arguments, None if it is to be compiled, by this process alone."""
+        target_context.refresh()
+        path, digest = self._place(sig, target_context.codegen())
+        if (data := _read(path, digest)) is None:
+            self._lock(path)
+            data = _read(path, digest)
+        return None if data is None else self._impl.rebuild(target_context, data)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep machine code for arguments."""
+        if not self._impl.check_cachable(data):
+            return
+        path, digest = self._place(sig, data.codegen)
+        content = dumps(self._impl.reduce(data))  # type: ignore[no-untyped-call]
+        part = path.with_name(f".{path.name}.{uuid4().hex}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(digest + hashlib.sha256(digest + content).digest() + content)
+            part.replace(path)
+            _LOGGER.debug("Compiled code is kept as '%s'.", path)
+        except OSError as error:
+            _LOGGER.warning("Compiled code is not kept as '%s': %s.", path, error)
+            part.unlink(missing_ok=True)
+
+    def in_turn(self, compile_for: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Compilation that frees the lock of its file at its end, however it ends."""
+
+        def compile_in_turn(sig: Any) -> Any:
+            held = len(self._locks)
+            try:
+                return compile_for(sig)
+            finally:
+                for lock in self._locks[held:]:
+                    with suppress(OSError):
+                        fcntl.flock(lock, fcntl.LOCK_UN)
+                    os.close(lock)
+                del self._locks[held:]
+
+        return compile_in_turn
+
+    def _lock(self, path: Path) -> None:
+        """Wait until no other process compiles the same; without locks there is no waiting."""
+        with suppress(OSError, AttributeError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o666)
+            self._locks.append(lock)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+
+    def _place(self, sig: Any, codegen: Any) -> tuple[Path, bytes]:
+        """File for a kind of arguments, and the digest of the code and all else it depends on."""
+        kinds = list(_kinds(sig if isinstance(sig, tuple) else sig.args))
+        kind = hashlib.sha256(repr((kinds, codegen.magic_tuple())).encode()).hexdigest()
+        function = self._function.py_func
+        name = f"{function.__module__}.{function.__qualname__}-{kind[:16]}"
+        versions = f"{sys.implementation.cache_tag} {numba.__version__}"
+        described = "\n".join([versions, kind, *_described(self._function, {})])
+        path = Path(self.cache_path) / f"{name.replace('<', '').replace('>', '')}.nbc"
+        return path, hashlib.sha256(described.encode()).digest()
+
+
+def _read(path: Path, digest: bytes) -> Any:
+    """Content of a file of compiled code; None if it is missing, damaged or of other code."""
+    try:
+        content = path.read_bytes()
+        code, checksum, data = content[:_SIZE], content[_SIZE : 2 * _SIZE], content[2 * _SIZE :]
+        if hashlib.sha256(code + data).digest() == checksum:
+            return pickle.loads(data) if code == digest else None
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # noqa: BLE001 - whatever it holds, it can be made anew
+        _LOGGER.warning("Unreadable compiled code: %s.", error)
+    _LOGGER.warning("Damaged compiled code '%s'. It is compiled again.", path)
+    return None
+
+
+def _kinds(types: Any) -> Iterator[str]:
+    """Types of arguments, with the names of fields, by which compiled code finds their places."""
+    for kind in types:
+        yield f"{kind} {getattr(kind, 'fields', '')}"
+        yield from _kinds(getattr(kind, "types", ()))
+
+
+def _described(value: Any, seen: dict[int, int]) -> Iterator[str]:
+    """All of a compiled function, constant or name that is in the machine code."""
+    if isinstance(value, Dispatcher):
+        first = id(value) not in seen
+        yield f"function {seen.setdefault(id(value), len(seen))}"
+        if first:
+            options = value.targetoptions
+            yield from _described([(name, options[name]) for name in sorted(options)], seen)
+            yield from _of_function(value.py_func, seen)
+    elif isinstance(value, tuple | list):
+        yield f"{type(value).__qualname__} {len(value)} {getattr(value, '_fields', '')}"
+        for part in value:
+            yield from _described(part, seen)
+    elif not isinstance(value, ModuleType):  # of which what is used is described
+        yield _plainly(value)
+
+
+def _plainly(value: Any) -> str:
+    """A constant, or the name of what numba itself compiles, as text."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    if isinstance(value, set | frozenset):
+        return f"set {sorted(map(repr, value))}"
+    if callable(value) and hasattr(value, "__name__"):
+        fields = getattr(value, "_fields", "")
+        return f"{getattr(value, '__module__', 'numpy')}.{value.__name__} {fields}"
+    if isinstance(value, int | float | complex | str | bytes | slice | np.generic):
+        return repr(value)
+    if value is None or value is ...:
+        return repr(value)
+    raise TypeError(f"Invalid {value!r} in a compiled function. Must be a number, or compiled.")
+
+
+def _of_function(function: Any, seen: dict[int, int]) -> Iterator[str]:
+    """Code and defaults of a function, and what its global and free names stand for."""
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    free = dict(zip(function.__code__.co_freevars, cells, strict=True))
+    yield from _described(function.__defaults__, seen)
+    yield from _of_code(function.__code__, {**function.__globals__, **free}, seen)
+
+
+def _of_code(code: CodeType, names: Mapping[str, Any], seen: dict[int, int]) -> Iterator[str]:
+    """Instructions of code, which depend on no comment, docstring or line."""
+    yield f"arguments {code.co_varnames[: code.co_argcount]}"
+    owner: Any = None  # module or type of which the next instruction may take a name
+    for step in dis.get_instructions(code):
+        yield step.opname
+        loaded = None
+        if step.opname == "LOAD_CONST" and isinstance(step.argval, CodeType):
+            yield from _of_code(step.argval, names, seen)
+        elif step.opname == "LOAD_CONST":
+            yield from _described(step.argval, seen)
+        else:
+            yield str(step.argval)
+        if step.opname in {"LOAD_GLOBAL", "LOAD_DEREF"}:
+            loaded = names.get(step.argval)
+        elif step.opname in {"LOAD_ATTR", "LOAD_METHOD"}:
+            loaded = getattr(owner, step.argval, None)
+        yield from _described(loaded, seen)
+        owner = loaded if isinstance(loaded, ModuleType | type) else None

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import accumulate
 from multiprocessing import parent_process
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
@@ -25,6 +25,7 @@ from dbthermal.separation._inputs import BLOCK_ROWS, Method
 from dbthermal.separation._solve import get_method, require_seed, solve
 from dbthermal.separation._tiles import largest
 from dbthermal.store._datasets import chunks_in_turn
+from dbthermal.store._integrity import last_sums
 
 if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings
@@ -64,14 +65,15 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
 
     Each block of rows is separated as by `solve` and written by the one process that has it; what
     is written stays when the run is killed, and the next one goes on from there to the same bytes.
-    A target that the same run has made before is left as it is.
+    A target that the same run has made before is left as it is. A capture is recognised by its
+    store's checksums; one in memory or lazy by all its values, which are read once more for it.
 
     Parameters
     ----------
     source : str, Path, Dataset, or a sequence of these
         Stage `corrected` of `schema`, as for `solve`: a folder ``*.zarr`` of `store.save`, which
         every process opens by itself, or a lazy Dataset (of zarr, dask), of which every process is
-        sent its rows; those of a chunk of dask's are read once, for all their blocks. What
+        sent its rows; those of a chunk of dask's are read once to separate all their blocks. What
         `correct_capture` or `align` leave to be computed, threads can take, and the workers of a
         cluster, not those of a ProcessPoolExecutor.
     target : str or Path, or as many
@@ -183,14 +185,16 @@ class _Job:
         )
         response = checked.response  # with one noise for all blocks
         provenance = self.provenance or store.provenance({})
-        digest = _digest([*_thinned(capture), response, self.method, self.options])
+        method, settings = get_method(self.method), self.options["settings"]
+        threads, height, read = _share(capture, self.memory, self.executor, method, settings)
+        with ThreadPoolExecutor(threads) as own:
+            content = _content(source, capture, read, self.executor or own)
+        digest = _digest([content, response, self.method, self.options])
         provenance = json.loads(json.dumps({**provenance, "run": digest}))
         parts = Path(f"{target}.parts")
         if target.exists() and store.open_dataset(target).attrs.get("provenance") == provenance:
             shutil.rmtree(parts, ignore_errors=True)  # of a run that was killed at its very end
             return
-        method, settings = get_method(self.method), self.options["settings"]
-        threads, height, read = _share(capture, self.memory, self.executor, method, settings)
         _begin(parts, {"height": height, **provenance})
         end = capture.sizes["y"]
         paths = {top: parts / f"{top:06d}.zarr" for top in range(0, end, height)}
@@ -324,12 +328,34 @@ def _begin(parts: Path, plan: Mapping[str, Any]) -> None:
         )
 
 
-def _thinned(capture: xr.Dataset) -> list[xr.Dataset]:
-    """Capture by which it is known again; of its films, which are too large, a few pixels."""
-    step = slice(None, None, max(1, int(np.sqrt(capture.sizes["y"] * capture.sizes["x"]) / 4)))
-    films = [name for name in capture.data_vars if capture[name].ndim > 2]
-    few = capture[films].isel(y=step, x=step, missing_dims="ignore")
-    return [capture.drop_vars(films), few]
+def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor: Executor) -> Any:
+    """All by which a capture is recognised: its store's checksums; without these, each value.
+
+    What is lazy is read for it, by those who read it again to separate it.
+    """
+    if isinstance(source, Path) and (sums := last_sums(source)):
+        return sums
+    films = [name for name, one in capture.variables.items() if "y" in one.dims]
+    rest, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
+    heights = capture["counts"].chunksizes.get("y") or [read] * math.ceil(capture.sizes["y"] / read)
+    parts = [
+        every.isel(y=slice(end - rows, end))
+        for end, rows in zip(accumulate(heights), heights, strict=True)
+    ]
+    if all(one.variable._in_memory for one in capture.values()):
+        return [_digest(rest), "".join(map(_row_digests, parts))]
+    jobs = [executor.submit(_row_digests, one) for one in parts]
+    try:
+        return [_digest(rest), "".join(job.result() for job in jobs)]
+    finally:
+        for job in jobs:
+            job.cancel()
+
+
+def _row_digests(part: xr.Dataset) -> str:
+    """Digests of rows, each by itself, whatever the number that are read together."""
+    part = part.compute(scheduler="synchronous")
+    return "".join(_digest(part.isel(y=row)) for row in range(part.sizes["y"]))
 
 
 def _digest(value: Any) -> str:

@@ -24,7 +24,7 @@ import papermill
 from jupyter_client.manager import AsyncKernelManager
 
 from dbthermal import store
-from reproduction import locked, parameters, paths
+from reproduction import integrity, locked, parameters, paths
 
 
 class Kernel(AsyncKernelManager):
@@ -100,8 +100,10 @@ def execute(
         failed.parent.mkdir(parents=True, exist_ok=True)
         part.replace(failed)
         raise
+    integrity.keep_sums(run, stem)
     os.utime(part, (start, start))
-    store.to_disk([part, *part.parent.glob(f"{stem}*"), *part.parent.glob(f"{stem}*/**/*")])
+    sums = paths.sums(run, stem)
+    store.to_disk([part, sums, *part.parent.glob(f"{stem}*"), *part.parent.glob(f"{stem}*/**/*")])
     part.replace(path)
     store.to_disk([path.parent])
     return path

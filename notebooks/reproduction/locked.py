@@ -2,12 +2,19 @@
 
 The Makefile runs this file by itself, before there is an environment, so it needs Python alone::
 
-    GOALS="test reproduce" python3 -I notebooks/reproduction/locked.py make
+    GOALS="test reproduce" python3 -I notebooks/reproduction/locked.py make $$
+
+The number is that of the outer make, or of another process that this one is to end with.
 
 The lock is one of the operating system on the file `LOCK`. All that make starts holds it too, the
 notebooks' kernels among them, so that it is free when the last of them has ended, however it ended.
+
+This process ends all that make started, kernels and their workers too: at a signal, when the outer
+make has one, or is no more, and when the inner make has ended. What does not end by itself in
+`_GRACE` is killed. Without /proc (macOS) a signal must reach this process, as a Ctrl-C does.
 """
 
+import ctypes
 import fcntl
 import os
 import re
@@ -16,7 +23,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -35,6 +44,8 @@ MIRROR: Final = "DBTHERMAL_DATA"
 
 _PATIENCE: Final = 3.0  # the kernels of a make that was killed notice it within a second [s]
 _POLL: Final = 0.2  # [s]
+_GRACE: Final = 1.2  # [s]
+_CHILD_SUBREAPER, _DEATH_SIGNAL = 36, 1  # of Linux's prctl
 
 
 def lock(folder: Path, task: str) -> int:
@@ -77,8 +88,6 @@ def end_with_parent(end: Callable[[], object]) -> None:
             time.sleep(_POLL)
         end()
 
-    threading.Thread(target=watch, daemon=True).start()
-
 
 def settings() -> dict[str, str]:
     """Environment for make: JOBS, and DBTHERMAL_DATA as an absolute path, both checked."""
@@ -101,7 +110,73 @@ def mirror() -> Path | None:
     return Path(folder).absolute()
 
 
-def main(make: str) -> int:
+def descendants(of: int) -> list[int]:
+    """Process numbers of all that a process started, and of what that started, but of the dead."""
+    parents = {number: parent for number, parent, dead in _processes() if not dead}
+    found = {of}
+    while more := {number for number, parent in parents.items() if parent in found} - found:
+        found |= more
+    return sorted(found - {of})
+
+
+def _processes() -> Iterable[tuple[int, int, bool]]:
+    """Number and parent of every process, and whether it is dead and only to be reaped."""
+    if Path("/proc/self/stat").exists():
+        for path in Path("/proc").glob("[0-9]*/stat"):
+            with suppress(OSError):  # ended since
+                state, parent = path.read_text(errors="replace").rpartition(")")[2].split()[:2]
+                yield int(path.parent.name), int(parent), state == "Z"
+        return
+    command = ["ps", "-A", "-o", "pid=,ppid=,stat="]
+    done = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    for line in done.communicate()[0].splitlines():
+        number, parent, state = line.split()
+        if int(number) != done.pid:
+            yield int(number), int(parent), state.startswith("Z")
+
+
+def end_descendants() -> None:
+    """End all that this process started: by SIGTERM, and after `_GRACE` by SIGKILL."""
+    start = time.monotonic()
+    asked: set[int] = set()
+    while left := descendants(os.getpid()):
+        killed = time.monotonic() > start + _GRACE
+        for number in left if killed else set(left) - asked:
+            with suppress(ProcessLookupError, PermissionError):
+                os.kill(number, signal.SIGKILL if killed else signal.SIGTERM)
+        asked.update(left)
+        time.sleep(0.02)
+
+
+def _wait_for_end(make: int) -> None:
+    """Wait until the outer make is no more, or has a signal and waits for this process to end.
+
+    At SIGTERM it ends its children. At SIGINT or SIGHUP it waits for them, and does not catch that
+    signal any more.
+    """
+    parent, caught = os.getppid(), _caught(make)
+    if os.getpid() in descendants(make):
+        while os.getppid() == parent and not caught & ~_caught(make):
+            time.sleep(_POLL)
+
+
+def _caught(process: int) -> int:
+    """Bits of SIGINT and SIGHUP if a process catches them; 0 where the system does not tell."""
+    bits = 1 << signal.SIGINT - 1 | 1 << signal.SIGHUP - 1
+    with suppress(OSError):
+        text = Path(f"/proc/{process}/status").read_text()
+        if found := re.search(r"^SigCgt:\s*([0-9a-f]+)$", text, re.MULTILINE):
+            return int(found[1], 16) & bits
+    return 0
+
+
+def _prctl(option: int, value: int) -> None:
+    """Set an option of this process; elsewhere than on Linux there is none."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+
+
+def main(make: str, outer: int) -> int:
     """Run make for the tasks in the variable GOALS; its exit status, 1 if it may not run."""
     goals, folder = os.environ["GOALS"].split(), Path.cwd()
     try:
@@ -112,20 +187,30 @@ def main(make: str) -> int:
         return 1
     environment |= {LOCKED: str(folder), HELD: str(file)}
     command = [make, "--no-print-directory", *goals]
-    # Inherited beside the lock: the pipe by which the makes share their jobs.
-    process = subprocess.Popen(command, env=environment, close_fds=False)
 
-    def forward(number: int, _: FrameType | None) -> None:
-        if number != signal.SIGINT:  # a Ctrl-C reaches all of them by itself
-            process.send_signal(number)
+    def end(number: int, _: FrameType | None) -> None:
+        for other in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(other, signal.SIG_IGN)
+        end_descendants()
+        os._exit(128 + number)
 
+    def watch() -> None:
+        _wait_for_end(outer)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    _prctl(_CHILD_SUBREAPER, 1)  # what loses its parent becomes a child of this process
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, forward)
-    end_with_parent(process.terminate)
+        if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
+    # Inherited beside the lock: the pipe by which the makes share their jobs. Should this process
+    # be killed, make gets a SIGTERM.
+    first = partial(_prctl, _DEATH_SIGNAL, signal.SIGTERM)  # before there is a thread
+    process = subprocess.Popen(command, env=environment, close_fds=False, preexec_fn=first)  # noqa: PLW1509
+    threading.Thread(target=watch, daemon=True).start()
     status = process.wait()
+    end_descendants()
     return status if status >= 0 else 128 - status
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(sys.argv[1], int(sys.argv[2])))

@@ -13,6 +13,7 @@ the root is the nearest folder upwards with ``data_manifest.yaml``::
       results/<run>/             results(run)
         NN_name.zarr ...         result(run, "NN_name", ".zarr")
         .NN_name.part.ipynb      unfinished(run, "NN_name")
+        .NN_name.sums            sums(run, "NN_name")
         NN_name/                 emulated(run, "NN_name")
       results/cells/NN_name/     cells("NN_name")
 """
@@ -95,9 +96,15 @@ def finished(run: str, stem: str) -> str:
     if (part := unfinished(run, stem)).exists():
         raise RuntimeError(
             f"Unfinished notebook '{stem}' of run '{run}': it is running, or was interrupted. Must "
-            f"have run to its end: run it again, or remove '{part}' and what it left."
+            f"have run to its end: 'make results/{run}/{stem}.ipynb', or remove '{part}' and what "
+            "it left."
         )
     return stem
+
+
+def sums(run: str, stem: str) -> Path:
+    """Checksums of all files that a notebook wrote."""
+    return results(run) / f".{_stem(stem)}.sums"
 
 
 def emulated(run: str, stem: str) -> Path:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import readers, store
-from reproduction import cache, manifest, parameters, paths
+from reproduction import cache, integrity, manifest, parameters, paths
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,14 +55,25 @@ class Run:
         self.provenance = store.provenance(values)
 
     def input(self, name: str, path: Path) -> Path:
-        """Path of an input, of which the provenance then holds the checksum."""
-        self.provenance["inputs"][name] = store.checksum(path)
+        """Path of an input, of which the provenance then holds the checksum; see `read`."""
+        with integrity.reading(path):
+            self.provenance["inputs"][name] = store.checksum(path)
         return path
 
+    def read(self, function: Callable[..., Any], path: Path, *args: Any, **options: Any) -> Any:
+        """What a function reads from a path; an error names the notebook that made it, if any."""
+        with integrity.reading(path):
+            return function(path, *args, **options)
+
     def open(self, stem: str, ending: str = "") -> xr.Dataset:
-        """Dataset of this run that another notebook saved; RuntimeError if that is unfinished."""
+        """Dataset of this run that another notebook saved.
+
+        RuntimeError if that is unfinished, or has left less: it names the target of make.
+        """
         path = paths.result(self.name, paths.finished(self.name, stem), f"{ending}.zarr")
-        return store.open_dataset(self.input(f"{stem}{ending}", path)).load()
+        self.input(f"{stem}{ending}", path)
+        dataset: xr.Dataset = self.read(lambda place: store.open_dataset(place).load(), path)
+        return dataset
 
     def data(self, collection: str) -> dict[str, Path]:
         """Verified outside files of a collection, name to path; empty if it is not available."""

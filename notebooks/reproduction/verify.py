@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal import store
-from reproduction import paper, paths
+from reproduction import integrity, paper, paths
 
 TOLERANCE: Final = 0.01
 """Largest difference of two numbers, relative to the larger of the two [1]."""
@@ -33,15 +33,24 @@ def reference_path() -> Path:
 def read_run(run: str) -> dict[str, Numbers]:
     """Headline numbers of every notebook of a run, stem -> name -> number.
 
-    RuntimeError if one of the notebooks is running or was interrupted, FileNotFoundError if all are
-    missing.
+    RuntimeError if one of the notebooks is running, was interrupted, or has left other numbers,
+    FileNotFoundError if all are missing.
     """
-    files = sorted(paths.results(run).glob("*.json"))
+    stems = [path.stem for path in paths.results(run).glob("[0-9][0-9]_*.ipynb")]
+    listed = {
+        file for stem in stems for file in integrity.files(run, stem) if file.suffix == ".json"
+    }
+    top = paths.results(run)
+    files = sorted({file for file in listed if file.parent == top} | {*top.glob("*.json")})
     if not files:
         raise FileNotFoundError(
             f"Missing numbers of run '{run}'. Must be made by 'make reproduce'."
         )
-    return {paths.finished(run, path.stem): store.read_numbers(path) for path in files}
+    numbers = {}
+    for path in files:
+        with integrity.reading(path):
+            numbers[paths.finished(run, path.stem)] = store.read_numbers(path)
+    return numbers
 
 
 def kind_of(numbers: Mapping[str, Numbers]) -> str:

@@ -1,5 +1,6 @@
 """Cache of experiments: a result is computed once, and again if code or file changed."""
 
+import zlib
 from pathlib import Path
 
 import joblib
@@ -53,7 +54,7 @@ def test_an_interruption_keeps_what_was_done(tmp_path: Path, marks: Path) -> Non
     assert calls(marks) == 3
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed", "no pickle"])
 def test_a_damaged_file_is_computed_again(
     tmp_path: Path, marks: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
@@ -70,6 +71,8 @@ def test_a_damaged_file_is_computed_again(
             path.write_bytes(whole[:place] + flipped + whole[place + 1 :])
         if damage == "removed":
             path.unlink()
+        if damage == "no pickle":  # whole for zlib
+            path.write_bytes(zlib.compress(b"spoilt"))
         xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
     assert calls(marks) == 1 + len(places)
     said = [record.getMessage() for record in caplog.records]

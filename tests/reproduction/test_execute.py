@@ -71,7 +71,7 @@ def test_what_an_earlier_run_left_goes_first(folder: Path, monkeypatch: pytest.M
     assert execute.execute("full", "03_tiny", {}) == folder / "03_tiny.ipynb"
     assert runner.seen == [".03_tiny.part.ipynb", "04_other.json"]
     names = sorted(path.name for path in folder.iterdir())
-    assert names == ["03_tiny.ipynb", "03_tiny.json", "04_other.json"]
+    assert names == [".03_tiny.sums", "03_tiny.ipynb", "03_tiny.json", "04_other.json"]
     assert (folder / "03_tiny.json").read_text() == "new"
 
 
@@ -86,7 +86,7 @@ def test_results_are_on_the_disk_before_the_name_is(
         store, "to_disk", lambda places: synced.extend((place, named.exists()) for place in places)
     )
     execute.execute("full", "03_tiny", {})
-    for name in ("03_tiny.json", ".03_tiny.part.ipynb"):
+    for name in ("03_tiny.json", ".03_tiny.sums", ".03_tiny.part.ipynb"):
         assert (folder / name, False) in synced
     assert synced[-1] == (folder, True)
 

@@ -1,13 +1,16 @@
 """Tasks of the Makefile, in a small checkout of its own: killed, two at a time, odd names."""
 
+import fcntl
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import nbformat
@@ -41,6 +44,16 @@ def script(path: Path, text: str) -> Path:
     return path
 
 
+def write_notebook(root: Path, stem: str, text: str) -> None:
+    """Make a notebook of two cells, and its parameters."""
+    small = nbformat.v4.new_code_cell('results = "smoke"\nnumber = 1')
+    small.metadata["tags"] = ["parameters"]
+    notebook = nbformat.v4.new_notebook(cells=[small, nbformat.v4.new_code_cell(text)])
+    notebook.metadata.kernelspec = {"name": "python3", "language": "python", "display_name": ""}
+    nbformat.write(notebook, root / f"notebooks/{stem}.ipynb")
+    (root / f"params/{stem}.yaml").write_text("results: full\nnumber: 2\n")
+
+
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Checkout with one notebook, which waits while the file `hold` is there; its name is odd."""
@@ -49,13 +62,8 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copy(ROOT / "Makefile", root)
     for name in ("data_manifest.yaml", "pyproject.toml", "requirements.lock"):
         (root / name).touch()
-    small = nbformat.v4.new_code_cell('results = "smoke"\nnumber = 1')
-    small.metadata["tags"] = ["parameters"]
-    notebook = nbformat.v4.new_notebook(cells=[small, nbformat.v4.new_code_cell(NOTEBOOK)])
-    notebook.metadata.kernelspec = {"name": "python3", "language": "python", "display_name": ""}
-    nbformat.write(notebook, root / "notebooks/01_tiny.ipynb")
     (root / "params/recorded").mkdir(parents=True)
-    (root / "params/01_tiny.yaml").write_text("results: full\nnumber: 2\n")
+    write_notebook(root, "01_tiny", NOTEBOOK)
     packages = f'PYTHONPATH="$PYTHONPATH:{ROOT}" exec {sys.executable} "$@"'
     script(root / ".venv/bin/python", packages)
     (root / ".venv/share/ipython").mkdir(parents=True)
@@ -124,50 +132,110 @@ def test_a_killed_notebook_runs_again(checkout: Path, started: Start) -> None:
     assert again.returncode == 0, again.stderr
     assert numbers(checkout) == {"number": 2}
     assert sorted(path.name for path in (checkout / "results/full").iterdir()) == [
+        ".01_tiny.sums",
         "01_tiny.ipynb",
         "01_tiny.json",
     ]
     assert "up to date" in make(TARGET).stdout
 
 
+SIGNALS = {name: getattr(signal, f"SIG{name}") for name in ("TERM", "INT", "HUP", "KILL")}
+
+
+def wait_for_end(root: Path, process: "subprocess.Popen[bytes]", numbers: list[int]) -> None:
+    """Wait until a make and all that it started are no more, and its lock is free."""
+    process.wait(60)
+    end = time.monotonic() + 60
+    with (root / locked.LOCK).open() as file:
+        while True:
+            with suppress(BlockingIOError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not {*numbers} & {*locked.descendants(0)}:
+                    return
+            assert time.monotonic() < end, numbers
+            time.sleep(0.05)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("victim", "moment"),
-    [
-        ("kernel", "01_tiny.json"),
-        *((victim, ".01_tiny.part.ipynb") for victim in ("make", "group", "ctrl-c", "terminate")),
-        *((victim, "01_tiny.json") for victim in ("make", "ctrl-c", "terminate")),
-    ],
-)
+@pytest.mark.parametrize("moment", [".01_tiny.part.ipynb", "01_tiny.json"])
+@pytest.mark.parametrize("victim", [*SIGNALS, "ctrl-c", "group", "kernel"])
 def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment: str) -> None:
     """Without make, the runner or the kernel nothing goes on, and the next make does all anew."""
     (checkout / "hold").touch()
     process = started(TARGET)
-    wait_for(checkout / "results/full" / moment)
+    wait_for(checkout / "results/full" / (moment if victim != "kernel" else "01_tiny.json"))
+    running = locked.descendants(process.pid)
+    assert len(running) >= 3
     if victim == "kernel":
-        (kernel,) = kernels(checkout)
-        os.kill(kernel, signal.SIGKILL)
-    elif victim in {"make", "terminate"}:
-        process.send_signal(signal.SIGKILL if victim == "make" else signal.SIGTERM)
+        os.kill(int((checkout / "kernels").read_text()), signal.SIGKILL)
+    elif victim in SIGNALS:
+        process.send_signal(SIGNALS[victim])
     else:
         os.killpg(process.pid, signal.SIGINT if victim == "ctrl-c" else signal.SIGKILL)
-    assert process.wait(60) != 0
+    wait_for_end(checkout, process, running)
+    assert process.returncode != 0
     (checkout / "hold").unlink()
     assert not (checkout / TARGET).exists()
     again = make(TARGET)
     assert again.returncode == 0, again.stderr
     assert numbers(checkout) == {"number": 2}
-    assert not kernels(checkout)
 
 
-def kernels(root: Path) -> list[int]:
-    """Process numbers of the kernels of a checkout that still run."""
-    states = {}
-    for number in (root / "kernels").read_text().split():
-        command = ["ps", "-o", "stat=", "-p", number]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        states[int(number)] = done.stdout.strip()
-    return [number for number, state in states.items() if state and not state.startswith("Z")]
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(40))
+def test_killed_at_any_moment(checkout: Path, started: Start, seed: int) -> None:
+    """Ten random moments of each signal: all ends, and the next make goes on to the end."""
+    rng, name = random.Random(seed), [*SIGNALS][seed % 4]
+    process = started(TARGET)
+    time.sleep(rng.uniform(0.0, 12.0))  # the whole takes some ten seconds
+    running = locked.descendants(process.pid)
+    process.send_signal(SIGNALS[name])
+    start = time.monotonic()
+    wait_for_end(checkout, process, running)
+    print(f"{name} to {len(running)} processes: all ended after {time.monotonic() - start:.1f} s")
+    again = make(TARGET)
+    assert again.returncode == 0, again.stderr
+    assert numbers(checkout) == {"number": 2}
+
+
+MAKER = """\
+import xarray as xr
+from reproduction.run import Run
+
+run = Run("01_calibration", globals())
+run.save(xr.Dataset({"counts": ("time", range(50))}), "_response")
+run.finish({"frames": 50})
+"""
+READER = """\
+from reproduction.run import Run
+
+run = Run("02_emissivity", globals())
+read = run.open("01_calibration", "_response")
+run.finish({"sum": int(read["counts"].sum())})
+"""
+
+
+@pytest.mark.slow
+def test_what_is_spoilt_is_mended(checkout: Path) -> None:
+    """A reader names the notebook of a spoilt input; the next make makes both, by itself."""
+    (checkout / "notebooks/01_tiny.ipynb").unlink()
+    for stem, text in (("01_calibration", MAKER), ("02_emissivity", READER)):
+        write_notebook(checkout, stem, text)
+    assert make("reproduce").returncode == 0
+    folder = checkout / "results/full"
+    (folder / "01_calibration_response.zarr/counts/c/0").write_bytes(b"spoilt")
+    (folder / "02_emissivity.ipynb").unlink()
+    failed = make("full")
+    assert failed.returncode == 2
+    assert "'make results/full/01_calibration.ipynb'" in failed.stderr + failed.stdout
+    assert make("reproduce").returncode == 0
+    path = folder / "02_emissivity.json"
+    numbers = json.loads(path.read_text())["numbers"]
+    path.unlink()
+    mended = make("reproduce")
+    assert mended.returncode == 0
+    assert f"Missing file '{path}'. The notebook is run again." in mended.stderr
+    assert json.loads(path.read_text())["numbers"] == numbers
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,29 +286,64 @@ def test_values_are_refused(
     assert not (checkout / "results").exists()
 
 
-def test_an_interrupted_install_is_done_anew(checkout: Path, started: Start) -> None:
-    """What a killed pip left goes, for pip would take it for whole; `installed` comes last."""
-    shutil.rmtree(checkout / ".venv")
-    # A Python whose environment has a pip that first leaves half a package, and then succeeds.
-    pip = 'if test -e hold; then mkdir -p .venv/lib/half; sleep 60; else echo "$@" >> calls; fi'
+@pytest.fixture
+def python(checkout: Path) -> str:
+    """Setting of a Python that makes environments whose pip does what the file `pip` says."""
+    pip = 'if test "$2" = pip; then echo "$@" >> calls; . ./pip; fi'
     venv = f"mkdir -p .venv/bin; printf '#!/bin/sh\\n%s\\n' '{pip}' > .venv/bin/python"
-    python = script(
+    script(
         checkout / "fake python",
         f'if test "$2" = venv; then {venv}; chmod +x .venv/bin/python\n'
         f'else exec {sys.executable} "$@"; fi',
     )
-    (checkout / "hold").touch()
-    process = started("install", f"PYTHON=./{python.name}")
-    wait_for(checkout / ".venv/lib/half")
+    return "PYTHON=./fake python"
+
+
+def state(root: Path) -> dict[str, int]:
+    """Files of the environment but that of the fake pip, with their times [ns]."""
+    every = (one for one in root.glob(".venv/**/*") if one.name not in {"bin", "python", "lib"})
+    return {one.name: one.stat().st_mtime_ns for one in every if one.is_file()}
+
+
+def test_an_update_that_fails_leaves_the_environment(checkout: Path, python: str) -> None:
+    """Without a network an older environment stays whole, however often it is tried."""
+    script(checkout / ".venv/lib/package", "")
+    os.utime(checkout / ".venv/installed", (1e9, 1e9))
+    before = state(checkout)
+    for pip in ("exit 1", "mkdir -p .venv/lib && exit 2"):
+        (checkout / "pip").write_text(pip)
+        failed = make("check", python)
+        assert failed.returncode == 2
+        assert ".venv is not up to date, and as it was" in failed.stderr
+        assert state(checkout) == before
+    (checkout / "pip").write_text("exit 0")
+    assert make("install", python).returncode == 0
+    assert state(checkout).keys() == before.keys()
+    assert state(checkout)["installed"] > before["installed"]
+    assert "is up to date" not in make("install", python).stderr
+
+
+def test_an_interrupted_install_is_done_anew(
+    checkout: Path, python: str, started: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    """What a killed pip left is put aside until a new environment is whole, then it goes."""
+    (checkout / "pip").write_text("mkdir -p .venv/lib/half; touch .venv/lib/half/file; sleep 60")
+    os.utime(checkout / ".venv/installed", (1e9, 1e9))
+    process = started("install", python)
+    wait_for(checkout / ".venv/lib/half/file")
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    assert not (checkout / ".venv/installed").exists()
-    (checkout / "hold").unlink()
-    done = make("install", f"PYTHON=./{python.name}")
+    assert state(checkout).keys() == {"installing", "file"}
+    for _ in range(2):  # without a network
+        (checkout / "pip").write_text("exit 1")
+        assert make("install", python).returncode == 2
+        assert state(checkout).keys() == {"installing", "file"}
+    (checkout / "pip").write_text("exit 0")
+    (checkout / "calls").unlink()
+    done = make("install", python)
     assert done.returncode == 0, done.stderr
-    assert not (checkout / ".venv/lib/half").exists()
-    assert (checkout / ".venv/installed").exists()
-    assert not (checkout / ".venv/installing").exists()
+    assert state(checkout).keys() == {"installed"}
+    assert not (checkout / ".venv-interrupted").exists()
     assert len((checkout / "calls").read_text().splitlines()) == 2  # pip itself, then the packages
 
 

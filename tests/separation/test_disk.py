@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -140,6 +141,30 @@ def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> No
             separation.run(source, target, RIG.response(), memory=MEMORY, executor=one)
     results = [store.open_dataset(tmp_path / f"{name}.zarr").load() for name in ("folder", "lazy")]
     xr.testing.assert_equal(*results)
+
+
+@pytest.mark.parametrize("kind", ["folder", "zarr", "dask", "memory"])
+def test_a_source_of_other_values_is_another(path: Path, tmp_path: Path, kind: str) -> None:
+    """Warmer in a single pixel it is separated anew; the same again is left, for any memory."""
+    capture, target = store.open_dataset(path).isel(y=slice(12)).load(), tmp_path / "result.zarr"
+    source = tmp_path / "capture.zarr"
+    for warmer in (0.0, 500.0):  # count
+        capture["counts"][..., 5, 7] += warmer
+        store.save(capture, source, {})
+        sources: dict[str, Callable[[], Any]] = {
+            "folder": lambda: source,
+            "zarr": lambda: store.open_dataset(source),
+            "dask": lambda: dask_backed(source),
+            "memory": lambda: capture,
+        }
+        opened = sources[kind]
+        separation.run(opened(), target, RIG.response(), memory=MEMORY)
+        made = (target / "zarr.json").stat().st_mtime_ns
+        separation.run(opened(), target, RIG.response())
+        assert (target / "zarr.json").stat().st_mtime_ns == made
+        expected = separation.solve(capture, RIG.response())
+        result = store.open_dataset(target).load()
+        xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
 
 
 @pytest.mark.parametrize("rows", [16, 41, 1, 3, (5, 13, 23)], ids=str)

@@ -3,15 +3,13 @@
 Planes (y, x) are in single precision, and the loops along a row are taken many pixels at once.
 """
 
-from collections.abc import Callable
-from contextlib import suppress
 from math import sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from dbthermal._compiled import kept
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._known_emissivity import AGREE
@@ -19,6 +17,8 @@ from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import Table, allocating
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
+
+_entered: Final = kept(**kernels.ALLOCATING)
 
 Planes = npt.NDArray[np.float32]
 
@@ -141,8 +141,8 @@ def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
         number[x] += _ONE if good else _ZERO
 
 
-@allocating
-def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
+@_entered
+def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
     """
     Means (band, y, x) of frames (band, frame, y, x) [count], in place; NaN of less than half.
 
@@ -346,8 +346,8 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
     _object(camera, found, pixel, noise, variance, (first, last), line, x)
 
 
-@allocating
-def _emit(
+@_entered
+def emit(
     block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
 ) -> None:
     """Films of the frames of one mean, and in the status the calibrated range, in place.
@@ -367,27 +367,3 @@ def _emit(
                 films[film, f, y] = out[film]
         for x in range(films.shape[3]):
             result.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)
-
-
-def _kept(digest: str) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Both functions, compiled once for sources of one digest; see `fused`."""
-
-    @njit(nogil=True, error_model="numpy")
-    def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
-        if digest:
-            _absorb(frames, mean, top, stop)
-
-    @njit(nogil=True, error_model="numpy")
-    def emit(
-        block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
-    ) -> None:
-        if digest:
-            _emit(block, fit, camera, fine, result, top, stop)
-
-    with suppress(RuntimeError):  # without a folder that may be written each process compiles
-        absorb.enable_caching()
-        emit.enable_caching()
-    return absorb, emit
-
-
-absorb, emit = _kept(kernels.DIGEST)

@@ -4,8 +4,6 @@ The equations and choices of `pieces.divide`. In two bands the part of a signal 
 one number, along the normal n: of a scatter the energy :math:`n^T S n`.
 """
 
-from collections.abc import Callable
-from contextlib import suppress
 from functools import lru_cache
 from math import acos, sqrt
 from typing import Final, NamedTuple
@@ -345,38 +343,27 @@ def _turn(signals: Array, noise: Array, white: Array) -> None:
                 white[p, band, t] = signals[band, t, p] / noise[band]
 
 
-def _compiled(digest: str) -> Callable[..., None]:
-    """Divisions of all pixels of a tile, compiled once for sources of one digest."""
-
-    @kernels.entered
-    def divide(
-        tree: Tree,
-        signals: Array,
-        noise: Array,
-        ratio: Array,
-        scratch: Scratch,
-        first: Mask,
-        cost: Array,
-    ) -> None:
-        if not digest:  # a constant of the compiled code, which is kept with it
-            return
-        begins, block = scratch.begins, len(scratch.white)
-        for start in range(0, signals.shape[2], block):
-            _turn(signals[:, :, start : start + block], noise, scratch.white)
-            for p in range(start, min(start + block, signals.shape[2])):
-                white = scratch.white[p - start]
-                _pixel(tree, scratch, white, ratio[p] * noise[0] / noise[1], begins)
-                for rank in range(2):
-                    best = 0
-                    for number in range(1, pieces.AXES):
-                        if scratch.costs[number] < scratch.costs[best]:
-                            best = number
-                    cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
-                    kernels.copy(begins[best], first[rank, p])
-
-    with suppress(RuntimeError):  # without a folder that may be written each process compiles
-        divide.enable_caching()
-    return divide
-
-
-_divide: Final = _compiled(kernels.DIGEST)
+@kernels.entered
+def _divide(
+    tree: Tree,
+    signals: Array,
+    noise: Array,
+    ratio: Array,
+    scratch: Scratch,
+    first: Mask,
+    cost: Array,
+) -> None:
+    """Divisions of all pixels of a tile."""
+    begins, block = scratch.begins, len(scratch.white)
+    for start in range(0, signals.shape[2], block):
+        _turn(signals[:, :, start : start + block], noise, scratch.white)
+        for p in range(start, min(start + block, signals.shape[2])):
+            white = scratch.white[p - start]
+            _pixel(tree, scratch, white, ratio[p] * noise[0] / noise[1], begins)
+            for rank in range(2):
+                best = 0
+                for number in range(1, pieces.AXES):
+                    if scratch.costs[number] < scratch.costs[best]:
+                        best = number
+                cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
+                kernels.copy(begins[best], first[rank, p])

@@ -3,8 +3,7 @@ r"""Steps 1 to 4 of `method` for two bands, one pixel after another, compiled.
 The equations of `steps`, whose results are repeated within rounding.
 """
 
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -180,40 +179,29 @@ def _return(turned: Any, places: Whole, samples: Any) -> None:
                 row[np.uintp(places[p])] = turned[p, kind, t]
 
 
-def _compiled(digest: str) -> Callable[..., None]:
-    """Steps of some pixels of a tile, compiled once for sources of one digest."""
-
-    @kernels.entered
-    def separate(
-        model: Model,
-        signals: Array,
-        places: Whole,
-        materials: Array,
-        least: float,
-        work: Work,
-        solved: Solved,
-    ) -> None:
-        if not digest:  # a constant of the compiled code, which is kept with it
-            return
-        inside, outside, pixels = work.inside, work.outside, places.size
-        block = len(inside)
-        for start in range(0, pixels, block):
-            together = places[start : start + block]
-            _turn(signals, together, inside)
-            for p in range(together.size):
-                here = np.uintp(together[p])
-                kernels.copy(inside[p, 0], work.first)
-                kernels.copy(inside[p, 1], work.second)
-                kernels.copy(materials[here], work.material)
-                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[..., here])
-            _return(outside, together, solved.films)
-
-    with suppress(RuntimeError):  # without a folder that may be written each process compiles
-        separate.enable_caching()
-    return separate
-
-
-_separate: Final = _compiled(kernels.DIGEST)
+@kernels.entered
+def _separate(
+    model: Model,
+    signals: Array,
+    places: Whole,
+    materials: Array,
+    least: float,
+    work: Work,
+    solved: Solved,
+) -> None:
+    """Steps of some pixels of a tile."""
+    inside, outside, pixels = work.inside, work.outside, places.size
+    block = len(inside)
+    for start in range(0, pixels, block):
+        together = places[start : start + block]
+        _turn(signals, together, inside)
+        for p in range(together.size):
+            here = np.uintp(together[p])
+            kernels.copy(inside[p, 0], work.first)
+            kernels.copy(inside[p, 1], work.second)
+            kernels.copy(materials[here], work.material)
+            _pixel(model, least, work, outside[p], solved.record[here], solved.sums[..., here])
+        _return(outside, together, solved.films)
 
 
 def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:

@@ -4,10 +4,8 @@ A pixel's curves stay in the processor's cache, and a step costs what its sums c
 for arrays in `response` is repeated within rounding.
 """
 
-import hashlib
 from collections.abc import Callable
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -16,6 +14,7 @@ from numpy.polynomial import Chebyshev
 
 from dbthermal import planck
 from dbthermal._arrays import Array
+from dbthermal._compiled import kept
 from dbthermal.response import Curve, LinearCurve
 from dbthermal.separation import _tiles as tiles
 
@@ -29,20 +28,17 @@ _TRIED: Final = (
     *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
 )
 
-_SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), Path(tiles.__file__)]
-DIGEST: Final = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_SOURCES))).hexdigest()
-"""Of the sources, with which compiled code is kept."""
-
 # Nothing is allocated within: to count references to the parts of arrays takes a fifth of the time.
 _OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-entered: Final[Callable[..., Any]] = njit(**_OPTIONS)
+entered: Final[Callable[..., Any]] = kept(**_OPTIONS)
 """Decorator of compiled functions that are called from outside."""
 
 # Sums may be taken in any order; NaN stays NaN.
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
 compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
 """Decorator of functions that are compiled into those that call them."""
-allocating: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS | {"_nrt": True})
+ALLOCATING: Final[dict[str, Any]] = _OPTIONS | {"fastmath": _FLAGS, "_nrt": True}
+allocating: Final[Callable[..., Any]] = njit(**ALLOCATING)
 """As `compiled`, for functions that make arrays."""
 
 _WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}

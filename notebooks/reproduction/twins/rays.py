@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from numba import njit
 from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from dbthermal._compiled import kept
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -123,7 +124,7 @@ class Hits:
         return Hits(self.face[rays], self.distance[rays], self.weights[rays])
 
 
-@njit(nogil=True, error_model="numpy", cache=True)
+@kept(nogil=True, error_model="numpy")
 def _on_faces(
     face: npt.NDArray[np.int64], origins: Array, directions: Array, corners: Array
 ) -> tuple[Array, Array]:

@@ -12,9 +12,9 @@ from typing import Any, Final, cast
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from numba import njit
 from scipy.spatial.transform import Rotation
 
+from dbthermal._compiled import kept
 from reproduction.twins.rays import Array, Caster, Hits
 
 Rays = tuple[Array, Array]
@@ -86,7 +86,7 @@ def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | Non
     return Actor(cast("trimesh.Trimesh", whole), np.concatenate(warmth), motion)
 
 
-@njit(nogil=True, error_model="numpy", cache=True)
+@kept(nogil=True, error_model="numpy")
 def _approaching(rays: Rays, sphere: tuple[Array, float], pose: Rays, box: Rays) -> tuple[Any, ...]:
     """Numbers of the rays that meet a sphere and a box; their origins and directions in its frame.
 
