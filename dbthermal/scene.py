@@ -82,7 +82,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     Dataset
         As from `separation.separate`, on the first band's grid, and `reflection_shift`
         (axis, y, x) [pixel] where the cameras see reflections apart. Attributes of the alignment:
-        `clock`, `time_offset` and `time_offset_std` [s], `frames_lost`, `transform`. From a `target` it is lazy.
+        `clock`, `time_offset` and `time_offset_std` [s], `frames_lost`, `transform`. From a
+        `target` it is lazy.
 
     Warns
     -----

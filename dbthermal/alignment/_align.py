@@ -70,9 +70,10 @@ def align(
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
         much interpolation in time and over pixels lessens the noise, root mean square;
         `pattern_std`, lessened over pixels. Attributes: `clock`, `time_offset` (of each band) [s],
-        `time_offset_std` [s] where the images tell it, `frames_lost` (of each band), `pauses` (times of the frames before and after each gap of
-        more than 20 frame periods, in turn) [s], `transform` (the matrices, row by row). Other
-        variables over `time`, as `exposure_time` and `drift`, are dropped.
+        `time_offset_std` [s] where the images tell it, `frames_lost` (of each band), `pauses`
+        (times of the frames before and after each gap of more than 20 frame periods, in turn) [s],
+        `transform` (the matrices, row by row). Other variables over `time`, as `exposure_time` and
+        `drift`, are dropped.
 
     Warns
     -----
@@ -84,8 +85,8 @@ def align(
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no offset is found and none was stated, or a band's clock was set
-        while it ran: its stamps step, and the images go on as without the step.
+        If an argument is not as described, no offset is found and none was stated, or a band's
+        clock was set while it ran: its stamps step, and the images go on as without the step.
 
     Examples
     --------

@@ -134,18 +134,33 @@ def _compared(
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
     offset, field, left = _clocked(small, scale, together, resample)
-    field = None if field is None else _enlarged(field, corrected)
-    if field is None or not seen_apart(field):
+    wide = None if field is None else _enlarged(field, corrected)
+    if field is None or wide is None or not seen_apart(wide):
         return _at_one_place(corrected, options["search"])
+    # A false shift may go with a false delay: then one place and its clocks explain more.
+    try:
+        plain = _at_one_place(corrected, options["search"])
+        rival = _shift(resample(small, offset=plain.offset), scale)
+    except ValueError:
+        rival = None
+    if rival is not None and np.greater(*_explained(rival, field)):
+        return plain
     frame = clocks.frame_period(stamps[0])
     if left <= _PRECISION * frame:
-        return Comparison(offset, left, field)
+        return Comparison(offset, left, wide)
     off = f"{left / frame:.2g}" if np.isfinite(left) else "an unknown number of"
     doubt = (
         f"The offset found between the cameras' clocks may be off by {off} frames, more than "
         f"{_PRECISION:g}: what moves fast may be wrong without a flag. Give it [s] if known."
     )
-    return Comparison(offset, left, field, (doubt,))
+    return Comparison(offset, left, wide, (doubt,))
+
+
+def _explained(*fields: xr.Dataset) -> list[float]:
+    """Share of the others' energy that each of two shifts explains, in the pixels of both."""
+    known = np.all([one["known"].values for one in fields], axis=0)
+    sums = [one["energy"].values[:, known].sum(axis=1) for one in fields]
+    return [float(explained / max(energy, 1e-9)) for explained, energy in sums]
 
 
 def _clocked(

@@ -85,7 +85,7 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         rapidly, or the shift is beyond a third of the image.
     """
     names = [str(name) for name in schema.check_corrected(corrected)["counts"]["band"].values]
-    return shift_of(corrected, Scale.of_response(response, names))
+    return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _noise_factor(corrected: xr.Dataset) -> Array:
 
 
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
-    """Displacement as `reflection_shift`, of a capture with a scale of its bands."""
+    """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
     with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
         return _found(corrected, _Capture.of(corrected, scale))
 
@@ -153,8 +153,9 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
-            late, std = matching.delay(level, field.on(level.centres()), times)
+            late, std, energy = matching.delay(level, field.on(level.centres()), times)
             result = _result(corrected, capture, field, data, spread)
+            result["energy"] = ("part", "y", "x"), energy
             return result.assign_attrs(delay=late, delay_std=std)
 
 
