@@ -222,9 +222,6 @@ def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     values = flags.values
     shares = {"no_flag": float((values == 0).mean())}
-    bit = schema.Status.COMPLETED_FRAMES
-    if bit.label in str(flags.attrs["flag_meanings"]).split():
-        shares["no_flag_but_for_some_frames"] = float((values == bit).mean())
     for name in str(flags.attrs["flag_meanings"]).split():
         share = float(schema.has_flag(flags, name).mean())
         shares |= {name: share} if share else {}
