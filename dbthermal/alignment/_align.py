@@ -80,12 +80,12 @@ def align(
     UserWarning
         If an offset leaves no frame of a band; if the clocks of cameras apart seem to be off by
         more than a tenth of a frame still; if the images contradict an offset that was stated to
-        `readers.two_bands`, and are followed, or tell none, and it is kept.
+        `readers.two_bands`, and are followed.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, no offset is found and none was stated, or a band's
+        If an argument is not as described, no offset is found, or a band's
         clock was set while it ran: its stamps step, and the images go on as without the step.
 
     Examples

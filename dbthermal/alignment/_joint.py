@@ -65,7 +65,7 @@ def compare(
 
     The scale of the bands is by default that of their own changes. Cameras that may not stand
     `side_by_side` are taken to stand at one place. ValueError where nothing tells the clocks, as
-    `time_offset`, and none were stated.
+    `time_offset`.
     """
     names = [str(name) for name in corrected["band"].values]
     together = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
@@ -73,27 +73,21 @@ def compare(
         return Comparison(together, 0.0)
     for name in names[1:]:
         check(corrected, name, search)
-    stated = corrected.attrs.get("offset_by") == "caller"
-    said = f"The stated offset of the recordings, {corrected.attrs.get('offset')} s, is"
-    try:
-        if side_by_side:
-            result = _compared(corrected, scale, together, search=search, clock=clock, lazy=lazy)
-        else:
-            result = _at_one_place(corrected, search)
-    except ValueError as error:
-        if not stated:
-            raise
-        return Comparison(
-            together, np.nan, doubts=(f"{said} used and could not be checked: {error}",)
-        )
+    if side_by_side:
+        result = _compared(corrected, scale, together, search=search, clock=clock, lazy=lazy)
+    else:
+        result = _at_one_place(corrected, search)
+    if corrected.attrs.get("offset_by") != "caller" or not np.isfinite(result.std):
+        return result
     frame = clocks.frame_period(clocks.exposure_times(corrected)[0])
     off = float(result.offset.values[np.argmax(np.abs(result.offset.values))])
-    if not stated or not np.isfinite(result.std):
-        return result
     if abs(off) <= max(_PRECISION * frame, _SIGMAS * result.std):
         return replace(result, offset=together)
     told = f"by {off:.4f} +- {result.std:.4f} s, {off / frame:.2f} frames"
-    doubt = f"{said} contradicted by the images {told}, which are used. Give offset= to keep it."
+    doubt = (
+        f"The stated offset of the recordings, {corrected.attrs.get('offset')} s, is contradicted "
+        f"by the images {told}, which are followed. Give offset= [s] to align to keep it."
+    )
     return replace(result, doubts=(*result.doubts, doubt))
 
 

@@ -173,6 +173,22 @@ def test_times_that_are_wrong(scene: xr.Dataset) -> None:
     assert alignment.align(capture, offset=-3.0).attrs["time_offset"] == [0.0, -3.0]
 
 
+@pytest.mark.parametrize(("delay", "kept"), [(0.05, True), (0.4, False)])
+def test_a_stated_offset_is_kept_or_contradicted(
+    scene: xr.Dataset, delay: float, kept: bool
+) -> None:
+    """An offset that was stated at the import is kept within a tenth of a frame, or it warns."""
+    capture = recorded(scene, delay).assign_attrs(offset=0.0, offset_by="caller")
+    if kept:
+        assert alignment.align(capture).attrs["time_offset"] == [0.0, 0.0]
+        return
+    with pytest.warns(UserWarning, match=r"stated offset .*, 0\.0 s, is contradicted by .*\+- 0"):
+        aligned = alignment.align(capture)
+    assert abs(aligned.attrs["time_offset"][1] - delay * PERIOD) < 0.04 * PERIOD
+    assert aligned.attrs["time_offset_std"] < 0.04 * PERIOD
+    assert alignment.align(capture, offset=0.0).attrs["time_offset"] == [0.0, 0.0]
+
+
 def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
     """A step in both bands after a shutter event does not pull the offset to zero."""
     capture = recorded(scene, 1.5)
