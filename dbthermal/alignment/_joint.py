@@ -137,7 +137,8 @@ def _compared(
         rival = _shift(resample(small, offset=plain.offset), scale)
     except ValueError:
         rival = None
-    if rival is not None and np.greater(*_explained(rival, field)):
+    at_one, side_by_side = (0.0, 1.0) if rival is None else _explained(rival, field)
+    if at_one > side_by_side:
         return plain
     frame = clocks.frame_period(stamps[0])
     if left <= _PRECISION * frame:
@@ -150,11 +151,11 @@ def _compared(
     return Comparison(offset, left, wide, (doubt,))
 
 
-def _explained(*fields: xr.Dataset) -> list[float]:
+def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
     """Share of the others' energy that each of two shifts explains, in the pixels of both."""
     known = np.all([one["known"].values for one in fields], axis=0)
     sums = [one["energy"].values[:, known].sum(axis=1) for one in fields]
-    return [float(explained / max(energy, 1e-9)) for explained, energy in sums]
+    return tuple(float(explained / max(energy, 1e-9)) for explained, energy in sums)
 
 
 def _clocked(

@@ -191,7 +191,7 @@ def _lacking(result: xr.Dataset, blocks: list[slice]) -> Mask:
     lacking = empty(result[FILMS[0]].shape, np.bool_)
     for rows in blocks:
         films = [np.isnan(result[name].values[:, rows]) for name in FILMS]
-        np.logical_or(*films, out=lacking[:, rows])
+        lacking[:, rows] = np.any(films, axis=0)
         release()
     return lacking
 
