@@ -231,14 +231,6 @@ def test_what_parallax_costs() -> None:
     assert found[2.0] > 0.5  # [K]
 
 
-def test_parallax_looks_like_a_time_offset() -> None:
-    """A parallax of 2 pixels of the reflection is taken for an offset of at most half a frame."""
-    _, capture = parallax(2.0, np.random.default_rng(1))
-    offset = alignment.time_offset(capture)
-    print(f"reflection 2 pixels apart: {offset / 0.1:.2f} frames")
-    assert 0.1 < abs(offset) / 0.1 < 0.5
-
-
 def test_the_offset_is_that_of_registered_views() -> None:
     """The offset of views 3 pixels and 4/3 frames apart is found after their registration."""
     value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})

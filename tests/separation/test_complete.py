@@ -283,7 +283,7 @@ def test_black_gives_the_reading() -> None:
 
 
 def test_gaps_of_single_pixels(half: Case) -> None:
-    """Samples that a pixel alone lacks are bridged, known by frame, and right within their intervals."""
+    """Samples that a pixel alone lacks are bridged, known by frame, and within their intervals."""
     scene, capture, _ = half
     lost = capture.copy(deep=True)
     lost["counts"].values[1, [0, 50, 51, 52, 53, 54, 55, 120, 199], ::2] = np.nan
