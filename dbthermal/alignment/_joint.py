@@ -93,7 +93,6 @@ def compare(
 
 def _at_one_place(corrected: xr.Dataset, search: int) -> Comparison:
     """Clocks of cameras at one place, which all pixels tell, of registered views."""
-    corrected = _of_squares(corrected)
     names = [str(name) for name in corrected["band"].values]
     found = [measured_offset(corrected, name, search) for name in names[1:]]
     offsets = np.array([0.0, *(offset for offset, _ in found)])
