@@ -151,6 +151,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
             "noise": _of("band", "count", "noise, as used"),
+            "bridged": _of("time y x", "1", "sample bridged in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),
             "reflection_shift": _of("axis y x", "pixel", "shift of what is reflected", "float32"),
         },

@@ -168,6 +168,13 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
             said[f"{name}_shares"] = _shares(dataset[name])
     frames = ("frames_missing", "frames_bridged")
     said |= {name: round(dataset.attrs[name], 1) for name in frames if name in dataset.attrs}
+    found = {name: dataset.attrs.get(name) for name in ("time_offset", "time_offset_std")}
+    said |= {
+        f"{name}_s": np.round(one, 6).tolist() for name, one in found.items() if one is not None
+    }
+    said |= {"frames_lost": dataset.attrs["frames_lost"]} if "frames_lost" in dataset.attrs else {}
+    if "transform" in dataset.attrs and "y" in dataset.sizes:
+        said["view_shift_pixel"] = _view_shifts(dataset)
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
@@ -202,13 +209,19 @@ def _stage(dataset: xr.Dataset) -> str:
     return fitting[-1]
 
 
+def _view_shifts(dataset: xr.Dataset) -> dict[str, list[float]]:
+    """Rows down and columns to the right, by which each view shows the image's centre elsewhere."""
+    column, row = (0.5 * (dataset.sizes[dim] - 1) for dim in ("x", "y"))
+    matrices = np.reshape(dataset.attrs["transform"], (-1, 3, 3))
+    right, down, scale = (matrices @ [column, row, 1.0]).T
+    shifts = np.stack([down / scale - row, right / scale - column], axis=1).round(2)
+    return dict(zip(map(str, dataset["band"].values), shifts.tolist(), strict=True))
+
+
 def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     values = flags.values
     shares = {"no_flag": float((values == 0).mean())}
-    bit = schema.Status.COMPLETED_FRAMES
-    if bit.label in str(flags.attrs["flag_meanings"]).split():
-        shares["no_flag_but_for_some_frames"] = float((values == bit).mean())
     for name in str(flags.attrs["flag_meanings"]).split():
         share = float(schema.has_flag(flags, name).mean())
         shares |= {name: share} if share else {}

@@ -26,8 +26,10 @@ import xarray as xr
 
 from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
+from dbthermal import noise as noises
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
+from dbthermal.noise import MAD
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
@@ -120,7 +122,14 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     >>> round(time_offset(corrected), 2)  # the frame period is 0.1 s
     0.05
     """
-    place = _check(corrected, band, search)
+    return measured_offset(corrected, band, search)[0]
+
+
+def measured_offset(
+    corrected: xr.Dataset, band: str | None = None, search: int = SEARCH
+) -> tuple[float, float]:
+    """Delay as `time_offset`, and its standard deviation by the jackknife [s]."""
+    place = check(corrected, band, search)
     pair = corrected.isel(band=[0, place])
     signals, stamps = sample(pair), clocks.exposure_times(pair)
     clocks.require_steady(stamps, [str(name) for name in pair["band"].values])
@@ -164,14 +173,14 @@ def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
     if np.isfinite(stamps).sum(axis=1).min() < _MINIMUM_FRAMES:
         return np.nan
     try:
-        return _offset(pair, signals, stamps, search)
+        return _offset(pair, signals, stamps, search)[0]
     except ValueError:
         return np.nan
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
-    """Offset of two bands [s], of signals (band, time, pixel) [count] at stamps (band, time)."""
+def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tuple[float, float]:
+    """Offset of two bands and its deviation [s], of their signals at their stamps."""
     names = [str(name) for name in pair["band"].values]
     start = [row[np.isfinite(row)][0] for row in stamps]
     times = f"times begin at {start[1]:.4g} and {start[0]:.4g} s"
@@ -190,11 +199,12 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> flo
             f"Invalid time offset {label}: {delays[0]:.2f} +- {std:.2f} frames. Must be known "
             f"within {_PRECISION}: too little moves, or in too few pixels; give offset= [s]."
         )
-    return float(delays[0] * clocks.frame_period(shared.times))
+    period = clocks.frame_period(shared.times)
+    return float(delays[0] * period), float(std * period)
 
 
-def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
-    """Position of the band."""
+def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
+    """Position of a band whose offset is to be found, which is checked with the capture."""
     counts = schema.check(corrected, "corrected")["counts"]
     names = [str(name) for name in counts["band"].values]
     if len(names) < 2:
@@ -239,6 +249,22 @@ def sample(corrected: xr.Dataset) -> Array:
             "finite and change."
         )
     return counts[:, :, usable]
+
+
+def noise_levels(signals: Array, stamps: Array) -> Array:
+    """Noise of each band by second differences in time: in counts, and relative to its signal."""
+    levels = []
+    for frames, times in zip(signals, stamps, strict=True):
+        here = present(frames) & np.isfinite(times)
+        signal = frames[here]
+        rough = noises.second_difference(signal, times[here])
+        if not rough.size:  # too few frames to tell
+            levels.append((0.0, 0.0))
+            continue
+        scatter, change = MAD * np.median(np.abs(rough), axis=0), signal.std(axis=0)
+        relative = np.divide(scatter, change, out=np.zeros_like(change), where=change > 0)
+        levels.append((np.median(scatter), np.median(relative)))
+    return np.array(levels).T
 
 
 def present(frames: npt.NDArray[Any]) -> Mask:

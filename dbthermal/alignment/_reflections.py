@@ -20,7 +20,7 @@ from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
-from dbthermal.alignment._offset import sample
+from dbthermal.alignment._offset import noise_levels, sample
 from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image, at least
@@ -84,8 +84,52 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         If an input is not as described, the image is too small, nothing that both bands see changes
         rapidly, or the shift is beyond a third of the image.
     """
+    names = [str(name) for name in schema.check_corrected(corrected)["counts"]["band"].values]
+    return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Slope (band) [count/K] of each band, or another scale of its changes, and its noise."""
+
+    slopes: Array
+    noise: Array | None  # before the alignment (band) [K], estimated from the capture if None
+
+    @classmethod
+    def of_response(cls, response: xr.Dataset, names: list[str]) -> "Scale":
+        """Scale of a response, and of its noise if it states one."""
+        slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+        noise = responses.noise(response, names) / slopes if "noise" in response else None
+        return cls(slopes, noise)
+
+    @classmethod
+    def of_changes(cls, corrected: xr.Dataset) -> "Scale":
+        """Scale without a response: each band's own changes in time, each on its own clock."""
+        scatter, relative = noise_levels(sample(corrected), clocks.exposure_times(corrected))
+        if not np.all(relative > 0.0):
+            raise ValueError("Missing noise of the capture. Must be seen to match reflections.")
+        return cls(scatter / relative, relative / _noise_factor(corrected))
+
+    def noise_of(self, corrected: xr.Dataset) -> Array:
+        """Noise of a capture (band) [K]."""
+        if self.noise is not None:
+            return np.asarray(self.noise * _noise_factor(corrected))
+        signals = sample(corrected)
+        here = np.all(np.isfinite(signals), axis=(0, 2))
+        parts = [signal[here] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
+        return noises.estimate_bands(parts, corrected["time"].values[here])
+
+
+def _noise_factor(corrected: xr.Dataset) -> Array:
+    """Noise (band) [1] over that before the alignment."""
+    whole = np.ones(corrected.sizes["band"])
+    return np.asarray(corrected["noise_factor"].values if "noise_factor" in corrected else whole)
+
+
+def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
+    """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
     with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
-        return _found(corrected, _Capture.of(corrected, response))
+        return _found(corrected, _Capture.of(corrected, scale))
 
 
 def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
@@ -109,8 +153,9 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
-            late, std = matching.delay(level, field.on(level.centres()), times)
+            late, std, energy = matching.delay(level, field.on(level.centres()), times)
             result = _result(corrected, capture, field, data, spread)
+            result["energy"] = ("part", "y", "x"), energy
             return result.assign_attrs(delay=late, delay_std=std)
 
 
@@ -137,8 +182,8 @@ class _Capture:
     rough: npt.NDArray[np.intp]  # first of four frames that follow one another evenly
 
     @classmethod
-    def of(cls, corrected: xr.Dataset, response: xr.Dataset) -> "_Capture":
-        """Check a capture and its response."""
+    def of(cls, corrected: xr.Dataset, scale: Scale) -> "_Capture":
+        """Check a capture."""
         counts = schema.check_corrected(corrected)["counts"]
         names = [str(name) for name in counts["band"].values]
         if len(names) < 2:
@@ -148,8 +193,7 @@ class _Capture:
                 f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
                 f"at least {SMALLEST} of each to match reflections."
             )
-        slopes = np.array([responses.curve(response, name).reference_slope for name in names])
-        noise = _noise(corrected, response, names, slopes)
+        slopes, noise = scale.slopes, scale.noise_of(corrected)
         order = np.argsort(noise, kind="stable")
         valid = np.ones(counts.shape[2:], dtype=bool)
         if "status" in corrected:
@@ -290,17 +334,6 @@ def _rapid(signal: Array, smoothing: Array) -> Array:
     flat = signal.reshape(-1, signal.shape[-1]).T
     flat = flat - flat.mean(axis=0)
     return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
-
-
-def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str], slopes: Array) -> Array:
-    """Noise (band) [K], of the response or else of the capture."""
-    if "noise" in response:
-        factor = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
-        return np.asarray(responses.noise(response, names) / slopes * factor)
-    signals = sample(corrected)
-    here = np.all(np.isfinite(signals), axis=(0, 2))
-    parts = [signal[here] / slope for signal, slope in zip(signals, slopes, strict=True)]
-    return noises.estimate_bands(parts, corrected["time"].values[here])
 
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:

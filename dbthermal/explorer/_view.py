@@ -216,6 +216,7 @@ class View:
         ----------
         pixels : {"unflagged", "measured", "all"}
             Those without a flag and those that were completed; those without a flag; every one.
+            Of measured pixels samples that were bridged in time do not count, either.
         """
         if pixels not in get_args(Pixels):
             raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
@@ -293,7 +294,9 @@ class View:
         gain = self._common(pane, box, where)
         count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
-        parts = [self._part(pane, slice(at, at + count), box, where, gain) for at in starts]
+        at_once = [slice(at, at + count) for at in starts]
+        measured = pixels == "measured"
+        parts = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
         values = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         units = {"units": pane.units}
         result = xr.Dataset(
@@ -324,10 +327,20 @@ class View:
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
 
     def _part(
-        self, pane: Pane, frames: slice, box: tuple[slice, ...], where: Mask, gain: Array | None
+        self,
+        pane: Pane,
+        frames: slice,
+        box: tuple[slice, ...],
+        where: Mask,
+        gain: Array | None,
+        *,
+        measured: bool,
     ) -> dict[str, Array]:
         """Statistics of some frames of a region, at the pixels of its box that count."""
         values = pane.read(frames, *box)[:, where]
+        if measured and "bridged" in self.data and pane.name.removesuffix("_std") in FILMS:
+            bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
+            values = np.where(bridged[:, where], np.float32(np.nan), values)
         result = statistics(values)
         std = common = np.full(values.shape, np.nan)
         if pane.name.startswith("input "):

@@ -18,7 +18,7 @@ REASONS: Final = MappingProxyType(
         "completed_from_prior": ("completed, by a library's or stated emissivity", "#8e4585"),
         "completed_from_material": ("completed, by the same material elsewhere", "#d6619b"),
         "completed_from_surroundings": ("completed, by the surroundings", "#e78ac3"),
-        "completed_frames": ("some frames completed", "#f7cfe2"),
+        "completed_frames": ("many frames completed", "#f7cfe2"),
         "dead_pixel": ("dead pixel", "#000000"),
         "saturated": ("saturated", "#4d4d4d"),
         "invalid_samples": ("no samples, as outside a view", "#737373"),
@@ -86,12 +86,8 @@ def status(result: xr.Dataset) -> Figure:
         for words, color in [REASONS.get(name, _GOOD)]
     ]
     right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
-    frames = shares["completed_frames"]
-    completed = (
-        sum(share for name, share in shares.items() if name.startswith("completed")) - frames
-    )
+    completed = sum(share for name, share in shares.items() if name.startswith("completed"))
     good = f"{percent(shares[''])} of the pixels have no flag"
-    good += f", {percent(frames)} but for some frames" if frames else ""
     good += f", {percent(completed)} are completed" if completed else ""
     figure.suptitle(f"Status: {good}{provenance_note(result)}", fontsize="medium")
     return figure

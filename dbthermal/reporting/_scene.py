@@ -189,7 +189,8 @@ def _regions(
         rows.append([region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), std])
     yield table(head, rows)
     yield (
-        "Of a region only measured pixels count: none with a flag, and none that was completed. "
+        "Of a region only measured pixels and frames count: no pixel with a flag or completed, "
+        "and no frame of a pixel that was bridged in time. "
         "Errors that the pixels of a region share are not lessened by their number."
     )
 
@@ -217,12 +218,10 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
 
 def _validity(view: View) -> dict[str, float]:
     """Share of the pixels that are measured, completed, without a value, and with each flag."""
-    frames = int(Status.COMPLETED_FRAMES)
-    completed = (view.status & int(schema.COMPLETED) & ~np.uint32(frames)) != 0
+    completed = (view.status & int(schema.COMPLETED)) != 0
     film, _ = sampled(view, "object_temperature", VIEWED, VIEWED * 200_000)
     shares = {
         "no_flag": float(np.mean(view.status == 0)),
-        "no_flag_but_for_some_frames": float(np.mean(view.status == frames)),
         "completed": float(completed.mean()),
         "without_value": float(film.isnull().all("time").mean()),
     }
@@ -246,7 +245,6 @@ def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
     meaning = {bit.label: bit.meaning for bit in Status}
     words = {
         "no_flag": "measured, and nothing speaks against it",
-        "no_flag_but_for_some_frames": "measured, and frames that it alone lacks are bridged",
         "completed": "not measured here, but completed from what else is known",
         "without_value": "no object temperature at any time",
     }

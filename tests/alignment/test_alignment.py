@@ -6,11 +6,9 @@ import xarray as xr
 from captures import drop_frames, still
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import BarycentricInterpolator, CubicSpline
+from scipy.interpolate import BarycentricInterpolator
 
 from dbthermal import alignment, separation, simulation
-from dbthermal._arrays import Mask
-from dbthermal.alignment import _clocks as clocks
 from dbthermal.simulation import Background, Rig, expose
 
 RIG = Rig()
@@ -19,7 +17,7 @@ PERIOD = 0.1
 FINE = np.arange(STEPS * (FRAMES + 10)) * PERIOD / STEPS
 
 
-def repeat_frames(capture: xr.Dataset, lost: Mask) -> xr.Dataset:
+def repeat_frames(capture: xr.Dataset, lost: np.ndarray) -> xr.Dataset:
     """Capture in which each lost frame (band, time) is a copy of the one before, unstamped."""
     counts = capture["counts"].copy(deep=True)
     for band, frame in np.argwhere(lost):
@@ -171,6 +169,22 @@ def test_times_that_are_wrong(scene: xr.Dataset) -> None:
     print(f"found {found:.4f} s, true -3 s")
     assert abs(found + 3.0) < 0.1 * PERIOD
     assert alignment.align(capture, offset=-3.0).attrs["time_offset"] == [0.0, -3.0]
+
+
+@pytest.mark.parametrize(("delay", "kept"), [(0.05, True), (0.4, False)])
+def test_a_stated_offset_is_kept_or_contradicted(
+    scene: xr.Dataset, delay: float, kept: bool
+) -> None:
+    """An offset that was stated at the import is kept within a tenth of a frame, or it warns."""
+    capture = recorded(scene, delay).assign_attrs(offset=0.0, offset_by="caller")
+    if kept:
+        assert alignment.align(capture).attrs["time_offset"] == [0.0, 0.0]
+        return
+    with pytest.warns(UserWarning, match=r"stated offset .*, 0\.0 s, is contradicted by .*\+- 0"):
+        aligned = alignment.align(capture)
+    assert abs(aligned.attrs["time_offset"][1] - delay * PERIOD) < 0.04 * PERIOD
+    assert aligned.attrs["time_offset_std"] < 0.04 * PERIOD
+    assert alignment.align(capture, offset=0.0).attrs["time_offset"] == [0.0, 0.0]
 
 
 def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
@@ -394,33 +408,6 @@ def test_a_wave_keeps_its_crests(missing: int | None) -> None:
     assert error.max() < 0.3 * before.max()
 
 
-def test_a_step_does_not_swing() -> None:
-    """A curve would overshoot beside a sudden step: no sample there, and none of it in the rest."""
-    time = np.arange(40.0)
-    frames = np.sin(2.0 * np.pi * time[:, np.newaxis] / 8.0) + np.outer(time > 19.0, [0.0, 100.0])
-    present, segment, moved = np.ones(40, dtype=bool), np.zeros(40, dtype=np.intp), time + 0.5
-    result = np.empty_like(frames)
-    clocks.interpolation(time, present, moved, segment, 3.0).apply(frames, result, 2.0)
-    assert np.flatnonzero(np.isnan(result[:, 0])).tolist() == [39]
-    assert np.flatnonzero(np.isnan(result[:, 1])).tolist() == [18, 19, 20, 39]
-    np.testing.assert_allclose(result[:18, 1], result[:18, 0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(result[21:39, 1], result[21:39, 0] + 100.0, rtol=0, atol=1e-12)
-
-
-def test_lines_and_splines_are_what_is_expected() -> None:
-    """Of a random walk the line, of its integral the natural spline; growth is told from noise."""
-    nodes, wanted = np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([1.3])
-    np.testing.assert_allclose(clocks._expected(nodes, wanted, 1.0), [[0, 0.7, 0.3, 0]], atol=1e-9)
-    spline = CubicSpline(nodes[0], np.eye(4), bc_type="natural")(wanted)
-    np.testing.assert_allclose(clocks._expected(nodes, wanted, 3.0), spline, rtol=0, atol=1e-9)
-    limit = [clocks._expected(nodes, wanted, growth) for growth in (1.999, 2.0, 2.001)]
-    np.testing.assert_allclose(limit[::2], [limit[1]] * 2, atol=1e-4)
-    noise = np.random.default_rng(1).normal(size=(2, 4000, 50))
-    assert clocks.growth(np.cumsum(noise[0], axis=0) + noise[1]) == pytest.approx(1.0, abs=0.1)
-    wave = 30.0 * np.sin(np.arange(4000.0) / 5.0)
-    assert clocks.growth(wave[:, np.newaxis] + noise[1]) == pytest.approx(3.9, abs=0.1)
-
-
 def test_gaps_are_not_bridged() -> None:
     """NaN frames, copies and holes in the stamps stay holes, and only the frames next to them."""
     capture = ramp()
@@ -528,18 +515,6 @@ def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
     offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
     with pytest.raises(ValueError, match="Invalid units 'ms' of the time offset"):
         alignment.align(capture, offset=offset.assign_attrs(units="ms"))
-
-
-def test_frames_beside_lost_ones_are_not_bridged() -> None:
-    """The frame period is that of the slots: with most stamps lost, no pause counts as a step."""
-    time = np.arange(400) / 10.0
-    stamps = np.where(np.random.default_rng(1).random(time.size) < 0.95, np.nan, time)
-    assert clocks.frame_period(stamps) == pytest.approx(0.1)
-    known = np.isfinite(stamps)
-    between = clocks.interpolation(
-        stamps, np.ones(time.size, dtype=bool), time + 0.03, np.zeros(time.size, dtype=np.intp), 1.0
-    )
-    assert not between.valid[~(known & np.roll(known, -1))].any()
 
 
 def test_arguments_of_another_type_are_named() -> None:

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, schema, simulation, store
-from dbthermal.alignment._field import Information, Spline
 from reproduction import twins
 from reproduction.experiments import capture_of
 from reproduction.experiments.pictures import Picture, smooth_shift
@@ -158,39 +157,6 @@ def test_rapid_object_does_not_pull_the_field(
     print(f"{rise} s, {shift}: median {np.median(np.abs(error), axis=1)} pixel")
     assert error.shape[1] > 0.7 * true[0].size
     assert np.median(np.abs(error[1])) < 0.03
-
-
-def test_fields_of_the_posterior_disagree_as_chance_makes_them() -> None:
-    """The chi-square of fields drawn from the posterior is that of chance, far ones' is more."""
-    rng = np.random.default_rng(3)
-    spline, centres = Spline((40, 50), 15.0), [np.arange(40.0), np.arange(50.0)]
-    tensor = np.stack([np.full((40, 50), one) for one in (0.3, 0.1, 0.8)])
-    data = Information(tensor, rng.normal(0.0, 0.5, (2, 40, 50)))
-    field = spline.fitted(data, centres)
-    factor = np.triu(field.factor[0])
-    draws = field.nodes + np.linalg.solve(factor, rng.normal(size=(field.nodes.size, 500))).T
-    chance = [field.disagreement(data, centres, replace(field, nodes=one)) for one in draws]
-    far = field.disagreement(data, centres, replace(field, nodes=field.nodes + 1.0))
-    print(f"drawn {np.mean(chance):.3f}, a pixel off {far:.0f}")
-    assert np.mean(chance) == pytest.approx(1.0, abs=0.05)
-    assert far > 25.0
-
-
-def test_goes_on_level_beyond_the_data() -> None:
-    """A slope at the end of the data is not drawn on over the rest of the image."""
-    spline, centres = Spline((60, 80), 30.0), [np.arange(60.0), np.arange(80.0)]
-    right = np.arange(80.0)
-    sloped = 0.1 * np.clip(right - 25.0, 0.0, None)
-    told = 25.0 * (right < 40.0) * np.ones((60, 1))  # [1/pixel^2]
-    tensor = np.stack([told, 0.0 * told, told])
-    data = Information(tensor, tensor[[0, 2]] * sloped)
-    field = spline.fitted(data, centres)
-    found, std = field.on(centres)[1][30], np.sqrt(field.variances(centres)[1][30])
-    drawn_on = sloped[-1] - sloped[39]
-    print(f"{found[39]:.2f} pixel at the end of the data, {found[-1]:.2f} +- {std[-1]:.1f} beyond")
-    assert abs(found[39] - sloped[39]) < 0.1
-    assert abs(found[-1] - found[39]) < 0.5 * drawn_on
-    assert 10.0 * std[39] < std[-1] < 0.1 * right[-1]
 
 
 @pytest.mark.slow

@@ -5,12 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.ndimage import map_coordinates, spline_filter
 
 from dbthermal import alignment, schema, separation, simulation
-from dbthermal.alignment import _registration as registration
-from dbthermal.alignment import _views as sampling
+from dbthermal.correction import correct_capture
 from dbthermal.simulation import Rig
+from reproduction.experiments import whole
 
 pytest.importorskip("cv2")
 
@@ -31,32 +30,11 @@ def picture(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
     return result
 
 
-def test_splines_and_motions_are_those_of_differences() -> None:
-    """Splines are SciPy's, and their slopes over a pixel; a transform's motion is a limit."""
-    rng, shape = np.random.default_rng(3), (40, 52)
-    images = rng.normal(size=(3, *shape))
-    matrix = homography((0.7, -1.2), 1.5, 1.02)
-    matrix[2, :2] = 2e-4, -1e-4
-    places = sampling.positions(matrix, shape)
-    inside = registration._inside(places, "9.5")
-    splines = np.stack([spline_filter(one) for one in images], axis=-1)
-    values, down, right = registration._sampled(splines, places[:, inside])
-    at = {
-        away: np.stack([map_coordinates(one, (places.T + away).T[:, inside]) for one in images])
-        for away in ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
-    }
-    np.testing.assert_allclose(values, at[0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(down, at[0.5, 0.0] - at[-0.5, 0.0], atol=1e-12)
-    np.testing.assert_allclose(right, at[0.0, 0.5] - at[0.0, -0.5], atol=1e-12)
-    motion = registration._motion(matrix, places, inside)
-    for row, column in np.ndindex(3, 3):
-        off = np.zeros((3, 3))
-        off[row, column] = 1e-6 if row == 2 else 1e-4
-        one, other = (
-            sampling.positions(it, shape)[:, inside] for it in (matrix + off, matrix - off)
-        )
-        slope = (one - other) / (2.0 * off[row, column])
-        np.testing.assert_allclose(motion[row, column], slope, rtol=1e-6, atol=1e-3)
+def positions(matrix: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Row and column (2, y, x) [pixel] at which a transform shows each pixel."""
+    rows, columns = np.indices(shape)
+    column, row, scale = np.einsum("ij,jyx->iyx", matrix, np.stack([columns, rows, 0 * rows + 1]))
+    return np.asarray(np.stack([row, column]) / scale)
 
 
 def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.ndarray:
@@ -72,7 +50,7 @@ def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.n
 def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
     """Two views of one plane, the second of other gain, offset and noise, with bad pixels."""
     rng = np.random.default_rng(seed)
-    (y, x), (row, column) = np.indices(SHAPE), sampling.positions(np.linalg.inv(matrix), SHAPE)
+    (y, x), (row, column) = np.indices(SHAPE), positions(np.linalg.inv(matrix), SHAPE)
     first, second = 100.0 * picture(x, y, seed), 3000.0 + 8.0 * picture(column, row, seed)
     counts = np.stack([np.stack([first] * frames), np.stack([second] * frames)])
     counts += rng.normal(0, [[[[1.0]]], [[[0.3]]]], counts.shape)
@@ -97,7 +75,7 @@ def test_object_registers(truth: tuple[tuple[float, float], float, float], model
     matrix = homography(*truth)
     for seed in range(3):
         found = alignment.register(views(matrix, seed), model=model)
-        apart = sampling.positions(found.values[1], SHAPE) - sampling.positions(matrix, SHAPE)
+        apart = positions(found.values[1], SHAPE) - positions(matrix, SHAPE)
         errors = np.hypot(*apart)
         print(
             f"{truth} {model}: {np.sqrt(np.mean(errors**2)):.3f}, at most {errors.max():.3f} pixel"
@@ -121,7 +99,7 @@ def test_a_warm_spot_tells_the_translation_alone() -> None:
             pattern = rng.normal(0, 0.125, (2, 1, *shape)) * noise
             capture["counts"] = capture["counts"] + pattern.astype(np.float32)
             found = alignment.register(capture).values[1]
-            errors.append(np.hypot(*(sampling.positions(found, shape) - np.indices(shape))).max())
+            errors.append(np.hypot(*(positions(found, shape) - np.indices(shape))).max())
         print(f"{shape}: {np.round(errors, 3)} pixel")
         assert np.median(errors) < 0.15  # [pixel]
 
@@ -139,7 +117,7 @@ def test_a_pattern_that_rests_does_not_pull() -> None:
         capture["counts"] = capture["counts"].copy(data=counts.astype(np.float32))
         found = alignment.register(capture).values[1]
         true = homography((-3.0, 2.0), 0.0, 1.0)
-        apart = sampling.positions(found, SHAPE) - sampling.positions(true, SHAPE)
+        apart = positions(found, SHAPE) - positions(true, SHAPE)
         errors.append(float(np.sqrt(np.mean(np.hypot(*apart) ** 2))))
     print(f"{np.round(errors, 3)} pixel, of a pattern of 3 K")
     assert max(errors) < 0.1  # [pixel]; with all residuals alike 0.4 to 0.6
@@ -164,11 +142,11 @@ def test_views_are_warped() -> None:
 def test_places_behind_the_camera_are_nan() -> None:
     """Pixels that a homography sends behind the camera have no place; an array is no transform."""
     horizon = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.1, 0.0, 1.0]])
-    places = sampling.positions(horizon, (4, 20))
+    places = positions(horizon, (4, 20))
     assert np.isfinite(places[:, :, :10]).all()
     assert np.isnan(places[:, :, 10:]).all()
-    np.testing.assert_array_equal(places, sampling.positions(-horizon, (4, 20)))
-    assert np.isnan(sampling.positions(0 * horizon, (4, 20))).all()
+    np.testing.assert_array_equal(places, positions(-horizon, (4, 20)))
+    assert np.isnan(positions(0 * horizon, (4, 20))).all()
     with pytest.raises(TypeError, match="Invalid transform of type ndarray"):
         alignment.align(views(np.eye(3)), transform=np.eye(3))  # type: ignore[arg-type]
 
@@ -231,7 +209,7 @@ def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     """The edges of two views correlate by chance: what keeps only these is no transform."""
     apart = np.eye(3)
     apart[0, 2] = 0.6 * SHAPE[1]
-    monkeypatch.setattr(registration, "_start", lambda *_: (0.99, apart))
+    monkeypatch.setattr("dbthermal.alignment._registration._start", lambda *_: (0.99, apart))
     with pytest.raises(ValueError, match=r"band '9\.5': it shares 40% of the image"):
         alignment.register(views(np.eye(3)))
 
@@ -251,14 +229,6 @@ def test_what_parallax_costs() -> None:
     assert found[0.5] < 3 * found[0.0]
     assert 0.2 < found[1.0] < 0.5  # [K]
     assert found[2.0] > 0.5  # [K]
-
-
-def test_parallax_looks_like_a_time_offset() -> None:
-    """A parallax of 2 pixels of the reflection is taken for an offset of at most half a frame."""
-    _, capture = parallax(2.0, np.random.default_rng(1))
-    offset = alignment.time_offset(capture)
-    print(f"reflection 2 pixels apart: {offset / 0.1:.2f} frames")
-    assert 0.1 < abs(offset) / 0.1 < 0.5
 
 
 def test_the_offset_is_that_of_registered_views() -> None:
@@ -292,3 +262,15 @@ def test_the_offset_is_that_of_registered_views() -> None:
     print(f"error of the offset: {errors[0]:.3f} frames as seen, {errors[1]:.3f} registered")
     assert abs(errors[1]) < 0.05  # [frame]
     assert abs(errors[0]) > 0.2  # [frame]: else the scene would not tell
+
+
+@pytest.mark.slow
+def test_clocks_are_found_where_the_first_shift_is_false() -> None:
+    """At 50 Hz what moves by the cameras' shift is seen as a delay of many frames."""
+    rig: dict[str, Any] = {"shift": (-4.0, 0.8), "view": (-1, 4), "late": 2, "shutter": (0.76,)}
+    recording = whole.record((48, 62), (419, 50.0), 1, **rig, lost=(0.01, 0.01), steps=4, frames=16)
+    fitted, _ = whole.calibrate(recording.movies)
+    corrected = correct_capture(recording.capture, fitted)
+    aligned = alignment.align(corrected, transform=whole.registration(rig["view"]))
+    print(f"clock {aligned.attrs['time_offset'][1]:.4f} s, true 0.02")
+    assert abs(aligned.attrs["time_offset"][1] - 0.02) < 0.002  # 0.1 of a frame

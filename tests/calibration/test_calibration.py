@@ -67,12 +67,6 @@ def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
     assert all("units" in variable.attrs for variable in two_bands.data_vars.values())
 
 
-def test_reference_is_a_measured_temperature() -> None:
-    """Without 298.15 K among the temperatures the nearest one is the reference."""
-    fitted = calibration.fit_response(blackbody(4))  # 283, 303, 323, 343 K
-    assert float(fitted["reference_temperature"]) == pytest.approx(303.15, abs=1e-9)
-
-
 def test_line_is_polyfit() -> None:
     """The linear pair is numpy's least-squares line over all temperatures."""
     counts = blackbody()

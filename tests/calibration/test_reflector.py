@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import calibration, response, schema
+from dbthermal import calibration, response
 from dbthermal.calibration import Bias
 from dbthermal.simulation import Rig, contact_measurements
 from reproduction.experiments.bench import (
@@ -280,12 +280,3 @@ def test_bad_bench(known: xr.Dataset) -> None:
         reflector_series(known, OBJECTS[0], cold, np.random.default_rng(0))
     with pytest.raises(ValueError, match="Invalid comparison of 5 samples, 1 times"):
         compare_procedures(known, np.random.default_rng(0), repeats=1)
-
-
-def test_series_are_stages(known: xr.Dataset) -> None:
-    """A simulated series is what the calibration asks for."""
-    rng = np.random.default_rng(0)
-    contact = bench_series(known, OBJECTS[0], Bench(), rng)
-    foil = reflector_series(known, OBJECTS[0], Bench(), rng)
-    assert schema.check(contact, "contact").sizes["measurement"] == 12
-    assert schema.check(foil, "reflector").sizes["measurement"] == 3

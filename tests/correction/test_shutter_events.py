@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 from captures import RIG, still, walkers
 
-from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
 from dbthermal.correction import find_shutter, mark_shutter
 from dbthermal.simulation import Background
@@ -198,16 +197,6 @@ def test_separation_stands_a_shutter_and_lost_frames(
     marked = rmse(scene, mark_shutter(nuisance(capture, rng)))
     print(f"{nuisance.__name__}: {marked:.4f} K, undisturbed {undisturbed:.4f} K")
     assert marked <= 1.2 * undisturbed
-
-
-@pytest.mark.parametrize(("times", "factor"), [((17.5,), 1.90), ((11.0, 24.0), 2.71)])
-def test_a_step_costs_accuracy(times: tuple[float, ...], factor: float) -> None:
-    """The smooth part's deviation rises as stated, steps being fitted beside five functions."""
-    functions = smooth.polynomial_basis(TIME, 5)
-    steps = (TIME[:, np.newaxis] > np.array(times)).astype(float)
-    both = np.hstack([functions, steps])
-    covariance = np.linalg.inv(both.T @ both)[:5, :5]
-    np.testing.assert_allclose(np.sqrt(np.trace(covariance) / 5), factor, rtol=0, atol=0.01)
 
 
 def test_closed_frames_are_labelled() -> None:

@@ -1,4 +1,4 @@
-"""Regions against areas that are known, and deviations of means against closed forms."""
+"""Regions against areas that are known."""
 
 import math
 
@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal.explorer import Region
-from dbthermal.explorer._regions import common_gain, mean_std
 
 SHAPE = (120, 160)
 coordinates = st.tuples(st.floats(-20, 140), st.floats(-20, 180))
@@ -48,53 +47,3 @@ def test_bad_regions_are_refused(kind: str, points: tuple[object, ...], message:
     """The error names the kind, the points and the rule."""
     with pytest.raises(ValueError, match=message):
         Region(kind, points)  # type: ignore[arg-type]
-
-
-def test_mean_std_has_its_limits() -> None:
-    """Own errors fall with the root of the number, shared ones not at all, both add in squares."""
-    std = np.full((1, 100), 0.5)
-    shares = {0.0: 0.05, 0.5: 0.5, 0.3: math.hypot(0.3, 0.4 / 10), math.nan: 0.5, 9.0: 0.5}
-    for common, expected in shares.items():
-        np.testing.assert_allclose(mean_std(std, np.array(common)), expected, rtol=1e-12)
-    std[0, 50:] = np.nan  # not known: these do not count
-    np.testing.assert_allclose(mean_std(std, np.zeros(100)), 0.5 / math.sqrt(50), rtol=1e-12)
-    assert np.isnan(mean_std(np.full((1, 3), np.nan), np.zeros(3))).all()
-
-
-def test_mean_std_is_what_simulated_errors_have() -> None:
-    """Scatter of means of 40 pixels with a shared and an own error is within 3 % of the formula."""
-    rng = np.random.default_rng(5)
-    shared, own = np.linspace(0.1, 0.4, 40), np.linspace(0.5, 1.5, 40)
-    errors = rng.standard_normal((20_000, 1)) * shared + rng.standard_normal((20_000, 40)) * own
-    expected = mean_std(np.hypot(shared, own)[np.newaxis], shared)[0]
-    scatter = errors.mean(axis=1).std()
-    print(f"scatter of the mean {scatter:.4f}, stated {expected:.4f}")
-    np.testing.assert_allclose(scatter, expected, rtol=0.03)
-
-
-def test_gain_is_the_derivative_of_the_inverse() -> None:
-    """Object and background, inverted from two bands with emissivities changed, move as stated."""
-    warm, cold, error = 320.0, 295.0, np.array([2e-6, -1e-6])
-    emissivity = np.array([0.86, 0.72])
-    signal = emissivity * warm + (1 - emissivity) * cold
-    changed = emissivity + error
-    moved = np.linalg.solve(np.column_stack([changed, 1 - changed]), signal) - [warm, cold]
-    covariance = np.multiply.outer(error, error)[..., np.newaxis, np.newaxis]
-    gains = common_gain(emissivity[:, np.newaxis, np.newaxis], covariance)
-    np.testing.assert_allclose(gains.ravel() * (warm - cold), np.abs(moved), rtol=1e-3)
-
-
-@pytest.mark.parametrize("shared", [0.0, 0.6, 1.0])
-def test_neighbours_tell_what_they_share(shared: float) -> None:
-    """Of emissivities with a shared and an own error, the shared part of the gain is found."""
-    rng, std = np.random.default_rng(8), 0.01
-    base = np.array([0.86, 0.72])[:, np.newaxis, np.newaxis] + np.zeros((2, 60, 60))
-    base += std * np.sqrt(shared) * rng.standard_normal((2, 1, 1))
-    value = base + std * np.sqrt(1.0 - shared) * rng.standard_normal(base.shape)
-    covariance = std**2 * np.eye(2)[:, :, np.newaxis, np.newaxis] * np.ones((1, 1, 60, 60))
-    whole = common_gain(base, covariance)  # alike: all of it is shared
-    part = np.median(common_gain(value, covariance) / whole, axis=(1, 2)) ** 2
-    print(f"shared {shared}: found {part.round(3)} of the variance of object and background")
-    np.testing.assert_allclose(part, shared, rtol=0, atol=0.08)
-    varied = base + 5 * std * rng.standard_normal(base.shape)  # a material, not errors
-    assert np.median(common_gain(varied, covariance) / whole) > 0.7

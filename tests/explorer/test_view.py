@@ -3,7 +3,6 @@
 import csv
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ from PIL import Image
 
 import dbthermal
 from dbthermal import schema, store
-from dbthermal.explorer import Region, View, _export
-from dbthermal.explorer._widget import quantised
+from dbthermal.explorer import Region, View
 from dbthermal.response import apparent_temperature
 from dbthermal.schema import Status
 
@@ -141,7 +139,7 @@ def test_noise_of_an_input_falls_with_the_number(glass: Glass) -> None:
 
 
 def test_flagged_pixels_do_not_count() -> None:
-    """Completed pixels count unless only measured ones are wanted; flagged ones if all are."""
+    """Completed pixels count unless only measured ones, and frames, are wanted; flagged if all."""
     status = np.zeros((4, 5), np.uint32)
     status[0], status[1] = int(Status.GRAY), int(Status.GRAY | Status.COMPLETED_FROM_MATERIAL)
     view = View(separated(status=status))
@@ -149,6 +147,11 @@ def test_flagged_pixels_do_not_count() -> None:
     for pixels, number in numbers.items():
         curve = view.curve("object_temperature", WHOLE, pixels=pixels)  # type: ignore[arg-type]
         assert (curve["pixels"] == number).all()
+    bridged = np.zeros((3, 4, 5), dtype=bool)
+    bridged[1, 2, :2] = True
+    made = view.data.assign(bridged=(("time", "y", "x"), bridged))
+    curve = View(made).curve("object_temperature", WHOLE, pixels="measured")
+    assert curve["pixels"].values.tolist() == [10, 8, 10]
     empty = view.curve("object_temperature", Region("rectangle", ((0, 0), (1, 5))))
     assert np.isnan(empty["mean"]).all()
     assert (empty["pixels"] == 0).all()
@@ -189,13 +192,29 @@ def test_copied_code_gives_the_same(glass: Glass, tmp_path: Path) -> None:
         )
 
 
+def answer(explorer: Any, **question: Any) -> tuple[dict[str, Any], list[bytes]]:
+    """Answer of the explorer to a question of its page."""
+    sent: list[Any] = []
+    explorer.send = lambda content, buffers=(): sent.append((content, list(buffers)))
+    explorer._handle_custom_msg({"page": 1, **question}, [])
+    result: tuple[dict[str, Any], list[bytes]] = sent[-1]
+    return result
+
+
 def test_exported_files(tmp_path: Path) -> None:
     """CSV and NetCDF have the curves, TIFF and NetCDF the frame, PNG a picture; by suffix alone."""
-    view, names = View(separated()), ["object_temperature", "emissivity 9.5", "status"]
-    regions = {"region 1": WHOLE, "door": Region("rectangle", ((0, 0), (2, 2)))}
-    shown = _export.Shown(names, 1, regions, celsius=True)
-    for suffix in _export.SUFFIXES:
-        _export.save(view, tmp_path / f"a{suffix}", shown)
+    explorer = dbthermal.explore(separated())
+    names = ["object_temperature", "emissivity 9.5", "status"]
+    chosen = {"pixels": "unflagged", "panes": names, "index": 1, "celsius": True}
+    shown = {"kind": "export", **chosen, "palette": "inferno", "limits": {}}
+    assert "without a region" in answer(explorer, **shown, suffix=".csv")[0]["error"]
+    regions = [
+        ("region 1", WHOLE.kind, WHOLE.points),
+        ("door", "rectangle", ((0, 0), (2, 2))),
+    ]
+    answer(explorer, kind="curves", pane=names[0], pixels="unflagged", regions=regions)
+    for suffix in (".csv", ".tiff", ".png", ".nc"):
+        (tmp_path / f"a{suffix}").write_bytes(answer(explorer, **shown, suffix=suffix)[1][0])
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["time [s]"] for row in rows] == ["0", "0.5", "1"]
@@ -208,21 +227,28 @@ def test_exported_files(tmp_path: Path) -> None:
     with xr.open_dataset(tmp_path / "a.nc", engine="scipy") as saved:
         assert saved["mean"].sel(region="door").values.tolist() == [310.0, 311.0, 312.0]
         assert saved["object_temperature"].attrs["units"] == "K"
-    with pytest.raises(ValueError, match="Must end in one of"):
-        _export.save(view, tmp_path / "a.txt", shown)
-    with pytest.raises(ValueError, match="without a region"):
-        _export.save(view, tmp_path / "a.csv", replace(shown, regions={}))
+    assert "Must end in one of" in answer(explorer, **shown, suffix=".txt")[0]["error"]
+    explorer.close()
 
 
 def test_codes_are_places_in_a_palette() -> None:
     """A code gives a value back within half a step of 255, its ends beyond them, 0 no number."""
-    frame = np.array([[280.0, 300.5, np.nan], [np.inf, 320.0, 1e30]], dtype=np.float32)
-    codes = quantised(frame, 280.0, 320.0)
-    assert codes[~schema.measured(frame)].tolist() == [0, 0, 0]
-    known = schema.measured(frame)
-    back = 280.0 + (codes[known] - 0.5) / 255 * 40.0
+    data = separated()
+    frame = np.array([[280.0, 300.5, np.nan, 310.0, 320.0], [np.inf, 320.0, 1e30, 290.0, 285.0]])
+    data["object_temperature"].values[0, :2] = frame
+    explorer, known = dbthermal.explore(data), np.abs(frame) < schema.LARGEST
+    shown = {"kind": "frames", "panes": ["object_temperature"], "isotherm": None, "index": 0}
+
+    def codes(*limits: float) -> np.ndarray:
+        buffer = answer(explorer, **shown, limits=[limits])[1][0]
+        return np.frombuffer(buffer, np.uint8).reshape(4, 5)[:2]
+
+    wide = codes(280.0, 320.0)
+    assert not wide[~known].any()
+    back = 280.0 + (wide[known] - 0.5) / 255 * 40.0
     np.testing.assert_allclose(back, frame[known], rtol=0, atol=0.5 * 40 / 255 + 1e-4)  # [K]
-    assert quantised(frame, 290.0, 310.0)[known].tolist() == [1, 134, 255]
+    assert codes(290.0, 310.0)[known].tolist() == [1, 134, 255, 255, 255, 1, 1]
+    explorer.close()
 
 
 @pytest.mark.parametrize(

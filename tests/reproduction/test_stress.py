@@ -265,7 +265,7 @@ def test_completed_is_told_from_measured() -> None:
     names = ("completed_from_prior", "completed_frames", "gray")
     shown = ["25.0 %  good", *(f"25.0 %  {REASONS[name][0]}" for name in names)]
     assert [text.get_text() for text in legend.get_texts()] == shown
-    of_all = "25.0 % of the pixels have no flag, 25.0 % but for some frames, 25.0 % are completed"
+    of_all = "25.0 % of the pixels have no flag, 50.0 % are completed"
     assert figure.get_suptitle() == f"Status: {of_all}"
 
 

@@ -10,7 +10,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import release
+from dbthermal._arrays import empty, release
 from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
@@ -24,7 +24,6 @@ from dbthermal.separation._solve import require_workers, solve
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 _BITS: Final = {
-    scenes.OWN: Status.COMPLETED_FRAMES,
     scenes.MATERIAL: Status.COMPLETED_FROM_MATERIAL | Status.COMPLETED_FROM_SURROUNDINGS,
     scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
 }
@@ -85,9 +84,10 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         The variables of the result, and its values bit for bit where it has any; `status` has the
         bits ``completed_from_material`` or ``completed_from_prior``, and
         ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
-        frames of a pixel were. Values stay NaN at bad pixels and constant signals, and in frames
-        of which no pixel has data of all bands (attribute `frames_missing`, their number); a sample
-        that a pixel alone lacks is bridged from those around it (`frames_bridged`, mean number of
+        more than a seventh of a pixel's frames were. Values stay NaN at bad pixels and constant
+        signals, and in frames of which no pixel has data of all bands (attribute `frames_missing`,
+        their number); a sample that a pixel alone lacks is bridged from those around it: `bridged`
+        (time, y, x) says which, and leaves no bit (`frames_bridged`, mean number of
         them in a pixel that has any). Attributes `surroundings`, `surroundings_std` [K] and
         `surroundings_source`.
 
@@ -167,21 +167,53 @@ def filled(
         fluctuation = scenes.find_level(replace(scene, level=level)).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
+    bridged = _lacking(result, inputs.blocks)
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_complete_rows, scene, result), inputs.blocks))
         film = result[FILMS[0]].values
         frames = np.array([np.isfinite(frame).any() for frame in film])
         parts = threads.map(partial(_bridge_rows, result, frames), inputs.blocks)
-        bridged = np.concatenate(list(parts))
+        number = np.concatenate(list(parts))
+    _mark_bridged(result, bridged, inputs.blocks)
     result["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
     return result.assign_attrs(
         frames_missing=int(np.count_nonzero(~frames)),
-        frames_bridged=float(bridged.sum() / max(1, np.count_nonzero(bridged))),
+        frames_bridged=float(number.sum() / max(1, np.count_nonzero(number))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
         surroundings_source="capture" if beside.surroundings is None else "stated",
     )
+
+
+def _lacking(result: xr.Dataset, blocks: list[slice]) -> Mask:
+    """Samples (time, y, x) of which a result lacks one of the films."""
+    lacking = empty(result[FILMS[0]].shape, np.bool_)
+    for rows in blocks:
+        films = [np.isnan(result[name].values[:, rows]) for name in FILMS]
+        lacking[:, rows] = np.any(films, axis=0)
+        release()
+    return lacking
+
+
+def _mark_bridged(completed: xr.Dataset, lacking: Mask, blocks: list[slice]) -> None:
+    """Mark, in place, the samples that a measured pixel lacked and now has: by frame, not by pixel.
+
+    A pixel that lacked too many of them gets a bit of the status, too.
+    """
+    status = completed["status"].values
+    elsewhere = np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)
+    for rows in blocks:
+        here = lacking[:, rows]
+        here &= np.isfinite(completed[FILMS[0]].values[:, rows])
+        here &= (status[rows] & elsewhere) == 0
+        many = here.mean(axis=0) >= quality.MOST_BRIDGED
+        status[rows] |= many * np.uint32(Status.COMPLETED_FRAMES)
+        if "bridged" in completed:
+            here |= completed["bridged"].values[:, rows]
+        release()
+    variable = schema.OPTIONAL["separated"]["bridged"]
+    completed["bridged"] = (variable.dims, lacking, variable.attrs)
 
 
 def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
@@ -263,12 +295,13 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
-    completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
+    if source in _BITS:
+        completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
     completed["status"].values[y, x] |= beyond * np.uint32(Status.OUTSIDE_RESPONSE)
 
 
 def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
-    """Bridge gaps of single pixels of some rows by lines, in place, and set the bit that says so.
+    """Bridge gaps of single pixels of some rows by lines, in place.
 
     Only in the frames (time) that some pixel has. The deviation grows as that of a random walk of
     the curve's own steps. Returns how many each pixel (y, x) had, in one of the films.
@@ -283,7 +316,6 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
         curves, stds = (np.ascontiguousarray(film[place].T, dtype=np.float64) for film in films)
         _bridge(curves, stds, time)
         films[0][place], films[1][place] = curves.T, stds.T
-        completed["status"].values[rows.start + y, x] |= np.uint32(Status.COMPLETED_FRAMES)
         number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
     return number

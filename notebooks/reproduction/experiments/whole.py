@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter
 
 from dbthermal import correction, simulation
 from dbthermal.calibration import fit_response
-from dbthermal.schema import Status
 from dbthermal.simulation import Rig
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
@@ -114,7 +113,7 @@ def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
 def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
     """Errors of a result of a scene, by name with unit.
 
-    Of the pixels that are measured, which a bridged frame leaves them, the median over pixels of
+    Of the pixels that are measured, the median over pixels of
     the object's RMSE and the share of 95 % intervals that hold it; these of all that have a value,
     completed or flagged ones too; and the shares of pixels that are measured, and that have one.
     """
@@ -123,7 +122,7 @@ def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
     error = result["object_temperature"] - truth.assign_coords(time=result["time"])
     inside = (abs(error) < INTERVAL * result["object_temperature_std"]).where(error.notnull())
     rmse = (error**2).mean("time") ** 0.5
-    measured = (result["status"] & ~np.uint32(Status.COMPLETED_FRAMES)) == 0
+    measured = result["status"] == 0
     return {
         "object RMSE, measured [K]": float(rmse.where(measured).median()),
         "object RMSE, all [K]": float(rmse.median()),

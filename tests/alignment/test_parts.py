@@ -1,0 +1,225 @@
+"""Parts of the alignment, each against a closed form or a behaviour that is known."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.interpolate import CubicSpline
+
+from dbthermal import schema
+from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment import _joint as joint
+from dbthermal.alignment._field import Information, Spline
+from dbthermal.alignment._reflections import Scale
+from dbthermal.correction import correct_capture
+from reproduction.experiments import whole
+from reproduction.experiments.pictures import smooth_shift
+
+FRAME = 0.1  # [s]
+
+
+def clocks_tried(
+    monkeypatch: pytest.MonkeyPatch,
+    start: list[float],
+    seen: Callable[[float], tuple[float, int]],
+    std: float = 0.0,
+) -> tuple[list[float], list[float], float]:
+    """Offsets found, from those that what moves one way tells; those tried; their uncertainty.
+
+    All in frames. By an offset of the other bands a camera is seen late, with a deviation, and one
+    is the reference.
+    """
+    bands, tried = ["8-14", "9.5", "more"][: len(start)], list[float]()
+    together = xr.DataArray(np.zeros(len(bands)), {"band": bands}, "band")
+    counts = np.zeros((len(bands), 40, 1, 1), np.float32)
+    small = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts)},
+        {"band": bands, "time": FRAME * np.arange(40)},
+    )
+
+    def resample(_: xr.Dataset, offset: xr.DataArray | None = None, **__: Any) -> xr.Dataset:
+        own = FRAME * np.array(start) if offset is None else offset.values
+        return xr.Dataset(attrs={"time_offset": own.tolist()})
+
+    def shift(aligned: xr.Dataset, _: object) -> xr.Dataset:
+        tried.append(float(np.mean(aligned.attrs["time_offset"][1:])) / FRAME)
+        late, reference = seen(tried[-1])
+        told = {"delay": late * FRAME, "delay_std": std * FRAME}
+        return xr.Dataset(attrs={"reference_band": bands[reference], **told})
+
+    monkeypatch.setattr(joint, "_shift", shift)
+    scale = Scale(np.ones(len(bands)), None)
+    offset, _, left = joint._clocked(small, scale, together, resample)
+    return (offset.values / FRAME).tolist(), tried, left / FRAME
+
+
+@pytest.mark.parametrize("start", [-3.6, -0.25, 0.3, 0.549])
+@pytest.mark.parametrize("slope", [0.3, 0.8, 3.0])
+def test_clocks_are_found_from_a_poor_start(
+    monkeypatch: pytest.MonkeyPatch, start: float, slope: float
+) -> None:
+    """A delay seen too short or too long, with an error, leads to the clock by which it is none.
+
+    No delay is seen at clocks that are set together, for which these have no reason to be.
+    """
+
+    def seen(clock: float) -> tuple[float, int]:
+        error = 0.02 * math.sin(5.0 * clock)
+        return (0.0 if clock == 0.0 else slope * (0.55 - clock) + error), 0
+
+    (_, found), _, left = clocks_tried(monkeypatch, [0.0, start], seen)
+    assert abs(found - 0.55) < 0.02 / slope + 0.02
+    assert left < 0.1
+
+
+def test_clocks_of_three_bands_and_of_either_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other bands move together; the band that is interpolated may be the quietest then."""
+    found, *_ = clocks_tried(monkeypatch, [0.0, 0.9, -1.0], lambda clock: (0.2 - clock, 0))
+    np.testing.assert_allclose(found, [0.0, 1.15, -0.75], atol=0.02)
+
+    def seen(clock: float) -> tuple[float, int]:
+        return (0.45 - clock, 0) if abs(clock - round(clock)) > 0.15 else (clock - 0.45, 1)
+
+    (_, late), *_ = clocks_tried(monkeypatch, [0.0, -0.3], seen)
+    assert abs(late - 0.45) < 0.02
+
+
+@pytest.mark.parametrize("after", [0.3, np.nan])
+def test_clocks_that_nothing_tells_are_doubted(
+    monkeypatch: pytest.MonkeyPatch, after: float
+) -> None:
+    """Reflections seen late by every clock, or by one alone, or by parts of the image otherwise."""
+
+    def seen(clock: float) -> tuple[float, int]:
+        return (0.3 if abs(clock + 0.2) < 0.01 else after), 0
+
+    (_, found), tried, left = clocks_tried(monkeypatch, [0.0, -0.2], seen)
+    assert abs(found + 0.2) < 0.01
+    assert len(tried) == 3
+    assert left == pytest.approx(0.3)
+    assert clocks_tried(monkeypatch, [0.0, 0.1], lambda c: (0.1 - c, 0), 0.2)[2] > 0.19
+
+
+@pytest.mark.slow
+def test_a_large_image_is_aligned_by_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clocks and the shift of means over squares are those of all pixels."""
+    rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (0, 0), "late": 1, "shutter": (0.4,)}
+    recording = whole.record(
+        (64, 96), (300, 10.0), 1, **rig, lost=(0.03, 0.005), steps=6, frames=16
+    )
+    corrected = correct_capture(recording.capture, whole.calibrate(recording.movies)[0])
+    found = []
+    for pixels in (64 * 96, 64 * 96 // 4):
+        monkeypatch.setattr(joint, "_PIXELS", pixels)
+        found.append(joint.compare(corrected))
+    times = [one.offset.values[1] for one in found]
+    fields = [one.field for one in found if one.field is not None]
+    known = np.all([field["known"].values for field in fields], axis=0)
+    true = smooth_shift((64, 96), *rig["shift"])[1]
+    rms = [float(np.std((field["shift"].values[1] - true)[known])) for field in fields]
+    print(f"clocks {times} s, true 0.05; shifts off by {rms} pixels, {known.mean():.2f} known")
+    np.testing.assert_allclose(times, 0.05, atol=0.005)  # 0.05 of a frame
+    assert known.mean() > 0.9
+    assert rms[1] < 1.5 * rms[0]
+
+
+def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pixel that lacks samples does not step the mean; a bad one and a missing frame count."""
+    rng, level = np.random.default_rng(2), np.array([20000.0, 21000.0])[:, None, None, None]
+    pattern, change = rng.normal(0.0, 500.0, (2, 1, 6, 9)), rng.normal(0.0, 50.0, (2, 40, 1, 1))
+    counts = (level + pattern + change).astype(np.float32)
+    counts[1, 10:20, 0, 0] = np.nan  # single samples
+    counts[0, 30] = np.nan  # a frame
+    counts[0, :, 0:3, 3:6] = np.nan  # a square that one band does not see
+    status = np.zeros((6, 9), np.uint32)
+    status[4, 4] = schema.Status.DEAD_PIXEL
+    counts[:, :, 4, 4] = 7.0
+    corrected = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts), "status": (("y", "x"), status)},
+        {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
+    )
+    monkeypatch.setattr(joint, "_PIXELS", 6)
+    small = joint._of_squares(corrected)
+    values, blind = small["counts"].values, np.zeros((2, 3), dtype=bool)
+    blind[0, 1] = True
+    np.testing.assert_array_equal(small["status"] != 0, blind)
+    assert np.isnan(values[:, :, blind]).all()
+    there = np.arange(40) != 30
+    assert np.isnan(values[0, 30]).all()
+    seen = values[:, there][:, :, ~blind]
+    expected = np.broadcast_to(change[:, there, 0], seen.shape)
+    np.testing.assert_allclose(seen - seen[:, :1], expected - expected[:, :1], atol=10.0)
+    np.testing.assert_allclose(
+        seen[..., 1:] - seen[:, :1, 1:], (expected - expected[:, :1])[..., 1:], atol=0.02
+    )
+
+
+def test_a_step_does_not_swing() -> None:
+    """A curve would overshoot beside a sudden step: no sample there, and none of it in the rest."""
+    time = np.arange(40.0)
+    frames = np.sin(2.0 * np.pi * time[:, np.newaxis] / 8.0) + np.outer(time > 19.0, [0.0, 100.0])
+    present, segment, moved = np.ones(40, dtype=bool), np.zeros(40, dtype=np.intp), time + 0.5
+    result = np.empty_like(frames)
+    clocks.interpolation(time, present, moved, segment, 3.0).apply(frames, result, 2.0)
+    assert np.flatnonzero(np.isnan(result[:, 0])).tolist() == [39]
+    assert np.flatnonzero(np.isnan(result[:, 1])).tolist() == [18, 19, 20, 39]
+    np.testing.assert_allclose(result[:18, 1], result[:18, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result[21:39, 1], result[21:39, 0] + 100.0, rtol=0, atol=1e-12)
+
+
+def test_lines_and_splines_are_what_is_expected() -> None:
+    """Of a random walk the line, of its integral the natural spline; growth is told from noise."""
+    nodes, wanted = np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([1.3])
+    np.testing.assert_allclose(clocks._expected(nodes, wanted, 1.0), [[0, 0.7, 0.3, 0]], atol=1e-9)
+    spline = CubicSpline(nodes[0], np.eye(4), bc_type="natural")(wanted)
+    np.testing.assert_allclose(clocks._expected(nodes, wanted, 3.0), spline, rtol=0, atol=1e-9)
+    limit = [clocks._expected(nodes, wanted, growth) for growth in (1.999, 2.0, 2.001)]
+    np.testing.assert_allclose(limit[::2], [limit[1]] * 2, atol=1e-4)
+    noise = np.random.default_rng(1).normal(size=(2, 4000, 50))
+    assert clocks.growth(np.cumsum(noise[0], axis=0) + noise[1]) == pytest.approx(1.0, abs=0.1)
+    wave = 30.0 * np.sin(np.arange(4000.0) / 5.0)
+    assert clocks.growth(wave[:, np.newaxis] + noise[1]) == pytest.approx(3.9, abs=0.1)
+
+
+def test_fields_of_the_posterior_disagree_as_chance_makes_them() -> None:
+    """The chi-square of fields drawn from the posterior is that of chance, far ones' is more."""
+    rng = np.random.default_rng(3)
+    spline, centres = Spline((40, 50), 15.0), [np.arange(40.0), np.arange(50.0)]
+    tensor = np.stack([np.full((40, 50), one) for one in (0.3, 0.1, 0.8)])
+    data = Information(tensor, rng.normal(0.0, 0.5, (2, 40, 50)))
+    field = spline.fitted(data, centres)
+    factor = np.triu(field.factor[0])
+    draws = field.nodes + np.linalg.solve(factor, rng.normal(size=(field.nodes.size, 500))).T
+    chance = [field.disagreement(data, centres, replace(field, nodes=one)) for one in draws]
+    assert np.mean(chance) == pytest.approx(1.0, abs=0.05)
+    assert field.disagreement(data, centres, replace(field, nodes=field.nodes + 1.0)) > 25.0
+
+
+def test_goes_on_level_beyond_the_data() -> None:
+    """A slope at the end of the data is not drawn on over the rest of the image."""
+    spline, centres = Spline((60, 80), 30.0), [np.arange(60.0), np.arange(80.0)]
+    right = np.arange(80.0)
+    sloped = 0.1 * np.clip(right - 25.0, 0.0, None)
+    told = 25.0 * (right < 40.0) * np.ones((60, 1))  # [1/pixel^2]
+    tensor = np.stack([told, 0.0 * told, told])
+    field = spline.fitted(Information(tensor, tensor[[0, 2]] * sloped), centres)
+    found, std = field.on(centres)[1][30], np.sqrt(field.variances(centres)[1][30])
+    assert abs(found[39] - sloped[39]) < 0.1
+    assert abs(found[-1] - found[39]) < 0.5 * (sloped[-1] - sloped[39])
+    assert 10.0 * std[39] < std[-1] < 0.1 * right[-1]
+
+
+def test_frames_beside_lost_ones_are_not_bridged() -> None:
+    """The frame period is that of the slots: with most stamps lost, no pause counts as a step."""
+    time = np.arange(400) / 10.0
+    stamps = np.where(np.random.default_rng(1).random(time.size) < 0.95, np.nan, time)
+    assert clocks.frame_period(stamps) == pytest.approx(0.1)
+    known = np.isfinite(stamps)
+    between = clocks.interpolation(
+        stamps, np.ones(time.size, dtype=bool), time + 0.03, np.zeros(time.size, dtype=np.intp), 1.0
+    )
+    assert not between.valid[~(known & np.roll(known, -1))].any()
