@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
-from dbthermal.separation._subspace import emission, residuals
 from dbthermal.simulation import Rig
 from reproduction import experiments
 from reproduction.experiments import pictures
@@ -121,27 +119,6 @@ def test_drift_is_that_of_the_closed_form() -> None:
     expected = (1.0 - none["emissivity"].values[0, 0]) * 20.0 / np.sqrt(3.0) / warming
     print(f"added {np.median(added):.4f}, expected {np.median(expected):.4f}")
     np.testing.assert_allclose(added, expected, rtol=0.15)  # the response bends over 40 K
-
-
-@pytest.mark.parametrize("walk", [0.0, 1.0])
-def test_a_random_walk_is_extrapolated(walk: float) -> None:
-    """Slopes under a random walk scatter as the stated variance; without one it is nearly 0."""
-    rng = np.random.default_rng(5)
-    functions = smooth.subspace(TIME, 14)
-    own = np.repeat(20.0 * (1 - np.exp(-TIME / 12.0))[:, np.newaxis], 2000, axis=1)
-    steps = walk * rng.standard_normal(own.shape) / np.sqrt(350)
-    ordinate = 0.8 * own + np.cumsum(steps, axis=0) + 0.03 * rng.standard_normal(own.shape)
-    line = residuals.regress(own, ordinate, 0.03)
-    found = emission.walk_variance(line, own, functions, 0.03)[1]
-    true, stated = float(np.std(line.slope)), np.sqrt(found)
-    share = float(
-        np.mean(np.abs(line.slope - 0.8) < 1.96 * np.hypot(stated, np.sqrt(line.variance)))
-    )
-    print(
-        f"walk {walk} K: scatter {true:.4f}, stated {np.median(stated):.4f}, intervals {share:.3f}"
-    )
-    assert share > 0.92
-    assert np.median(stated) < 4.0 * true
 
 
 @pytest.mark.parametrize("drift", [-1.0, np.nan, np.inf])

@@ -7,7 +7,6 @@ import xarray as xr
 
 from dbthermal import calibration, separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.simulation import Background, Rig
 
 Floats = npt.NDArray[np.float64]
@@ -143,30 +142,6 @@ def test_nearly_gray_bodies_have_honest_bars(values: tuple[float, ...]) -> None:
     print(f"{values}: {100 * good:.1f} % no flag, {100 * wrong:.2f} % wrong")
     assert good > 0.2
     assert wrong < 0.01
-
-
-def test_a_gray_body_is_flat_in_the_responses_alone() -> None:
-    """Ratios of the responses' slopes at any temperature may be gray, and those outside not."""
-    noise, slopes = np.array([0.03, 0.03]), np.array([[1.0, 0.9], [1.1, 1.1], [1.2, 1.3]])
-    ratio = np.stack([np.ones(5), np.array([0.8, 0.91, 0.99, 1.08, 1.15])])
-    weights, variance = reflection_ratio.null_combination(ratio, noise)
-    one = np.ones(5)
-    ratios = reflection_ratio.ReflectionRatio(
-        ratio=ratio,
-        variance=np.zeros((2, 5)),
-        inverse_energy=1e-2 * one,
-        null_weights=weights,
-        null_variance=variance,
-        order=np.full(5, 4),
-        contrast=one,
-        reduced_chi2=one,
-        coefficients=np.zeros((2, 4, 5)),
-        scatter=np.zeros((2, 2, 5)),
-        rapid_scatter=np.zeros((2, 2, 2, 5)),
-        pooled=np.zeros(5, dtype=bool),
-    )
-    found = reflection_ratio.may_be_gray(ratios, noise, slopes)
-    assert found.tolist() == [False, True, True, True, False]
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ from captures import emissivity_of
 
 from dbthermal import alignment, schema, separation
 from dbthermal import response as responses
-from dbthermal.separation._tiles import Estimate
 from dbthermal.simulation import Rig
 
 RIG = Rig()
@@ -190,17 +189,6 @@ def test_frozen_frames_of_one_band_are_flagged_or_left_out(glass: Glass, band: i
         error = result["object_temperature"] - scene["object_temperature"]
         assert np.all(np.isnan(error[201 : 201 + copies]))
         assert float(np.sqrt((error**2).mean())) < 0.5  # [K]
-
-
-@pytest.mark.parametrize("name", ["gray", None])
-def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> None:
-    """A quantity that is NaN in all frames is flagged as outside the response, or by its cause."""
-    before = np.full(1, 0 if name is None else schema.Status.bits()[name], dtype=np.uint32)
-    warm, none, share = np.full((9, 1), 300.0), np.full((9, 1), np.nan), np.full((2, 1), 0.5)
-    found = Estimate(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)
-    status = found.check_range(responses.curve(RIG.response(), RIG.bands[0])).status
-    assert status[0] == before[0] or name is None
-    assert status[0] != 0
 
 
 @pytest.mark.parametrize(

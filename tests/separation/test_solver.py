@@ -8,7 +8,6 @@ import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
-from dbthermal.separation import _tiles as tiles
 from dbthermal.simulation import Rig
 
 TIME = np.arange(60) / 10.0  # s
@@ -25,14 +24,6 @@ def scene() -> xr.Dataset:
 def capture(scene: xr.Dataset) -> xr.Dataset:
     """Corrected counts of the scene."""
     return simulation.observe(scene, Rig().response(), np.random.default_rng(2))
-
-
-def test_tiles_draw_for_themselves() -> None:
-    """Random numbers differ between tiles, and from the seed's own generator."""
-    places = [(slice(row, row + 1), slice(0, 4)) for row in (0, 1)]
-    first, second = (tiles.generator(7, place).random(4) for place in places)
-    assert not np.any(np.isin(first, second))
-    assert not np.any(np.isin(first, np.random.default_rng(7).random(8)))
 
 
 @pytest.mark.parametrize("method", ["naive", "dbvt"])
