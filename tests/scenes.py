@@ -197,19 +197,20 @@ def lamp(apart: float) -> Callable[[int], Scene]:
     """A lamp that is switched thrice, mirrored as a disc that the second camera sees displaced."""
 
     def scene(seed: int) -> Scene:
-        lit = sum((begin < TIME) & (time < begin + 2.0) for begin in (3.0, 8.0, 14.0))
+        lit = sum((begin < TIME) & (begin + 2.0 > TIME) for begin in (3.0, 8.0, 14.0))
+        rows, columns = np.indices((40, 56))
         views = []
         for moved in (0.0, apart):
-            disc = 1.0 / (1.0 + np.exp(np.hypot(ROWS - 14.0, COLUMNS + moved - 20.0) - 8.0))
+            disc = 1.0 / (1.0 + np.exp(np.hypot(rows - 19.0, columns + moved - 27.0) - 11.0))
             views.append(ROOM + 4.0 * np.multiply.outer(lit, disc))
-        warm = ROOM + 15.0 * simulation.heating(TIME, 0.0, 1.0, 8.0)[:, None, None] * np.ones(SHAPE)
+        warm = ROOM + 15.0 * simulation.heating(TIME, 0.0, 1.0, 8.0)[:, None, None]
+        warm = np.broadcast_to(warm, views[0].shape)
         truth = simulation.scene(TIME, warm, views[0], emissivity_of(*GLASS))
         attrs = truth["background_temperature"].attrs
         dims = ("band", *truth["object_temperature"].dims)
         truth["background_temperature"] = dims, np.array(views), attrs
         return observed(truth, np.random.default_rng(seed))
 
-    time = TIME
     return scene
 
 
@@ -313,6 +314,20 @@ WAYS: Final[Mapping[str, Callable[[Scene], xr.Dataset]]] = {
 }
 
 
+def field(shift: Array, std: float = 0.0, **attrs: object) -> xr.Dataset:
+    """Field of the reflections' shift as `alignment.reflection_shift` gives it."""
+    units = {"units": "pixel"}
+    return xr.Dataset(
+        {
+            "shift": (("axis", "y", "x"), shift.astype(np.float32), units),
+            "shift_std": (("axis", "y", "x"), np.full(shift.shape, std, np.float32), units),
+            "known": (("y", "x"), np.all(np.isfinite(shift), axis=0)),
+        },
+        coords={"axis": ["y", "x"]},
+        attrs={"reference_band": RIG.bands[0], "bands": list(RIG.bands[1:]), **attrs},
+    )
+
+
 class Shelf:
     """Scenes and outcomes of a session, each made by the first worker that asks for it."""
 
@@ -355,10 +370,10 @@ def heard(make: Callable[[], xr.Dataset]) -> Outcome:
 def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
     """Figures of a result against the truth.
 
-    Shares [1] of pixels `measured` (no flag), `completed` and `empty` (without any number). Of
-    those measured: `rmse` of the object [K], `cover` of its 95 % intervals, share `silent` that is
-    off by more than four deviations and 0.3 K, median errors of `emissivity` and `ratio`. Of all
-    pixels: `p90` of their RMSE [K], `whole` cover.
+    Shares [1] of pixels `measured` (no flag, but for frames that are interpolated), `completed`
+    and `empty` (without any number). Of those measured: `rmse` of the object [K], `cover` of its
+    95 % intervals, share `silent` that is off by more than four deviations and 0.3 K, median errors
+    of `emissivity` and `ratio`. Of all pixels: `p90` of their RMSE [K], `whole` cover.
     """
     truth = scene.truth["object_temperature"].values
     error, std = (
@@ -366,7 +381,8 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
         for name, offset in (("object_temperature", truth), ("object_temperature_std", 0.0))
     )
     status = result["status"].values
-    good, there = status == 0, np.isfinite(error)
+    good = (status & ~np.uint32(Status.COMPLETED_FRAMES)) == 0
+    there = np.isfinite(error)
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # means of nothing
         size, bar = (np.sqrt(np.nanmean(part**2, axis=0)) for part in (error, std))

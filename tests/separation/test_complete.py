@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
-from test_displaced import field
+from scenes import field
 
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation, simulation

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scenes import field
 
 from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
@@ -13,20 +14,6 @@ GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)}
 TIME = np.arange(300) / 10
 SMALL = Picture(shape=(20, 48), walkers=6)
 _TO_95 = 1.96
-
-
-def field(shift: np.ndarray, std: float = 0.0, **attrs: object) -> xr.Dataset:
-    """Field of the reflections' shift as `alignment.reflection_shift` gives it."""
-    units = {"units": "pixel"}
-    return xr.Dataset(
-        {
-            "shift": (("axis", "y", "x"), shift.astype(np.float32), units),
-            "shift_std": (("axis", "y", "x"), np.full(shift.shape, std, np.float32), units),
-            "known": (("y", "x"), np.all(np.isfinite(shift), axis=0)),
-        },
-        coords={"axis": ["y", "x"]},
-        attrs={"reference_band": RIG.bands[0], "bands": list(RIG.bands[1:]), **attrs},
-    )
 
 
 def film(
