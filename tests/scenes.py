@@ -280,6 +280,12 @@ SCENES: Final[Mapping[str, Callable[[int], Scene]]] = {
     "still half, apart": lambda seed: painted(seed, picture=STILL, shift=SHIFT),
     "rapid": lambda seed: painted(seed, picture=RAPID),
     "rapid, apart": lambda seed: painted(seed, picture=RAPID, shift=SHIFT),
+    "rapid, nearly black, apart": lambda seed: painted(
+        seed,
+        (0.95, 0.88),
+        Picture((40, 56), 6, rise=(0.5, 2.0), still=0.5),
+        smooth_shift((40, 56), 4.2, 1.0),
+    ),
     "rapid before a still half": lambda seed: painted(seed, picture=replace(RAPID, still=0.5)),
     "samples lost": lambda seed: spoilt(painted(seed)),
     "gray": lambda seed: painted(seed, (0.86, 0.86)),

@@ -6,10 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import emissivity_of, polynomials
 from numpy.typing import NDArray
 
-from dbthermal import _smooth as smooth
 from dbthermal import response as responses
 from dbthermal import separation, simulation
 from dbthermal.simulation import Background, Rig
@@ -93,7 +92,7 @@ def test_emission_and_reflection_are_the_first_band(
 
 def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
     """The reflection's error is that of the best linear estimate, without the scaling."""
-    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
+    functions = polynomials(TIME, found.attrs["order"])
     true = pulses().reshape(FRAMES, -1)
     true -= functions @ (functions.T @ true)
     error = found["reflection"].values.reshape(FRAMES, -1) - true

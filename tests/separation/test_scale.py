@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from captures import polynomials
 from numpy.typing import NDArray
 
-from dbthermal import _smooth as smooth
 from dbthermal import separation
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     with pytest.raises(ValueError, match="pixels have a correlation below"):
         separation.uncalibrated_reflection(shown)  # for its scale moves all of them together
     found = separation.uncalibrated_reflection(separation.unscaled(shown, still()))
-    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
+    functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
     rapid = [part - functions @ (functions.T @ part) for part in rapid]
