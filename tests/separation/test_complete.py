@@ -43,22 +43,6 @@ def half() -> Case:
     return draw(replace(SMALL, still=0.5), 1, 0.86, 0.72)
 
 
-def test_measured_values_are_untouched(half: Case) -> None:
-    """What was measured stays bit for bit; all else is finite and says that it is completed."""
-    _, capture, alone = half
-    whole = separation.complete(alone, capture, RESPONSE)
-    for name in alone.data_vars:
-        if name not in ("status", "noise"):
-            assert bool(whole[name].notnull().all()), name
-            xr.testing.assert_identical(whole[name].where(alone[name].notnull()), alone[name])
-    missing = alone["object_temperature"].isnull().any("time")
-    completed = (whole["status"] & int(COMPLETED)) != 0
-    assert bool(missing.any())
-    assert bool((completed | ~missing).all())
-    assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).where(missing, 1).all())
-    xr.testing.assert_equal(whole["status"] & ~np.uint32(COMPLETED), alone["status"])
-
-
 @pytest.mark.parametrize("temperature", [300.0, 353.0])
 def test_background_behind_a_measured_object_changes_as_it_does(temperature: float) -> None:
     """Behind a constant object all that changes is reflected, however uncertain its temperature."""
@@ -86,37 +70,6 @@ def test_background_behind_a_measured_object_changes_as_it_does(temperature: flo
     print(f"{temperature:g} K: {share:.3f} of the change, intervals hold {hold:.3f}")
     assert 0.9 < share < 1.1
     assert hold > 0.9
-
-
-def test_material_elsewhere_completes_within_noise(half: Case) -> None:
-    """With the labels of one material the still half is right within 0.1 K, and says from what."""
-    scene, capture, alone = half
-    labels = xr.zeros_like(alone["status"]).astype(int)
-    whole = separation.complete(alone, capture, RESPONSE, labels)
-    missing = alone["object_temperature"].isnull()
-    error = abs(whole["object_temperature"] - scene["object_temperature"]).where(missing)
-    within = error < 1.96 * whole["object_temperature_std"]
-    cover = float(within.where(missing).mean())
-    print(f"still half by its material: {float(error.median()):.3f} K, intervals hold {cover:.3f}")
-    assert float(error.median()) < 0.1  # [K]
-    assert cover > 0.9
-    still = whole["status"].where(missing.any("time"), 0).astype(int)
-    assert bool((((still & int(Status.COMPLETED_FROM_MATERIAL)) != 0) | (still == 0)).all())
-
-
-def test_few_pixels_tell_no_material(half: Case) -> None:
-    """Three pixels do not say how much those of their label differ: the prior completes these."""
-    _, capture, alone = half
-    told = np.argwhere(alone["status"].values == 0)[:3]
-    labels = xr.full_like(alone["status"], -1, dtype=int)
-    labels.values[alone["status"].values != 0] = 0
-    labels.values[tuple(told.T)] = 0
-    pooled = alone.assign_attrs(pooled=1)  # as if they were pooled, each with its own
-    whole = separation.complete(pooled, capture, RESPONSE, labels)
-    assert not bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
-    labels.values[tuple(np.argwhere(alone["status"].values == 0)[3:6].T)] = 0
-    whole = separation.complete(pooled, capture, RESPONSE, labels)
-    assert bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
 
 
 def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
@@ -187,54 +140,6 @@ def test_black_gives_the_reading() -> None:
     assert bool((apart < 4.0 * np.hypot(whole["object_temperature_std"], RIG.noise[0])).all())
 
 
-def test_gaps_of_single_pixels(half: Case) -> None:
-    """Samples that a pixel alone lacks are bridged, flagged, and right within their intervals."""
-    scene, capture, _ = half
-    lost = capture.copy(deep=True)
-    lost["counts"].values[1, [0, 50, 51, 52, 53, 54, 55, 120, 199], ::2] = np.nan
-    alone = separation.solve(lost, RESPONSE)
-    whole = separation.complete(alone, lost, RESPONSE)
-    measured = alone["object_temperature"].notnull().any("time")
-    gaps = alone["object_temperature"].isnull() & measured
-    error = abs(whole["object_temperature"] - scene["object_temperature"])
-    within = float((error < 1.96 * whole["object_temperature_std"]).where(gaps).mean())
-    print(f"bridged: {float(error.where(gaps).median()):.3f} K, intervals hold {within:.3f}")
-    assert bool(whole["object_temperature"].notnull().all())
-    assert (whole.attrs["frames_missing"], whole.attrs["frames_bridged"]) == (0, 9)
-    flagged = (whole["status"] & int(Status.COMPLETED_FRAMES)) != 0
-    assert bool(flagged.where(gaps.any("time"), True).all())
-    assert within > 0.9
-
-
-def test_frames_that_no_pixel_has(half: Case) -> None:
-    """Frames without data of a camera stay empty, are counted, and leave no flag at a pixel."""
-    _, capture, _ = half
-    frames = [0, 50, 51, 52, 53, 54, 55, 120, 199]
-    lost = capture.copy(deep=True)
-    lost["counts"].values[1, frames] = np.nan
-    alone = separation.solve(lost, RESPONSE)
-    whole = separation.complete(alone, lost, RESPONSE)
-    empty = whole["object_temperature"].isnull()
-    np.testing.assert_array_equal(np.flatnonzero(empty.all(("y", "x"))), frames)
-    assert int(empty.any(("y", "x")).sum()) == whole.attrs["frames_missing"] == len(frames)
-    assert bool((whole["status"].where(alone["status"] == 0, 0) == 0).all())
-
-
-def test_dead_pixels_stay_empty(half: Case) -> None:
-    """A pixel that the correction marks as bad, or of a constant signal, gets no value."""
-    _, capture, _ = half
-    broken = capture.copy(deep=True)
-    broken["counts"].values[0, :, 3, 4] = 15000.0
-    dead = np.zeros(tuple(capture.sizes[dim] for dim in ("y", "x")), dtype=np.uint32)
-    dead[5, 6] = Status.DEAD_PIXEL
-    broken["status"] = (("y", "x"), dead, schema.status_attrs())
-    whole = separation.complete(separation.solve(broken, RESPONSE), broken, RESPONSE)
-    for place in ((3, 4), (5, 6)):
-        assert bool(whole["object_temperature"][:, place[0], place[1]].isnull().all())
-        assert not whole["status"].values[place] & int(COMPLETED)
-    assert bool(whole["object_temperature"].isnull().any("time").sum() == 2)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -286,7 +191,7 @@ def test_bands_of_no_library_are_refused_before_the_work() -> None:
     assert bool(separation.separate(other, response, prior=prior)["object_temperature"].any())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_unknown_materials_hold() -> None:
     """Nobody walks before materials of the libraries: intervals hold over these, of each or none.
 

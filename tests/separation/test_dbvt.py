@@ -181,18 +181,6 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     assert bool(started["emissivity"].notnull().all())
 
 
-def test_same_seed_same_result() -> None:
-    """A seed fixes the result; other random starts end at the same minimum."""
-    _, capture, response = glass(QUIET, 12)
-    capture = capture.isel(time=slice(0, 150))
-    first, again, other = (
-        separation.solve(capture, response, "dbvt", seed=seed) for seed in (1, 1, 2)
-    )
-    xr.testing.assert_identical(first, again)
-    apart = abs(first["emissivity"] - other["emissivity"])
-    assert float(apart.median()) < 1e-4
-
-
 def test_exact_response_is_taken_out() -> None:
     """Taking out the bend of the exact response at least halves the emissivity's error."""
     scene, capture, response = glass(QUIET, 40)
@@ -210,23 +198,6 @@ def test_too_few_steps_are_flagged() -> None:
     _, capture, response = glass(QUIET, 8)
     result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
-
-
-@pytest.mark.slow
-def test_temperatures_may_come_from_the_measured_signals() -> None:
-    """Without the estimated noise the object is smoother, and nearer to the truth."""
-    scene, capture, response = glass((0.03, 0.35), 30)
-    smooth, raw = (
-        errors(
-            scene,
-            separation.solve(
-                capture, response, "dbvt", settings=DbvtSettings(temperatures_from=source)
-            ),
-        )[1]
-        for source in ("corrected", "measured")
-    )
-    print(f"object from corrected signals {smooth:.3f} K, from measured ones {raw:.3f} K")
-    assert smooth < raw
 
 
 @pytest.mark.parametrize(

@@ -45,27 +45,6 @@ def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
     return float(np.sqrt(((result["reflection_ratio"].sel(band="9.5") - truth) ** 2).mean()))
 
 
-def test_four_hundred_pixels_cut_the_error_tenfold() -> None:
-    """The error of k2 falls by more than 10 over a few films, and that of the object falls."""
-    alone, shared, objects = [], [], []
-    for seed in range(3):
-        scene, capture, response = case(400, seed)
-        results = [
-            separation.solve(capture, response, pool=pool) for pool in (None, labels(one(400)))
-        ]
-        alone.append(error_of_ratio(results[0]))
-        shared.append(error_of_ratio(results[1]))
-        error = [r["object_temperature"] - scene["object_temperature"] for r in results]
-        objects.append([float(np.sqrt((e**2).mean())) for e in error])
-    before, after = (np.sqrt(np.mean(np.square(part))) for part in (alone, shared))
-    of_object = np.sqrt(np.mean(np.square(objects), axis=0))
-    print(
-        f"k2 {before:.4f} alone, {after:.4f} pooled: 1/{before / after:.1f}; object {of_object} K"
-    )
-    assert before / after >= 10
-    assert of_object[1] < of_object[0]
-
-
 def test_shared_error_bars_are_true() -> None:
     """Errors of materials of ten pixels scatter as their standard deviations state."""
     scene, capture, response = case(1000, 3)
@@ -153,24 +132,6 @@ def test_two_materials_stay_apart() -> None:
         assert abs(values[0] - truth) < 0.05
     alone = separation.solve(capture, response)["reflection_ratio"].sel(band="9.5")
     np.testing.assert_allclose(none, alone.values[0, 100:], rtol=1e-6)
-
-
-def test_result_does_not_depend_on_workers_or_tiles() -> None:
-    """Rows or columns, one thread or two: the same pixels, the same values."""
-    _, capture, response = case(400, 14)
-    wide = separation.solve(capture, response, pool=labels(np.arange(400) % 2), workers=1)
-    counts = capture["counts"].values.reshape(2, 350, 400, 1)
-    tall = xr.Dataset(
-        {"counts": (capture["counts"].dims, counts, capture["counts"].attrs)},
-        coords={"band": capture["band"], "time": capture["time"]},
-    )
-    pool = xr.DataArray((np.arange(400) % 2)[:, np.newaxis], dims=("y", "x"))
-    down = [separation.solve(tall, response, pool=pool, workers=n) for n in (1, 2)]
-    xr.testing.assert_identical(*down)
-    for name in ("object_temperature", "emissivity", "reflection_ratio"):
-        np.testing.assert_allclose(
-            down[0][name].values.reshape(wide[name].shape), wide[name].values, rtol=1e-4
-        )
 
 
 @pytest.mark.parametrize(

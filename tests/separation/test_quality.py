@@ -87,7 +87,7 @@ def test_whole_counts_repeat_by_chance(noise: float) -> None:
     assert flags_of_whole_counts(noise, range(2)) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.4, 30.0])
 def test_whole_counts_repeat_by_chance_in_many(noise: float) -> None:
     """At most one in 1e3 of 6400 such pixels is flagged."""

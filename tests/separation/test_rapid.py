@@ -8,7 +8,6 @@ import xarray as xr
 from captures import emissivity_of
 
 from dbthermal import separation, simulation
-from reproduction import twins
 from reproduction.experiments.pictures import Picture
 
 TIME = np.arange(300) / 10.0
@@ -73,7 +72,7 @@ def test_a_kinked_rise_is_followed() -> None:
     assert_true(judge("kink", heated("kink", rng), rng))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("rise", RISES)
 def test_a_climbing_front_is_followed(rise: str) -> None:
     """Rises of any speed: 70 % of the moving pixels without a flag, intervals hold everywhere."""
@@ -81,33 +80,3 @@ def test_a_climbing_front_is_followed(rise: str) -> None:
         rng = np.random.default_rng(seed)
         scene = Picture((40, 56), rise=RISES[rise]).draw(TIME, GLASS, rng)
         assert_true(judge(f"{rise}, seed {seed}", scene, rng))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["kink", "two steps", "touch", "cooling"])
-def test_other_rapid_curves_are_followed(kind: str) -> None:
-    """Kinks, two steps, a touch that fades, and cooling, as rises."""
-    for seed in (2, 3):
-        rng = np.random.default_rng(seed)
-        assert_true(judge(f"{kind}, seed {seed}", heated(kind, rng), rng))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["wineglass", "coffee_pot"])
-def test_a_pour_before_the_capture_is_followed(name: str) -> None:
-    """Simulated twins whose curves begin steeply, as rises; also in the first second."""
-    rng = np.random.default_rng(21)
-    scene = twins.twin(name, twins.Capture(GLASS, shape=(48, 64)), rng)
-    assert_true(judge(name, scene, rng))
-
-
-def test_rapid_pixels_of_one_material_are_pooled() -> None:
-    """Known to be of one material, rapid pixels nearly all lose their flags; intervals hold."""
-    rng = np.random.default_rng(4)
-    scene = Picture((16, 24), rise=(0.5, 2.0)).draw(TIME, GLASS, rng)
-    one = xr.zeros_like(scene["object_temperature"].isel(time=0, drop=True), dtype=np.int64)
-    alone = judge("alone", scene, np.random.default_rng(5))
-    pooled = judge("pooled", scene, np.random.default_rng(5), pool=one)
-    assert pooled["good"] > max(0.9, alone["good"])
-    assert pooled["rmse"] < 0.8 * alone["rmse"]
-    assert 0.9 <= pooled["cover"] <= 0.98

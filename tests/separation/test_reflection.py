@@ -101,23 +101,6 @@ def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
     assert float(np.std(true)) > 3 * noise
 
 
-def test_units_and_provenance(signal: xr.DataArray, found: xr.Dataset) -> None:
-    """The movies keep the input's unit and its mark, the maps have none; the order is written."""
-    assert {str(name): variable.attrs["units"] for name, variable in found.items()} == {
-        "ratio": "1",
-        "correlation": "1",
-        "reflection": "1",
-        "emission": "1",
-    }
-    assert (
-        separation.uncalibrated_reflection(signal.assign_attrs(units="K"))["emission"].attrs[
-            "units"
-        ]
-        == "K"
-    )
-    assert (found.attrs["radiometric"], found.attrs["order"]) == (0, 9)
-
-
 def test_unit_does_not_matter(signal: xr.DataArray, found: xr.Dataset) -> None:
     """Bands in units of their own give the ratio in those units, and the same reflection."""
     scale = xr.DataArray([100.0, 300.0], dims="band")

@@ -116,7 +116,7 @@ def test_intervals_hold_the_residual_pattern() -> None:
     assert shares["without"] < 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_hold_the_residual_pattern_of_many() -> None:
     """The same over five scenes."""
     parts = [cover(seed) for seed in range(2, 7)]

@@ -99,17 +99,6 @@ def test_constant_scale_is_left() -> None:
     assert float(abs(undone["gain"] - 1).max()) == 0.0
 
 
-def test_each_band_is_judged_by_itself() -> None:
-    """Of two bands the one is undone, the other stays as it is."""
-    rng = np.random.default_rng(8)
-    truth, _ = scene(rng)
-    shown = picture(truth, rng)
-    shown[0] = picture(truth, rng, between=False)[0]
-    undone = separation.unscaled(shown, still())
-    assert undone.attrs["scale_undone"] == ["9.5"]
-    np.testing.assert_array_equal(undone[0], shown[0])
-
-
 @pytest.mark.parametrize(
     ("pixels", "message"),
     [

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import response as responses
-from dbthermal import schema, separation, simulation
+from dbthermal import separation, simulation
 from dbthermal.simulation import Rig
 
 TIME = np.arange(60) / 10.0  # s
@@ -56,27 +56,6 @@ def test_bad_settings_are_named(capture: xr.Dataset, case: str) -> None:
     method, arguments, error, message = BAD[case]
     with pytest.raises(error, match=message):
         separation.solve(capture, Rig().response(), method, **arguments)
-
-
-def test_a_dead_pixel_harms_no_neighbour() -> None:
-    """A pixel marked as dead, however hot, does not change the channel prior's other pixels."""
-    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
-    rng, response = np.random.default_rng(3), Rig().response()
-    scene = simulation.walkers(TIME[:8], (20, 24), emissivity, rng, crossings=2)
-    clean = simulation.observe(scene, response, rng)
-    dead = clean.copy(deep=True)
-    dead["counts"][:, :, 10, 12] = 60000.0
-    status = xr.zeros_like(clean["counts"][0, 0], dtype=np.uint16).drop_vars(["band", "time"])
-    status[10, 12] = schema.Status.DEAD_PIXEL
-    options: dict[str, Any] = {
-        "method": "bcp",
-        "settings": separation.BcpSettings(patch=5, window=9),
-    }
-    found = separation.solve(dead.assign(status=status), response, **options)
-    expected = separation.solve(clean, response, **options)
-    name = "object_temperature"
-    assert np.all(np.isnan(found[name][:, 10, 12]))
-    assert float(abs(found[name] - expected[name]).max()) < 2.0  # [K]; 50 K with the pixel in
 
 
 def test_progress_is_shown(capture: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
