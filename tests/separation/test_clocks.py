@@ -109,24 +109,6 @@ def test_no_real_clock_is_refused() -> None:
         separation.solve(capture, RIG.response())
 
 
-@pytest.mark.parametrize("method", separation.METHODS)
-@pytest.mark.parametrize("clock", ["nanoseconds", "bursts of 8 in 0.7 ms", "two pauses"])
-def test_every_method_takes_any_clock_or_names_it(clock: str, method: str) -> None:
-    """No clock is an error but for a method of even times, which names it."""
-    _, capture = seen_at(CLOCKS[clock], 12, seed=1)
-    known = separation.get_method(method)
-    emissivity = GLASS if known.knows_emissivity else None
-    if known.even_times and clock != "nanoseconds":
-        with pytest.raises(ValueError, match=r"Invalid interval .* of 'time' after .* s for"):
-            separation.solve(capture, RIG.response(), method)
-        return
-    quick = separation.DbvtSettings(stages=1, steps=2) if method == "dbvt" else None
-    result = separation.solve(
-        capture, RIG.response(), method, settings=quick, emissivity=emissivity
-    )
-    assert bool(result["object_temperature"].notnull().any())
-
-
 @pytest.mark.parametrize("place", [60, 175, 300])
 def test_a_jump_beside_a_pause_is_found(place: int) -> None:
     """A jump of the object is found at its frame in a recording that pauses for an hour, and what

@@ -1,46 +1,24 @@
 """Two cameras side by side: the object as certain as from one place, right or flagged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
-from scenes import field
+from captures import emissivity_of
+from scenes import GLASS, RIG, TIME, field, judged, painted
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-RIG = simulation.Rig()
-GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-TIME = np.arange(300) / 10
 SMALL = Picture(shape=(20, 48), walkers=6)
-_TO_95 = 1.96
-
-
-def film(
-    picture: Picture, shift: np.ndarray, seed: int, emissivity: xr.DataArray = GLASS
-) -> tuple[xr.Dataset, xr.Dataset]:
-    """Scene and capture of a picture, seen from two places."""
-    rng = np.random.default_rng(seed)
-    scene = picture.draw(TIME, emissivity, rng, shift)
-    return scene, simulation.observe(scene, RIG.response(), rng)
-
-
-def judged(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
-    """Share of pixels without a flag; of these median RMSE [K] and cover of the 95 % intervals."""
-    good = result["status"] == 0
-    error: xr.DataArray = result["object_temperature"] - scene["object_temperature"]
-    held = abs(error) < _TO_95 * result["object_temperature_std"]
-    return {
-        "good": float(good.mean()),
-        "rmse": float((error**2).mean("time").where(good).median() ** 0.5),
-        "cover": float(held.where(good).mean()),
-    }
+STRAIGHT = smooth_shift(SMALL.shape, 2.5, 0.0)
 
 
 def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
     """A dead pixel and one that lacks samples spoil the samples that are mostly made of them."""
-    shift = smooth_shift(SMALL.shape, 2.5, 0.0)
-    _, capture = film(SMALL, shift, 1)
+    capture, shift = painted(1, picture=SMALL, shift=STRAIGHT).capture, STRAIGHT
     counts = capture["counts"].copy()
     counts[1, :, 8, 20] = np.nan
     counts[1, 100:103, 12, 30] = np.nan
@@ -60,15 +38,16 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
 
 def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     """A pixel that is far too warm in the first band passes for no change of the object."""
-    shift = smooth_shift(SMALL.shape, 2.5, 0.0)
-    scene, capture = film(SMALL, shift, 1)
+    scene = painted(1, picture=SMALL, shift=STRAIGHT)
+    capture, shift = scene.capture, STRAIGHT
     stuck = np.zeros(SMALL.shape, dtype=np.uint32)
     stuck[4::6, 7::9] = int(Status.DEAD_PIXEL)
     counts = capture["counts"].where(stuck == 0, 2.0 * float(capture["counts"][0].max()))
     noisy = counts + np.random.default_rng(1).normal(0.0, 3.0, counts.shape)
     bad = capture.assign(counts=noisy.astype(np.float32), status=(("y", "x"), stuck))
     result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
-    error = abs(result["object_temperature"] - scene["object_temperature"]).mean("time")
+    error = abs(result["object_temperature"] - scene.truth["object_temperature"])
+    error = error.mean("time")
     error = error.where(result["status"] == 0)
     print(f"without a flag {float(error.notnull().mean()):.2f}, largest error {error.max():.2f} K")
     assert float(error.notnull().mean()) > 0.75
@@ -77,23 +56,17 @@ def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
 
 def test_known_emissivities_and_rapid_heating() -> None:
     """Frame by frame, the two places make the object more certain than one place does."""
-    picture = Picture(shape=(20, 48), walkers=6, rise=(2.0, 6.0))
+    picture, got = replace(SMALL, rise=(2.0, 6.0)), {}
     shift = smooth_shift(picture.shape, 2.4, 1.2)
-    got = {}
-    for name, moved_by in (("apart", shift), ("one place", np.zeros_like(shift))):
-        scene, capture = film(picture, moved_by, 4)
-        got[name] = judged(
-            scene,
-            separation.solve(
-                capture,
-                RIG.response(),
-                "calibrated",
-                emissivity=GLASS,
-                reflection_shift=field(moved_by),
-            ),
+    options = {"method": "calibrated", "emissivity": emissivity_of(*GLASS)}
+    for name, moved in (("apart", shift), ("one place", np.zeros_like(shift))):
+        scene = painted(4, picture=picture, shift=moved)
+        result = separation.solve(
+            scene.capture, scene.response, reflection_shift=field(moved), **options
         )
+        got[name] = judged(scene, result)
     print(got)
-    assert got["apart"]["good"] > 0.85
+    assert got["apart"]["measured"] > 0.85
     assert got["apart"]["rmse"] < 0.8 * got["one place"]["rmse"]
     assert 0.92 < got["apart"]["cover"] < 0.98
 
@@ -102,7 +75,7 @@ def test_known_emissivities_and_rapid_heating() -> None:
 def test_nothing_stands_where_no_object_fits(wrong: float) -> None:
     """By a wrong field no temperature is without a deviation, none of an impossible emissivity."""
     shift = smooth_shift(SMALL.shape, 2.4, 1.2)
-    _, capture = film(SMALL, shift, 4)
+    capture = painted(4, picture=SMALL, shift=shift).capture
     result = separation.solve(capture, RIG.response(), reflection_shift=field(wrong * shift))
     for name in ("object_temperature", "background_temperature"):
         known = result[name].notnull()
@@ -135,7 +108,9 @@ def test_bad_field_is_a_clear_error(what: str) -> None:
     bad, message = BAD[what]
     rng = np.random.default_rng(1)
     flat = np.full((TIME.size, *SMALL.shape), 300.0)
-    capture = simulation.observe(simulation.scene(TIME, flat, flat, GLASS), RIG.response(), rng)
+    capture = simulation.observe(
+        simulation.scene(TIME, flat, flat, emissivity_of(*GLASS)), RIG.response(), rng
+    )
     capture = capture.assign_coords(x=np.arange(48.0))
     with pytest.raises(ValueError, match=message):
         separation.solve(capture, RIG.response(), reflection_shift=bad)
@@ -145,7 +120,7 @@ def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
     """Stripes of six columns keep their common ratio, of sharp bands, where none is wider."""
     shift = np.zeros((2, *SMALL.shape))
     shift[1] = 4.0
-    (_, capture), known = film(SMALL, shift, 3), field(shift)
+    capture, known = painted(3, picture=SMALL, shift=shift).capture, field(shift)
     stripes = np.arange(SMALL.shape[1]) // 6
     labels = xr.DataArray(np.tile(stripes, (SMALL.shape[0], 1)), dims=("y", "x"))
     pooled = separation.solve(capture, RIG.response(), pool=labels, reflection_shift=known)

@@ -65,17 +65,6 @@ def test_shared_error_bars_are_true() -> None:
     assert of_emissivity >= 0.92
 
 
-def test_a_material_of_one_pixel_is_that_pixel() -> None:
-    """A label for each pixel changes neither values nor deviations."""
-    _, capture, response = case(30, 4)
-    alone = separation.solve(capture, response)
-    shared = separation.solve(capture, response, pool=labels(np.arange(30)))
-    for name in ("object_temperature", "emissivity", "reflection_ratio"):
-        apart = abs(shared[name] - alone[name])
-        assert bool((apart <= 0.15 * alone[f"{name}_std"]).all())
-        np.testing.assert_allclose(shared[f"{name}_std"], alone[f"{name}_std"], rtol=0.1, atol=0)
-
-
 def test_still_pixels_of_a_material_get_a_temperature() -> None:
     """Pixels with a still background get a temperature by the ratio of their material."""
     together = beside(case(60, 5), case(20, 6, background={"kind": "still"}))
