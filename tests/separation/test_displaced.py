@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
-from scenes import GLASS, RIG, TIME, field, judged, painted
+from scenes import GLASS, RIG, field, judged, painted
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
 from reproduction.experiments.pictures import Picture, smooth_shift
 
+TIME = np.arange(300) / 10.0
 SMALL = Picture(shape=(20, 48), walkers=6)
 STRAIGHT = smooth_shift(SMALL.shape, 2.5, 0.0)
 
 
 def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
     """A dead pixel and one that lacks samples spoil the samples that are mostly made of them."""
-    capture, shift = painted(1, picture=SMALL, shift=STRAIGHT).capture, STRAIGHT
+    capture, shift = painted(1, picture=SMALL, time=TIME, shift=STRAIGHT).capture, STRAIGHT
     counts = capture["counts"].copy()
     counts[1, :, 8, 20] = np.nan
     counts[1, 100:103, 12, 30] = np.nan
@@ -38,7 +39,7 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
 
 def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     """A pixel that is far too warm in the first band passes for no change of the object."""
-    scene = painted(1, picture=SMALL, shift=STRAIGHT)
+    scene = painted(1, picture=SMALL, time=TIME, shift=STRAIGHT)
     capture, shift = scene.capture, STRAIGHT
     stuck = np.zeros(SMALL.shape, dtype=np.uint32)
     stuck[4::6, 7::9] = int(Status.DEAD_PIXEL)
@@ -60,7 +61,7 @@ def test_known_emissivities_and_rapid_heating() -> None:
     shift = smooth_shift(picture.shape, 2.4, 1.2)
     options = {"method": "calibrated", "emissivity": emissivity_of(*GLASS)}
     for name, moved in (("apart", shift), ("one place", np.zeros_like(shift))):
-        scene = painted(4, picture=picture, shift=moved)
+        scene = painted(4, picture=picture, time=TIME, shift=moved)
         result = separation.solve(
             scene.capture, scene.response, reflection_shift=field(moved), **options
         )
@@ -75,7 +76,7 @@ def test_known_emissivities_and_rapid_heating() -> None:
 def test_nothing_stands_where_no_object_fits(wrong: float) -> None:
     """By a wrong field no temperature is without a deviation, none of an impossible emissivity."""
     shift = smooth_shift(SMALL.shape, 2.4, 1.2)
-    capture = painted(4, picture=SMALL, shift=shift).capture
+    capture = painted(4, picture=SMALL, time=TIME, shift=shift).capture
     result = separation.solve(capture, RIG.response(), reflection_shift=field(wrong * shift))
     for name in ("object_temperature", "background_temperature"):
         known = result[name].notnull()
@@ -120,7 +121,7 @@ def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
     """Stripes of six columns keep their common ratio, of sharp bands, where none is wider."""
     shift = np.zeros((2, *SMALL.shape))
     shift[1] = 4.0
-    capture, known = painted(3, picture=SMALL, shift=shift).capture, field(shift)
+    capture, known = painted(3, picture=SMALL, time=TIME, shift=shift).capture, field(shift)
     stripes = np.arange(SMALL.shape[1]) // 6
     labels = xr.DataArray(np.tile(stripes, (SMALL.shape[0], 1)), dims=("y", "x"))
     pooled = separation.solve(capture, RIG.response(), pool=labels, reflection_shift=known)
