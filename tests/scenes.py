@@ -377,9 +377,9 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
     """Figures of a result against the truth.
 
     Shares [1] of pixels `measured` (no flag, but for frames that are interpolated), `completed`
-    and `empty` (without any number). Of those measured: `rmse` of the object [K], `cover` of its
-    95 % intervals, share `silent` that is off by more than four deviations and 0.3 K, median errors
-    of `emissivity` and `ratio`. Of all pixels: `p90` of their RMSE [K], `whole` cover.
+    and `empty` (without any number). Of those measured: `rmse` of the object, of a `typical` pixel
+    (median) [K], `cover` of its 95 % intervals, share `silent` that is off by more than four
+    deviations and 0.3 K, median errors of `emissivity` and `ratio`. Of all pixels: `p90` of their RMSE [K], `whole` cover.
     """
     truth = scene.truth["object_temperature"].values
     error, std = (
@@ -401,8 +401,10 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
         of_ratio = np.abs(result["reflection_ratio"].values / ratio - 1.0)[:, good]
         if "shift" in scene.truth:  # the other band sees another place
             of_ratio = of_ratio[:0]
+        typical = float(np.median(size[good])) if good.any() else np.nan
         return {
             "measured": float(good.mean()),
+            "typical": typical,
             "completed": float(((status & np.uint32(COMPLETED)) != 0).mean()),
             "empty": float((~there).all(axis=0).mean()),
             "rmse": float(np.sqrt(np.nanmean(error[:, good] ** 2))),

@@ -26,7 +26,7 @@ def test_plan_is_the_bound(materials: Materials) -> None:
     table, noise = materials
     row = table.sel(material=["plate window glass"])
     design = limits.CaptureDesign()
-    time = np.arange(350) / 10.0
+    time: np.ndarray[Any, np.dtype[np.float64]] = np.arange(350) / 10.0
     rise = np.expm1(-3.0 * time / time[-1]) / np.expm1(-3.0)  # in a third of the time
     pulse = np.mod(time + 0.05, design.period) > design.period - design.duration
     warm, cold = design.start + design.span * rise, design.level + design.amplitude * pulse
@@ -35,8 +35,8 @@ def test_plan_is_the_bound(materials: Materials) -> None:
     of_glass = row["emissivity"].isel(material=0).sel(band=list(rig.bands))
     scene = simulation.scene(
         time,
-        warm[:, None, None],
-        cold[:, None, None],
+        np.asarray(warm)[:, None, None],
+        np.asarray(cold, dtype=np.float64)[:, None, None],
         of_glass.drop_vars("material"),
     )
     response["noise"] = noise.sel(band=list(rig.bands)) * response["noise"].assign_attrs(

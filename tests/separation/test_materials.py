@@ -91,7 +91,9 @@ def test_labels_are_an_image_and_hang_on_no_order(small: Inputs) -> None:
     """Labels are ordered by size; inputs stay as they are; the quieter band is the reference."""
     before = [part.copy(deep=True) for part in small]
     labels = materials(*small)
-    assert (labels.dims, labels.dtype, labels.attrs["units"]) == (("y", "x"), np.int32, "1")
+    assert labels.dims == ("y", "x")
+    assert labels.dtype == np.int32
+    assert labels.attrs["units"] == "1"
     sizes = np.bincount(labels.values[labels.values != NONE], minlength=1)
     assert np.all(np.diff(sizes) <= 0)
     for part, copy in zip(small, before, strict=True):
