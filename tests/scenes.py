@@ -379,7 +379,8 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
     Shares [1] of pixels `measured` (no flag, but for frames that are interpolated), `completed`
     and `empty` (without any number). Of those measured: `rmse` of the object, of a `typical` pixel
     (median) [K], `cover` of its 95 % intervals, share `silent` that is off by more than four
-    deviations and 0.3 K, median errors of `emissivity` and `ratio`. Of all pixels: `p90` of their RMSE [K], `whole` cover.
+    deviations and 0.3 K, median errors of `emissivity` and `ratio`. Of all pixels:
+    `p90` of their RMSE [K], `whole` cover.
     """
     truth = scene.truth["object_temperature"].values
     error, std = (

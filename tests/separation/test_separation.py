@@ -201,8 +201,8 @@ def test_a_long_rest_is_explained(louder: float) -> None:
     time, rig = np.arange(3000) / 10.0, Rig(noise=(0.03, 0.03 * louder))
     warm = 300.0 + 20.0 * (1.0 - np.exp(-time / 100.0))
     cold = 293.0 + 6.0 * (np.abs(time - 120.0) < 3.0)
-    warm, cold = (np.broadcast_to(one[:, None, None], (3000, 10, 20)) for one in (warm, cold))
-    scene = simulation.scene(time, warm, cold, emissivity_of(0.86, 0.72))
+    films = np.broadcast_to(np.stack([warm, cold])[..., None, None], (2, 3000, 10, 20))
+    scene = simulation.scene(time, films[0], films[1], emissivity_of(0.86, 0.72))
     capture = simulation.observe(scene, rig.response(), np.random.default_rng(8))
     status = separation.solve(capture, rig.response())["status"]
     print(f"noise 1:{louder:g}: flagged {float((status != 0).mean()):.4f}")

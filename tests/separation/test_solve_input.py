@@ -1,4 +1,4 @@
-"""Input of `solve`: invalid arguments, bad pixels, and their status."""
+"""Input of `solve`: invalid arguments, settings, randomness and what is recorded of it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -42,6 +42,10 @@ def test_order_of_bands_and_tiles_does_not_matter(
 
 
 BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
+    "negative seed": (
+        lambda c, r: separation.solve(c, r, "naive", seed=-1),
+        "Invalid seed -1. Must be",
+    ),
     "unknown method": (
         lambda c, r: separation.solve(c, r, "magic"),
         r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated', 'dbvt'",
@@ -183,3 +187,40 @@ def test_reflected_change_of_other_results(glass: Glass) -> None:
         separation.reflected_change(apparent.rename(y="row"), result)
     with pytest.raises(ValueError, match="Missing variable 'emissivity'"):
         separation.reflected_change(apparent, result.drop_vars("emissivity"))
+
+
+@pytest.mark.parametrize("method", ["naive", "dbvt"])
+def test_random_starts_hang_on_the_seed_alone(glass: Glass, method: str) -> None:
+    """Random starts depend on the seed: the same one repeats the result, another changes it."""
+    capture, response = glass[1].isel(time=slice(0, 60)), glass[2]
+    few = separation.DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
+    first, again, other = (
+        separation.solve(capture, response, method, settings=few, seed=seed)["emissivity"]
+        for seed in (1, 1, 2)
+    )
+    xr.testing.assert_identical(first, again)
+    assert float(abs(first - other).max()) > 1e-6
+
+
+def test_progress_is_shown(glass: Glass, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bar counts the pixels, on request."""
+    _, capture, response = glass
+    separation.solve(capture, response, progress=True)
+    assert "subspace: 100%" in capsys.readouterr().err
+    separation.solve(capture, response)
+    assert capsys.readouterr().err == ""
+
+
+def test_options_are_recorded(glass: Glass) -> None:
+    """The result records the settings of its method."""
+    settings = separation.RatioSettings("narrow")
+    result = separation.solve(*glass[1:], "ratio", settings=settings)
+    assert "kind='narrow'" in result.attrs["settings"]
+
+
+def test_apparent_is_the_reading_of_the_quieter_band(glass: Glass) -> None:
+    """Method "apparent" gives the blackbody temperature of the quieter band's counts."""
+    _, capture, response = glass
+    found = separation.solve(capture, response, "apparent")["object_temperature"]
+    counts = responses.curve(response, "8-14").counts(found.values.astype(np.float64))
+    np.testing.assert_allclose(counts, capture["counts"][0], rtol=0, atol=0.05)  # [count]

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
+from scenes import field
 
 from dbthermal import schema, simulation
 from dbthermal.schema import Status
@@ -121,19 +122,9 @@ def test_memory_does_not_grow_and_the_past_is_forgotten() -> None:
 def test_a_shift_of_nothing_changes_nothing(glass: Data) -> None:
     """Cameras in one place: the second one's frames are resampled to themselves."""
     _, capture, response = glass
-    axes = {"axis": ["y", "x"], "y": capture["y"].values, "x": capture["x"].values}
-    none = np.zeros((2, capture.sizes["y"], capture.sizes["x"]), np.float32)
-    attrs = {"units": "pixel"}
-    field = xr.Dataset(
-        {
-            "shift": (("axis", "y", "x"), none, attrs),
-            "shift_std": (("axis", "y", "x"), none, attrs),
-            "known": (("y", "x"), none[0] == 0),
-        },
-        axes,
-    )
+    none = field(np.zeros((2, capture.sizes["y"], capture.sizes["x"])))
     plain = live(capture, response)[0].result()
-    shifted = live(capture, response, reflection_shift=field)[0].result()
+    shifted = live(capture, response, reflection_shift=none)[0].result()
     xr.testing.assert_allclose(shifted, plain, rtol=1e-5)
 
 
