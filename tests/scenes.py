@@ -285,6 +285,7 @@ SCENES: Final[Mapping[str, Callable[[int], Scene]]] = {
         (0.95, 0.88),
         Picture((40, 56), 6, rise=(0.5, 2.0), still=0.5),
         smooth_shift((40, 56), 4.2, 1.0),
+        time=TIME[:200],
     ),
     "rapid before a still half": lambda seed: painted(seed, picture=replace(RAPID, still=0.5)),
     "samples lost": lambda seed: spoilt(painted(seed)),
