@@ -15,6 +15,13 @@ def emissivity_of(*values: float, bands: tuple[str, ...] = RIG.bands) -> xr.Data
     return xr.DataArray(list(values), dims="band", coords={"band": list(bands)})
 
 
+def polynomials(time: np.ndarray, order: int) -> np.ndarray:
+    """Orthonormal polynomials (time, order) over the frames, of degrees below the order."""
+    share = 2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0
+    found: np.ndarray = np.linalg.qr(np.polynomial.legendre.legvander(share, order - 1))[0]
+    return found
+
+
 def panels(*, size: int = 16) -> xr.DataArray:
     """A checkerboard of two materials: edges and corners everywhere."""
     rows, columns = np.indices(SHAPE)

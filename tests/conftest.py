@@ -8,6 +8,7 @@ import hypothesis
 import numpy as np
 import pytest
 import xarray as xr
+from scenes import Shelf
 
 from dbthermal import simulation
 from dbthermal.simulation import Background, Rig
@@ -26,6 +27,14 @@ def mirror() -> Path:
     if not Path(folder).is_dir():
         pytest.fail(f"Invalid DBTHERMAL_DATA {folder!r}. Must name a folder.")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def shelf(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Shelf:
+    """Small scenes and what comes out of them, shared by all workers of the session."""
+    folder = tmp_path_factory.getbasetemp()
+    one_of_several = hasattr(request.config, "workerinput")
+    return Shelf((folder.parent if one_of_several else folder) / "scenes")
 
 
 @pytest.fixture(scope="module")

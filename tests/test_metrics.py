@@ -119,21 +119,6 @@ def test_constant_map_has_no_correlation(truth: xr.DataArray) -> None:
         metrics.correlation(truth, flat)
 
 
-def test_one_pixel_has_no_correlation(truth: xr.DataArray) -> None:
-    """A correlation needs two pixels, and a mask that is the same in each frame."""
-    mask = truth.isel(time=0) == 301.0
-    with pytest.raises(ValueError, match="1 pixels remain"):
-        metrics.correlation(truth, truth, mask)
-    with pytest.raises(ValueError, match="Invalid mask"):
-        metrics.correlation(truth, truth, truth > 301.0)
-
-
-def test_missing_dimension(truth: xr.DataArray) -> None:
-    """Maps without one of their dimensions raise a ValueError."""
-    with pytest.raises(ValueError, match="Must hold y and x"):
-        metrics.correlation(truth.isel(x=0), truth.isel(x=0))
-
-
 def test_other_dims_are_refused(truth: xr.DataArray) -> None:
     """A curve in time is broadcast; a dim that the other array lacks raises a ValueError."""
     curve = truth.isel(y=0, x=0, drop=True)

@@ -1,12 +1,14 @@
-"""Counts that are computed when they are read are those computed at once."""
+"""Counts computed when they are read, and films on disk: the values of those in memory."""
 
+import resource
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _rows, alignment, correction, simulation
+from dbthermal import _arrays, _rows, alignment, correction, simulation
 
 SHAPE = (2, 5, 13, 7)
 WHOLE = xr.DataArray(
@@ -96,3 +98,41 @@ def test_rows_without_a_good_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     by_rows = correction.correct_capture(raw, fitted, lazy=True)["pattern_std"].values
     assert np.all(whole > 0)
     np.testing.assert_allclose(by_rows, whole, rtol=0.02)
+
+
+def test_a_film_on_disk_is_an_array_without_a_name(tmp_path: Path) -> None:
+    """Values outlive the pages, no file is left to be deleted, and small arrays stay in memory."""
+    before = _arrays.empty((3, 512, 1024), np.float32)
+    with _arrays.on_disk(tmp_path):
+        film = _arrays.empty((3, 512, 1024), np.float32)
+        small = _arrays.empty((4, 5), np.float32)
+    film[:] = np.arange(3, dtype=np.float32)[:, np.newaxis, np.newaxis]
+    _arrays.release()
+    np.testing.assert_array_equal(film[:, ::100, 7], np.outer([0, 1, 2], np.ones(6)))
+    again = _arrays.copied(film)
+    np.testing.assert_array_equal(again, film)
+    assert list(tmp_path.iterdir()) == []
+    assert film.flags.writeable
+    assert not _arrays.made_on_disk()
+    assert before.base is None
+    assert small.base is None
+    assert film.base is not None
+
+
+def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
+    """A film for which there is no room is refused, and does not end the process when written."""
+    with _arrays.on_disk(tmp_path), pytest.raises(OSError):  # noqa: PT011 - the system's own words
+        _arrays.empty((2**44,), np.float64)
+
+
+def test_pages_are_given_back(tmp_path: Path) -> None:
+    """A film of 256 MB that is released part by part takes a fraction of that."""
+    with _arrays.on_disk(tmp_path):
+        film = _arrays.empty((64, 2**20), np.float32)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for frame in film:
+        frame[:] = 1.0
+        _arrays.release()
+    taken = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+    assert taken < film.nbytes / 4
+    assert float(film[::9].mean()) == 1.0

@@ -32,13 +32,6 @@ def test_basis_spans_the_polynomials(time: Array, order: int, seed: int) -> None
     np.testing.assert_allclose(functions @ (functions.T @ signal), signal, rtol=0, atol=1e-10)
 
 
-def test_bases_are_nested() -> None:
-    """A higher order keeps the functions of the lower one, up to their sign."""
-    time = np.arange(30.0)
-    small, large = smooth.polynomial_basis(time, 3), smooth.polynomial_basis(time, 7)
-    np.testing.assert_allclose(np.abs(large[:, :3]), np.abs(small), rtol=0, atol=1e-12)
-
-
 @given(st.floats(0.01, 100.0), st.floats(-1e4, 1e4))
 def test_basis_ignores_unit_and_start_of_time(scale: float, start: float) -> None:
     """Seconds or minutes, from whenever: the functions are the same."""
@@ -47,11 +40,6 @@ def test_basis_ignores_unit_and_start_of_time(scale: float, start: float) -> Non
     np.testing.assert_allclose(
         np.abs(functions), np.abs(smooth.polynomial_basis(time, 5)), rtol=0, atol=1e-6
     )
-
-
-def test_single_frame() -> None:
-    """One frame has the constant alone."""
-    np.testing.assert_allclose(np.abs(smooth.polynomial_basis([3.0], 1)), [[1.0]], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("order", [0, -1, 6])
@@ -148,20 +136,6 @@ def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list
     np.testing.assert_allclose(own, curve, rtol=0, atol=1e-9)
 
 
-def test_leverage_with_steps_is_the_variance_of_the_object_part() -> None:
-    """White noise through the fit scatters as the leverage says, at every order."""
-    rng = np.random.default_rng(5)
-    time, noise = np.arange(80.0), rng.standard_normal((80, 4000))
-    functions = smooth.subspace(time, 5, segment=segmented(80, 30))
-    for order in (1, 3, 5):
-        used = functions.columns(np.array([order]))[:, 0]
-        assert used.sum() == order + 1
-        own = functions.object_part[:, used] @ (functions.functions[:, used].T @ noise)
-        np.testing.assert_allclose(
-            own.var(axis=1), functions.leverage[:, order - 1], rtol=0.15, atol=0
-        )
-
-
 def test_without_steps_the_subspace_is_the_basis() -> None:
     """No event: the polynomials, all of them the object's own."""
     time = np.arange(30.0)
@@ -205,10 +179,3 @@ def test_pieces_are_the_polynomials_of_their_frames(events: tuple[int, ...]) -> 
         np.testing.assert_allclose(np.abs(functions.functions), np.abs(whole), rtol=0, atol=1e-12)
     left = whole - functions.functions @ (functions.functions.T @ whole)
     np.testing.assert_allclose(left, 0.0, rtol=0, atol=1e-12)
-
-
-def test_frames_in_few_places_have_orthonormal_pieces() -> None:
-    """Bursts far apart within one piece: its functions stay orthonormal."""
-    time = np.concatenate([np.arange(8) * 1e-4, 1e3 + np.arange(8) * 1e-4])
-    functions = smooth.piecewise(time, np.arange(16) == 0, np.ones((16, 1))).functions
-    np.testing.assert_allclose(functions.T @ functions, np.eye(5), rtol=0, atol=1e-10)

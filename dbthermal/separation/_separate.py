@@ -258,11 +258,12 @@ def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
     jackknife): an object's own rapid changes displace a window, and so does a border of materials.
     """
     each = _displacements(corrected, response)
-    windows, (*tensor, gradient) = len(each), each.sum(axis=0)
-    if windows < _FEWEST or np.linalg.eigvalsh(tensor)[0] <= 0.0:
+    windows, whole = len(each), each.sum(axis=0)
+    # All windows, and those without one after another, have to tell a displacement.
+    told = np.concatenate([whole[np.newaxis], whole - each])
+    if windows < _FEWEST or np.linalg.eigvalsh(told[:, :2]).min() <= 0.0:
         return 0.0
-    shift = np.linalg.solve(tensor, gradient)
-    without = [np.linalg.solve(one[:2], one[2]) for one in each.sum(axis=0) - each]
+    shift, *without = (np.linalg.solve(one[:2], one[2]) for one in told)
     covariance = (windows - 1) ** 2 / windows * np.cov(np.transpose(without))
     square = shift @ np.linalg.solve(covariance, shift)
     chance = fdtrc(2, windows - 2, 0.5 * (windows - 2) / (windows - 1) * square)

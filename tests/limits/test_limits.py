@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import polynomials
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal import _smooth as smooth
 from dbthermal import limits, mixing, simulation
 from dbthermal import response as responses
 from dbthermal.simulation import Background, Rig
@@ -53,7 +53,7 @@ def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> No
     found = limits.bounds(scene, RIG.response(), order=6, **NOTHING)["reflection_ratio_std"]
     cold = scene["background_temperature"].values[:, 0]
     variance = limits.ratio_variance_bound(
-        (0.86, 0.72), linear_noise(RIG), cold, smooth.polynomial_basis(TIME, 6)
+        (0.86, 0.72), linear_noise(RIG), cold, polynomials(TIME, 6)
     )
     np.testing.assert_allclose(found[1, 0], np.sqrt(variance), rtol=1e-7)
     assert np.all(found[0] == 0)  # the quieter band over itself
@@ -63,7 +63,7 @@ def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
     """The bound equals the inverse Fisher information of the model with all its unknowns."""
     rng = np.random.default_rng(0)
     time, noise, pair = np.arange(40.0), (0.05, 0.3), (0.86, 0.72)
-    background, functions = rng.normal(0, 3, 40), smooth.polynomial_basis(time, 4)
+    background, functions = rng.normal(0, 3, 40), polynomials(time, 4)
     ratio = float(limits.reflection_ratio(pair))
     # Unknowns: the ratio, four coefficients of each band's smooth part, one reflection a frame.
     reflection = (1 - pair[0]) * background
@@ -148,7 +148,7 @@ def whole_fisher(scene: xr.Dataset, rig: Rig, functions: np.ndarray) -> dict[str
 def test_elimination_gives_the_whole_inverse(rig: Rig, values: tuple[float, ...]) -> None:
     """The background eliminated frame by frame, two bands or three, exact response, with rests."""
     scene = scene_of(*values, rig=rig, pixels=1).isel(time=slice(0, 350, 7))
-    functions = smooth.polynomial_basis(scene["time"].values, 5)
+    functions = polynomials(scene["time"].values, 5)
     projected = functions @ (functions.T @ scene["object_temperature"].values[:, 0, 0])
     scene["object_temperature"] = scene["object_temperature"].copy(data=projected[:, None, None])
     found = limits.bounds(scene, rig.response(), order=5)
@@ -224,7 +224,7 @@ def test_order_leaves_little() -> None:
     for pixel, order in enumerate(found["order"].values[0]):
         left = []
         for size in (order, order - 1):
-            functions = smooth.polynomial_basis(TIME, int(size))
+            functions = polynomials(TIME, int(size))
             warm = scene["object_temperature"].values[:, 0, pixel]
             left.append(np.sum((warm - functions @ (functions.T @ warm)) ** 2))
         # z2 - k2 z1 holds (1 - k2) x, and k2 = 2.
@@ -248,16 +248,6 @@ def test_more_is_known_the_less_is_assumed() -> None:
         ratio = other["object_temperature_std"].mean() / plain["object_temperature_std"].mean()
         print(f"{options}: object's bound times {float(ratio):.3f}")
         assert (float(ratio) < 1) == lower
-
-
-def test_pixels_are_independent() -> None:
-    """A pixel's bound is the same alone and among others of other orders."""
-    scene = scene_of(0.86, 0.72)
-    whole = limits.bounds(scene, RIG.response())
-    alone = limits.bounds(scene.isel(x=[4]), RIG.response())
-    assert len(np.unique(whole["order"])) > 1
-    for name in ("object_temperature_std", "emissivity_std", "order"):
-        np.testing.assert_allclose(alone[name], whole[name].isel(x=[4]), rtol=1e-9)
 
 
 def test_glass_is_as_designed() -> None:
@@ -317,15 +307,3 @@ def test_options_of_another_type_are_named(options: dict[str, Any]) -> None:
     """Options of another type raise a TypeError with their name."""
     with pytest.raises(TypeError, match=f"Invalid {next(iter(options))}"):
         limits.bounds(scene_of(0.86, 0.72), RIG.response(), **options)
-
-
-def test_ratio_bound_names_what_is_wrong() -> None:
-    """One noise for two bands, per cent and missing functions raise an error that names them."""
-    call: Any = limits.ratio_variance_bound
-    for arguments, message in (
-        (((0.8, 0.7), 3, np.ones(9), np.ones((9, 1))), r"Invalid noise \[K\] 3 of shape"),
-        (((80, 70), (0.1, 0.1), np.ones(9), np.ones((9, 1))), "Invalid emissivity 80"),
-        (((0.8, 0.7), (0.1, 0.1), np.ones(9), None), "Invalid basis None"),
-    ):
-        with pytest.raises((TypeError, ValueError), match=message):
-            call(*arguments)

@@ -50,7 +50,7 @@ def at_random(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     return scene, simulation.observe(scene, RIG.response(), rng)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.* of the pixels with moving reflections do not show the same")
 def test_hardly_a_pixel_is_wrong_without_a_flag() -> None:
     """Of eight scenes: pixels beyond five deviations, and the intervals of all, in each way."""

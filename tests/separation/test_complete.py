@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
-from test_displaced import field
+from scenes import field
 
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation._completion import posterior
-from dbthermal.separation._completion.scene import contradicted, gather
-from dbthermal.separation._inputs import check
-from dbthermal.separation._solve import get_method
-from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Rig, observe
 from reproduction.experiments.pictures import ROOM, Picture
 
@@ -48,55 +43,6 @@ def half() -> Case:
     return draw(replace(SMALL, still=0.5), 1, 0.86, 0.72)
 
 
-def test_measured_values_are_untouched(half: Case) -> None:
-    """What was measured stays bit for bit; all else is finite and says that it is completed."""
-    _, capture, alone = half
-    whole = separation.complete(alone, capture, RESPONSE)
-    for name in alone.data_vars:
-        if name not in ("status", "noise"):
-            assert bool(whole[name].notnull().all()), name
-            xr.testing.assert_identical(whole[name].where(alone[name].notnull()), alone[name])
-    missing = alone["object_temperature"].isnull().any("time")
-    completed = (whole["status"] & int(COMPLETED)) != 0
-    assert bool(missing.any())
-    assert bool((completed | ~missing).all())
-    assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).where(missing, 1).all())
-    xr.testing.assert_equal(whole["status"] & ~np.uint32(COMPLETED), alone["status"])
-
-
-def test_a_bend_that_may_be_the_background_tells_no_emissivity() -> None:
-    """The curve is known as one beside a quadratic and a cubic of such variances."""
-    time, rng = np.arange(320) / 10.0, np.random.default_rng(4)
-    rise = 20.0 * (1.0 - np.exp(-time / 12.0))
-    signals = np.stack([rise, 0.84 * rise])[..., np.newaxis] + 0.01 * rng.standard_normal(
-        (2, 320, 3)
-    )
-    tile = Tile(
-        signals=signals,
-        time=time,
-        curves=(),
-        noise=(0.03, 0.35),
-        shape=(1, 3),
-        rng=rng,
-    )
-    means = posterior.bins(tile, np.ones((320, 3), dtype=bool))
-    plain, bend = posterior.curve(tile, means, np.zeros(1)), np.array([[0.0, 0.4, 1e3]])
-    loose = posterior.curve(tile, means, np.zeros(1), bend=bend)
-    angle = np.pi * (np.arange(4) + 0.5) / 4.0  # of the nodes, Chebyshev's
-    bends = np.cos(np.multiply.outer([2.0, 3.0], angle))
-    for pixel, deviation in enumerate(bend[0]):
-        inverse = np.linalg.inv(plain.information[0, :, :, pixel])
-        expected = np.linalg.inv(inverse + deviation**2 * bends.T @ bends)
-        np.testing.assert_allclose(
-            loose.information[0, :, :, pixel], expected, rtol=1e-6, atol=1e-6 * expected.max()
-        )
-        # The mean stays: H' = (H^-1 + V)^-1, h' = H' H^-1 h.
-        mean = np.linalg.solve(plain.information[0, :, :, pixel], plain.linear[0, :, pixel])
-        np.testing.assert_allclose(
-            loose.linear[0, :, pixel], expected @ mean, rtol=1e-6, atol=1e-6 * expected.max()
-        )
-
-
 @pytest.mark.parametrize("temperature", [300.0, 353.0])
 def test_background_behind_a_measured_object_changes_as_it_does(temperature: float) -> None:
     """Behind a constant object all that changes is reflected, however uncertain its temperature."""
@@ -126,56 +72,6 @@ def test_background_behind_a_measured_object_changes_as_it_does(temperature: flo
     assert hold > 0.9
 
 
-def test_material_elsewhere_completes_within_noise(half: Case) -> None:
-    """With the labels of one material the still half is right within 0.1 K, and says from what."""
-    scene, capture, alone = half
-    labels = xr.zeros_like(alone["status"]).astype(int)
-    whole = separation.complete(alone, capture, RESPONSE, labels)
-    missing = alone["object_temperature"].isnull()
-    error = abs(whole["object_temperature"] - scene["object_temperature"]).where(missing)
-    within = error < 1.96 * whole["object_temperature_std"]
-    cover = float(within.where(missing).mean())
-    print(f"still half by its material: {float(error.median()):.3f} K, intervals hold {cover:.3f}")
-    assert float(error.median()) < 0.1  # [K]
-    assert cover > 0.9
-    still = whole["status"].where(missing.any("time"), 0).astype(int)
-    assert bool((((still & int(Status.COMPLETED_FROM_MATERIAL)) != 0) | (still == 0)).all())
-
-
-def test_pixels_that_are_not_of_their_material_contradict_it(half: Case) -> None:
-    """By chance 0.3 % do; and those whose ratio of emissivities is off, each within a deviation."""
-    _, capture, alone = half
-    inputs = check(capture, RESPONSE, get_method("subspace"), "subspace")
-    rng, places = np.random.default_rng(5), np.arange(480)
-    covariance = np.array([[9.0, 8.5], [8.5, 10.0]]) * 1e-4
-    scene = replace(
-        gather(inputs, alone, alone, None),
-        emissivity=np.full((2, places.size), [[0.86], [0.72]]),
-        covariance=np.repeat(covariance[..., np.newaxis], places.size, axis=-1),
-    )
-    drawn = rng.multivariate_normal([0.86, 0.72], covariance, (100, places.size))
-    chance = [contradicted(scene, {"emissivity": one.T}, places).mean() for one in drawn]
-    other = {"emissivity": scene.emissivity + np.array([[0.03], [-0.03]])}
-    print(f"{100.0 * np.mean(chance):.2f} % by chance")
-    assert np.mean(chance) == pytest.approx(0.0027, rel=0.3)
-    assert contradicted(scene, other, places).all()
-
-
-def test_few_pixels_tell_no_material(half: Case) -> None:
-    """Three pixels do not say how much those of their label differ: the prior completes these."""
-    _, capture, alone = half
-    told = np.argwhere(alone["status"].values == 0)[:3]
-    labels = xr.full_like(alone["status"], -1, dtype=int)
-    labels.values[alone["status"].values != 0] = 0
-    labels.values[tuple(told.T)] = 0
-    pooled = alone.assign_attrs(pooled=1)  # as if they were pooled, each with its own
-    whole = separation.complete(pooled, capture, RESPONSE, labels)
-    assert not bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
-    labels.values[tuple(np.argwhere(alone["status"].values == 0)[3:6].T)] = 0
-    whole = separation.complete(pooled, capture, RESPONSE, labels)
-    assert bool(((whole["status"] & int(Status.COMPLETED_FROM_MATERIAL)) != 0).any())
-
-
 def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
     """Two cameras see two backgrounds there: what one band shows of its own is no emission."""
     picture = Picture(shape=(24, 64), walkers=2, warmer=(10.0, 12.0))
@@ -195,24 +91,6 @@ def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
     assert float(beyond[:, :14].mean()) > 0.9
     assert float(off.max()) < 0.1
     assert cover > 0.9
-
-
-def test_nobody_walks() -> None:
-    """Glass before a still room: nothing is measured, and all of it completed from the library."""
-    scene, capture, alone = draw(NOBODY, 2, 0.86, 0.72)
-    assert bool(alone["object_temperature"].isnull().all())
-    whole = separation.complete(alone, capture, RESPONSE)
-    reading = separation.solve(capture, RESPONSE, "apparent")
-    errors = [
-        abs(part["object_temperature"] - scene["object_temperature"]) for part in (whole, reading)
-    ]
-    within = float((errors[0] < 1.96 * whole["object_temperature_std"]).mean())
-    print(f"{float(errors[0].median()):.2f} K, reading {float(errors[1].median()):.2f} K, {within}")
-    assert float(errors[0].median()) < float(errors[1].median())
-    assert within > 0.9
-    # The bands agree where the object is as warm as the room: that tells the room.
-    assert whole.attrs["surroundings"] == pytest.approx(ROOM, abs=0.5)  # [K]
-    assert whole.attrs["surroundings_source"] == "capture"
 
 
 def test_known_material_and_surroundings_narrow_the_bars() -> None:
@@ -248,26 +126,6 @@ def test_a_gray_scene_tells_little_of_the_room(gray: float) -> None:
     print(f"gray {gray}: {within:.2f} hold, {apart:.1f} +- {whole.attrs['surroundings_std']:.1f} K")
     assert within > 0.8
     assert abs(apart) < 3.0 * whole.attrs["surroundings_std"]
-
-
-def test_dust_is_in_the_deviation_of_a_material() -> None:
-    """Emissivities that differ from pixel to pixel widen those completed from the same material.
-
-    Not quite as far as they differ: pixels that differ unseen are pooled, and tell nothing of it.
-    """
-    scene, _, _ = draw(replace(SMALL, still=0.3), 12, 0.86, 0.72)
-    rng = np.random.default_rng(12)
-    shape = scene["emissivity"].shape
-    dusty = scene.assign(emissivity=scene["emissivity"] + rng.normal(0.0, 0.03, shape))
-    capture = observe(dusty, RESPONSE, rng)
-    alone = separation.solve(capture, RESPONSE)
-    labels = xr.zeros_like(alone["status"]).astype(int)
-    whole = separation.complete(alone, capture, RESPONSE, labels)
-    missing = alone["emissivity"].isnull()
-    error = abs(whole["emissivity"] - dusty["emissivity"])
-    within = float((error < 1.96 * whole["emissivity_std"]).where(missing).mean())
-    print(f"dust: {within:.2f} of the completed emissivities hold")
-    assert within > 0.75
 
 
 def test_black_gives_the_reading() -> None:
@@ -315,21 +173,6 @@ def test_frames_that_no_pixel_has(half: Case) -> None:
     assert bool((whole["status"].where(alone["status"] == 0, 0) == 0).all())
 
 
-def test_dead_pixels_stay_empty(half: Case) -> None:
-    """A pixel that the correction marks as bad, or of a constant signal, gets no value."""
-    _, capture, _ = half
-    broken = capture.copy(deep=True)
-    broken["counts"].values[0, :, 3, 4] = 15000.0
-    dead = np.zeros(tuple(capture.sizes[dim] for dim in ("y", "x")), dtype=np.uint32)
-    dead[5, 6] = Status.DEAD_PIXEL
-    broken["status"] = (("y", "x"), dead, schema.status_attrs())
-    whole = separation.complete(separation.solve(broken, RESPONSE), broken, RESPONSE)
-    for place in ((3, 4), (5, 6)):
-        assert bool(whole["object_temperature"][:, place[0], place[1]].isnull().all())
-        assert not whole["status"].values[place] & int(COMPLETED)
-    assert bool(whole["object_temperature"].isnull().any("time").sum() == 2)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -370,63 +213,6 @@ def test_result_of_another_capture_is_refused(half: Case) -> None:
         separation.complete(alone, other, RESPONSE)
 
 
-@pytest.mark.parametrize(
-    ("picture", "emissivity"),
-    [(replace(SMALL, still=0.5), (0.86, 0.72)), (SMALL, (0.98, 0.95)), (NOBODY, (0.86, 0.72))],
-)
-def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[float, ...]) -> None:
-    """Everything is finite, intervals hold, and nothing completed passes as measured."""
-    scene, capture, alone = draw(picture, 7, *emissivity)
-    whole = separation.separate(capture, RESPONSE)
-    error = abs(whole["object_temperature"] - scene["object_temperature"])
-    within = float((error < 1.96 * whole["object_temperature_std"]).mean())
-    reading = separation.solve(capture, RESPONSE, "apparent")["object_temperature"]
-    apart = abs(reading - scene["object_temperature"])
-    print(f"{emissivity}: {float(error.median()):.3f} K, reading {float(apart.median()):.3f} K")
-    assert bool(error.notnull().all())
-    assert within > 0.9
-    assert float(error.median()) < float(apart.median())
-    # Without motion anywhere a value cannot be measured.
-    if bool(alone["object_temperature"].isnull().all()):
-        completed = (whole["status"] & int(COMPLETED)) != 0
-        assert bool((completed | (whole["material"] >= 0)).all())
-
-
-@pytest.mark.parametrize("rise", [(6.0, 20.0), (2.0, 6.0)])
-def test_an_object_that_heats_before_a_still_room_is_no_reflection(
-    rise: tuple[float, float],
-) -> None:
-    """Where nobody walks, what moves is the object: it gets no temperature of what it mirrors."""
-    picture = Picture(shape=(30, 40), rise=rise, still=0.5)
-    scene, capture, _ = draw(picture, 17, 0.86, 0.72)
-    whole = separation.separate(capture, RESPONSE)
-    error = abs(whole["object_temperature"] - scene["object_temperature"])
-    within = (error < 1.96 * whole["object_temperature_std"]).mean("time")
-    still = scene["background_temperature"].std("time") < 0.01
-    share, worst = float(still.mean()), float(error.where(still).max())
-    measured = float((whole["status"] == 0).where(still).mean())
-    held = float(within.where(still).mean())
-    print(f"{share:.2f} still, {measured:.2f} measured, {held:.3f} hold, worst {worst:.1f} K")
-    assert share > 0.3
-    assert bool(error.notnull().all())
-    assert held > 0.9
-    assert worst < 5.0
-
-
-def test_one_call_without_a_shift_to_find() -> None:
-    """A band that is two frames late sets bands apart, and no shift mends it: that is said."""
-    _, capture, _ = draw(replace(SMALL, shape=(24, 24)), 13, 0.86, 0.72)
-    counts = capture["counts"].copy()
-    counts[1, 2:] = counts[1, :-2].values
-    with pytest.warns(UserWarning, match=r"^The bands of \d+% .* no shift") as said:
-        whole = separation.separate(capture.assign(counts=counts), RESPONSE)
-    assert whole.attrs["warnings"] == [str(said[0].message)]
-    apart = float(((whole["status"] & int(Status.BANDS_APART)) != 0).mean())
-    print(f"bands apart in {apart:.2f}")
-    assert whole.attrs["reflection_shift"] == "none"
-    assert apart > 0.5
-
-
 def test_bands_of_no_library_are_refused_before_the_work() -> None:
     """Bands without a prior on their emissivities are named, and one that is given is taken."""
     _, capture, _ = draw(SMALL, 7, 0.86, 0.72)
@@ -438,47 +224,7 @@ def test_bands_of_no_library_are_refused_before_the_work() -> None:
     assert bool(separation.separate(other, response, prior=prior)["object_temperature"].any())
 
 
-FOUR: dict[str, tuple[Picture, tuple[float, ...]]] = {
-    "glass, half still": (Picture(shape=(36, 48), still=0.5), (0.86, 0.72)),
-    "0.95/0.85, people 3 K above": (Picture(shape=(36, 48), warmer=(3.0, 3.0)), (0.95, 0.85)),
-    "0.98/0.95": (Picture(shape=(36, 48)), (0.98, 0.95)),
-    "glass, nobody": (replace(NOBODY, shape=(24, 32)), (0.86, 0.72)),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FOUR)
-def test_whole_pictures_hold(name: str) -> None:
-    """One call: 99 % finite, intervals hold, measured and completed, no worse than the reading."""
-    picture, emissivity = FOUR[name]
-    covers: dict[str, list[float]] = {"measured": [], "completed": []}
-    for seed in range(3):
-        scene, capture, _ = draw(picture, 100 + seed, *emissivity)
-        whole = separation.separate(capture, RESPONSE)
-        error = abs(whole["object_temperature"] - scene["object_temperature"])
-        within = error < 1.96 * whole["object_temperature_std"]
-        reading = separation.solve(capture, RESPONSE, "apparent")["object_temperature"]
-        apart = abs(reading - scene["object_temperature"])
-        completed = ((whole["status"] & int(COMPLETED)) != 0).broadcast_like(error)
-        assert float(error.notnull().mean()) >= 0.99
-        for label, part in (("measured", ~completed), ("completed", completed)):
-            if bool(part.any()):
-                covers[label].append(float(within.where(part).mean()))
-        medians = [float(one.where(completed).median()) for one in (error, apart)]
-        assert not medians[0] > medians[1]
-        print(
-            f"{name}, seed {seed}: {float(error.median()):.3f} K, reading "
-            f"{float(apart.median()):.3f} K; completed {float(completed.mean()):.2f}: "
-            f"{medians[0]:.3f} K, reading {medians[1]:.3f} K"
-        )
-    print({label: np.round(parts, 3).tolist() for label, parts in covers.items()})
-    if covers["measured"]:
-        assert 0.9 <= np.mean(covers["measured"]) <= 0.98
-    if covers["completed"]:
-        assert np.mean(covers["completed"]) >= 0.9
-
-
-@pytest.mark.slow
+@pytest.mark.long
 def test_unknown_materials_hold() -> None:
     """Nobody walks before materials of the libraries: intervals hold over these, of each or none.
 

@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
 from dbthermal.separation import DbvtSettings
-from dbthermal.separation._dbvt import method as dbvt
 from dbthermal.separation._dbvt import objective
 from dbthermal.separation._dbvt.objective import Scale, Weights
 from dbthermal.separation._tiles import Tile
@@ -112,20 +109,6 @@ def test_mean_of_the_noise_is_squared() -> None:
         assert_allclose(objective.losses(films, *others, weights())[4], expected, rtol=1e-12)
 
 
-def test_deviation_is_never_below_the_noise() -> None:
-    """Slip 5: a constant pixel is divided by its noise, another by its standard deviation."""
-    films, _, signals, _ = anywhere()
-    assert objective.deviation(0.0 * signals[0], 0.0 * films[1], 0.3, 1.0) == 0.3
-    moving = objective.deviation(signals[0], films[1], 0.3, 1.0)
-    assert_allclose(moving, (signals[0] - films[1]).std(ddof=1), rtol=1e-12)
-
-
-def test_huber_loss_has_slope_one_beyond_its_threshold() -> None:
-    """The normalised loss is a parabola inside, a line of slope 1 outside, smooth between."""
-    found = [objective.huber(value, 0.5) for value in (0.2, 0.5, 1.5, -2.5)]
-    assert_allclose(found, [0.04, 0.25, 1.25, 2.25], rtol=0, atol=1e-12)
-
-
 def directional(point: Point, chosen: Weights, way: tuple[np.ndarray, np.ndarray]) -> float:
     """Derivative of the objective along a direction, from the forces of the Newton step."""
     films, rest, _, scale = point
@@ -171,43 +154,6 @@ def test_slopes_match_finite_differences(name: str, along: str) -> None:
     assert_allclose(directional(point, chosen, way), expected, rtol=1e-6, atol=1e-6)
 
 
-@settings(max_examples=25)
-@given(st.integers(4, 30), st.floats(0.0, 1e6), st.integers(0, 10**6))
-def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed: int) -> None:
-    """The recursion's solution satisfies the equations, from no stiffness to much."""
-    rng = np.random.default_rng(seed)
-    diagonal, right = rng.uniform(0.5, 2.0, frames), rng.standard_normal((frames, 3))
-    found = objective.whittaker(diagonal, stiffness, right)
-    second = np.diff(np.eye(frames), n=2, axis=0)
-    expected = np.linalg.solve(np.diag(diagonal) + stiffness * second.T @ second, right)
-    assert_allclose(found, expected, rtol=0, atol=1e-7)
-
-
-def minimised(tile: Tile, films: np.ndarray, rest: np.ndarray, steps: int) -> np.ndarray:
-    """Objective of each pixel after the last stage of so many steps, from a start, in place."""
-    search = dbvt.Search(tile, DbvtSettings(steps=steps))
-    search.films, search.rest = films, rest
-    return search._minimise(np.ones(len(films), dtype=np.int64))[0]
-
-
-def test_a_step_never_raises_the_objective() -> None:
-    """From a point without symmetry the objective falls monotonically, and far."""
-    tile, films, rest = linear(QUIET, 8)
-    rest[:, 1:] -= 0.1
-    history = [minimised(tile, films.copy(), rest.copy(), steps) for steps in range(1, 30)]
-    assert np.all(np.diff(history, axis=0) <= 0)
-    assert np.all(history[-1] < 0.01 * history[0])
-
-
-def test_it_stays_at_the_truth() -> None:
-    """Started at the truth the emissivities move by less than 0.02 (median)."""
-    tile, films, rest = linear(QUIET, 30)
-    minimised(tile, films, rest, 80)
-    moved = float(np.median(abs(rest[:, 1:] - np.array(GLASS)).max(axis=1)))
-    print(f"moved from the truth by {moved:.4f}")
-    assert moved < 0.02
-
-
 @pytest.mark.parametrize(
     "noise", [QUIET, pytest.param((0.03, 0.05), marks=pytest.mark.slow)], ids=str
 )
@@ -235,24 +181,6 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     assert bool(started["emissivity"].notnull().all())
 
 
-def test_the_lowest_of_several_starts_is_kept() -> None:
-    """Columns are start by start, and NaN is no lowest objective."""
-    loss = np.array([3.0, np.nan, 1.0, 2.0, 5.0, 4.0])
-    assert dbvt._least(loss, 3).tolist() == [3, 4, 2]
-
-
-def test_same_seed_same_result() -> None:
-    """A seed fixes the result; other random starts end at the same minimum."""
-    _, capture, response = glass(QUIET, 12)
-    capture = capture.isel(time=slice(0, 150))
-    first, again, other = (
-        separation.solve(capture, response, "dbvt", seed=seed) for seed in (1, 1, 2)
-    )
-    xr.testing.assert_identical(first, again)
-    apart = abs(first["emissivity"] - other["emissivity"])
-    assert float(apart.median()) < 1e-4
-
-
 def test_exact_response_is_taken_out() -> None:
     """Taking out the bend of the exact response at least halves the emissivity's error."""
     scene, capture, response = glass(QUIET, 40)
@@ -270,32 +198,6 @@ def test_too_few_steps_are_flagged() -> None:
     _, capture, response = glass(QUIET, 8)
     result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
-
-
-@pytest.mark.slow
-def test_temperatures_may_come_from_the_measured_signals() -> None:
-    """Without the estimated noise the object is smoother, and nearer to the truth."""
-    scene, capture, response = glass((0.03, 0.35), 30)
-    smooth, raw = (
-        errors(
-            scene,
-            separation.solve(
-                capture, response, "dbvt", settings=DbvtSettings(temperatures_from=source)
-            ),
-        )[1]
-        for source in ("corrected", "measured")
-    )
-    print(f"object from corrected signals {smooth:.3f} K, from measured ones {raw:.3f} K")
-    assert smooth < raw
-
-
-@pytest.mark.parametrize("name", ["huber", "reconstruction", "smoothness", "noise", "noise_mean"])
-def test_each_loss_can_be_left_out(name: str) -> None:
-    """Without one of the losses it still ends with numbers, and with emissivities in (0, 1)."""
-    tile, _, _ = linear((0.03, 0.05), 6)
-    tile = tile.select_frames(TIME < 10.0)
-    result = dbvt.separate(tile, DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
-    assert np.all((result.emissivity > 0) & (result.emissivity < 1))
 
 
 @pytest.mark.parametrize(

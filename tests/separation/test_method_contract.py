@@ -73,15 +73,6 @@ def estimated(result: xr.Dataset) -> set[str]:
 
 
 @every_method
-def test_record(method: str) -> None:
-    """A method is a function of a tile, with default settings and known variables not estimated."""
-    record = separation.get_method(method)
-    assert callable(record.separate)
-    assert record.settings is None or record.settings() == record.settings()
-    assert set(record.not_estimated) < schema.STAGES["separated"].keys()
-
-
-@every_method
 def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
     """The result satisfies the glossary, names its method, and leaves the capture unchanged."""
     before = pair[0].copy(deep=True)

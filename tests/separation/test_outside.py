@@ -135,13 +135,16 @@ def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Data
     return truth, capture, calibration.fit_response(blackbody).assign(noise=stds)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
-def test_outside_scenes_hold(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "seeds"),
+    [pytest.param(name, (1,), marks=pytest.mark.slow) for name in SCENES]
+    + [pytest.param(name, (1, 2, 3), marks=pytest.mark.long) for name in SCENES],
+)
+def test_outside_scenes_hold(name: str, seeds: tuple[int, ...]) -> None:
     """Most pixels have no flag; of theirs 90 % of the 95 % intervals hold, and 1 % are far off."""
     within: dict[str, list[float]] = {}
     unflagged, far = [], []
-    for seed in (1, 2, 3):
+    for seed in seeds:
         truth, capture, response = draw(name, seed)
         result = separation.solve(capture, response)
         good = result["status"] == 0

@@ -7,10 +7,6 @@ import pytest
 import xarray as xr
 
 from dbthermal import schema, separation
-from dbthermal.separation._pooling import pool
-from dbthermal.separation._pooling.ratios import Image
-from dbthermal.separation._subspace import reflection_ratio
-from dbthermal.separation._tiles import Survey
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -49,46 +45,6 @@ def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
     return float(np.sqrt(((result["reflection_ratio"].sel(band="9.5") - truth) ** 2).mean()))
 
 
-def test_some_pixels_of_a_large_material_are_surveyed() -> None:
-    """All of a small material, and `MOST` evenly spaced pixels of a large one, are surveyed."""
-    count = 3 * pool.MOST
-    values = np.concatenate([one(5, 1), one(count), one(4, -1)])
-    selected = pool.select(values)
-    assert selected[:5].all()
-    assert not selected[-4:].any()
-    places = np.flatnonzero(selected[5:-4])
-    assert places.size == pool.MOST
-    assert np.all(np.diff(places) == 3)
-
-
-def test_materials_are_spread_over_their_pixels() -> None:
-    """Each pixel has the values of its label's material, and NaN without a label."""
-    image = Image(np.array([1, -1, 0]), np.arange(3), 3)
-    expanded = image.expand(np.array([[1.0, 1.0], [2.0, 1.4]]))
-    np.testing.assert_array_equal(expanded, [[1.0, np.nan, 1.0], [1.4, np.nan, 2.0]])
-
-
-def test_four_hundred_pixels_cut_the_error_tenfold() -> None:
-    """The error of k2 falls by more than 10 over a few films, and that of the object falls."""
-    alone, shared, objects = [], [], []
-    for seed in range(3):
-        scene, capture, response = case(400, seed)
-        results = [
-            separation.solve(capture, response, pool=pool) for pool in (None, labels(one(400)))
-        ]
-        alone.append(error_of_ratio(results[0]))
-        shared.append(error_of_ratio(results[1]))
-        error = [r["object_temperature"] - scene["object_temperature"] for r in results]
-        objects.append([float(np.sqrt((e**2).mean())) for e in error])
-    before, after = (np.sqrt(np.mean(np.square(part))) for part in (alone, shared))
-    of_object = np.sqrt(np.mean(np.square(objects), axis=0))
-    print(
-        f"k2 {before:.4f} alone, {after:.4f} pooled: 1/{before / after:.1f}; object {of_object} K"
-    )
-    assert before / after >= 10
-    assert of_object[1] < of_object[0]
-
-
 def test_shared_error_bars_are_true() -> None:
     """Errors of materials of ten pixels scatter as their standard deviations state."""
     scene, capture, response = case(1000, 3)
@@ -107,17 +63,6 @@ def test_shared_error_bars_are_true() -> None:
     assert spread == pytest.approx(1.0, abs=0.2)
     assert 0.92 <= of_object <= 0.98
     assert of_emissivity >= 0.92
-
-
-def test_a_material_of_one_pixel_is_that_pixel() -> None:
-    """A label for each pixel changes neither values nor deviations."""
-    _, capture, response = case(30, 4)
-    alone = separation.solve(capture, response)
-    shared = separation.solve(capture, response, pool=labels(np.arange(30)))
-    for name in ("object_temperature", "emissivity", "reflection_ratio"):
-        apart = abs(shared[name] - alone[name])
-        assert bool((apart <= 0.15 * alone[f"{name}_std"]).all())
-        np.testing.assert_allclose(shared[f"{name}_std"], alone[f"{name}_std"], rtol=0.1, atol=0)
 
 
 def test_still_pixels_of_a_material_get_a_temperature() -> None:
@@ -160,25 +105,6 @@ def test_wrong_labels_do_not_pull() -> None:
     assert float(np.sqrt((error**2).mean())) < 1.0  # [K]; 3 K with the ratio of glass
 
 
-def test_few_pixels_of_much_energy_are_outliers() -> None:
-    """Sixty pixels keep their ratio of 2 beside six, of a thousand times the energy, of 0.8."""
-    noise, rng, frames = np.array([0.05, 0.05]), np.random.default_rng(0), np.full(66, 280.0)
-    axis = np.where(np.arange(66) < 60, 2.0, 0.8)
-    std = np.where(np.arange(66) < 60, 20.0, 600.0) / np.sqrt(280.0)
-    ratio = np.stack([np.ones(66), axis])
-    rapid = std * rng.standard_normal((280, 1, 66)) * ratio + rng.standard_normal((280, 2, 66))
-    scatter = np.einsum("tbp,tcp->bcp", rapid, rapid) - 280.0 * np.eye(2)[..., np.newaxis]
-    twice, zero, half = np.stack([scatter] * 2), np.zeros(66), np.full(66, 0.5)
-    own = reflection_ratio.principal_ratio(np.moveaxis(scatter, -1, 0), noise)
-    survey = Survey(
-        scatter, frames, twice, np.stack([frames] * 2), own, 0 * ratio, half, zero, zero
-    )
-    labels = np.zeros(66, dtype=np.intp)
-    material = pool.estimate(Image(labels, np.arange(66), 66), labels, survey, noise)
-    variance = reflection_ratio.ratio_variance(material.ratio, material.inverse_energy, noise)
-    assert abs(material.ratio[1, 0] - 2.0) < 4.0 * np.sqrt(variance[1, 0])
-
-
 def test_two_materials_stay_apart() -> None:
     """Each label has its own ratio, whatever its number; pixels without one are alone."""
     parts = [
@@ -197,41 +123,6 @@ def test_two_materials_stay_apart() -> None:
     np.testing.assert_allclose(none, alone.values[0, 100:], rtol=1e-6)
 
 
-def test_labels_of_nothing_share_nothing() -> None:
-    """Negative labels leave every pixel as it is without a pool."""
-    _, capture, response = case(20, 13)
-    shared = separation.solve(capture, response, pool=labels(one(20, -1)))
-    alone = separation.solve(capture, response)
-    for name in schema.STAGES["separated"]:
-        np.testing.assert_array_equal(shared[name].values, alone[name].values)
-
-
-def test_result_does_not_depend_on_workers_or_tiles() -> None:
-    """Rows or columns, one thread or two: the same pixels, the same values."""
-    _, capture, response = case(400, 14)
-    wide = separation.solve(capture, response, pool=labels(np.arange(400) % 2), workers=1)
-    counts = capture["counts"].values.reshape(2, 350, 400, 1)
-    tall = xr.Dataset(
-        {"counts": (capture["counts"].dims, counts, capture["counts"].attrs)},
-        coords={"band": capture["band"], "time": capture["time"]},
-    )
-    pool = xr.DataArray((np.arange(400) % 2)[:, np.newaxis], dims=("y", "x"))
-    down = [separation.solve(tall, response, pool=pool, workers=n) for n in (1, 2)]
-    xr.testing.assert_identical(*down)
-    for name in ("object_temperature", "emissivity", "reflection_ratio"):
-        np.testing.assert_allclose(
-            down[0][name].values.reshape(wide[name].shape), wide[name].values, rtol=1e-4
-        )
-
-
-def test_a_capture_of_nothing_can_be_pooled() -> None:
-    """A capture without a valid sample is flagged in every pixel, without an error."""
-    _, capture, response = case(4, 15)
-    empty = capture.assign(counts=capture["counts"] * np.nan)
-    result = separation.solve(empty, response, pool=labels(one(4)))
-    assert np.all(result["status"] == schema.Status.INVALID_SAMPLES)
-
-
 @pytest.mark.parametrize(
     ("pool", "error", "message"),
     [
@@ -246,10 +137,3 @@ def test_bad_labels_are_a_clear_error(pool: Any, error: type[Exception], message
     _, capture, response = case(20, 16)
     with pytest.raises(error, match=message):
         separation.solve(capture, response, pool=pool)
-
-
-def test_other_methods_do_not_pool() -> None:
-    """A pool raises a ValueError in a method that does not use it."""
-    _, capture, response = case(20, 17)
-    with pytest.raises(ValueError, match="Invalid pool for method 'ratio'"):
-        separation.solve(capture, response, "ratio", pool=labels(one(20)))

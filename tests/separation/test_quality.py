@@ -1,96 +1,84 @@
-"""Data quality: valid samples, bits of the status, gaps, and sets of frames."""
+"""Data quality of the counts: bits of bad pixels, and none of good ones."""
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
 
+from dbthermal import separation
 from dbthermal.schema import Status
-from dbthermal.separation import _quality as quality
+from dbthermal.simulation import Rig
 
-FRAMES = 20
+FRAMES, PIXELS, RIG = 20, 6, Rig()
 Place = tuple[int | slice, int | slice, int]
+CHECKED = np.uint32(
+    Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.FROZEN_FRAMES | Status.SATURATED
+)
 
 
-def part(dtype: str = "float32", pixels: int = 6) -> xr.Dataset:
-    """Part of a capture (band, time, y, x) of noise about 1000 counts, one row high."""
-    rng = np.random.default_rng(1)
-    counts = 1000.0 + 20.0 * rng.standard_normal((2, FRAMES, 1, pixels))
-    return xr.Dataset({"counts": (("band", "time", "y", "x"), counts.astype(dtype))})
+def capture_of(counts: npt.NDArray[np.float64]) -> xr.Dataset:
+    """Capture one row high of counts (band, time, pixel)."""
+    dims = ("band", "time", "y", "x")
+    return xr.Dataset(
+        {"counts": (dims, counts[:, :, np.newaxis].astype(np.float32), {"units": "count"})},
+        {"band": list(RIG.bands), "time": np.arange(counts.shape[1]) / 10.0},
+    )
 
 
-def spoilt(*values: tuple[Place, float], dtype: str = "float32") -> xr.Dataset:
-    """The same with some counts replaced, by index (band, time, pixel)."""
-    result = part(dtype)
-    for (band, time, pixel), value in values:
-        result["counts"].values[band, time, 0, pixel] = value
-    return result
+def plain() -> npt.NDArray[np.float64]:
+    """Counts (band, time, pixel) of noise about 20000."""
+    noise = np.random.default_rng(1).standard_normal((2, FRAMES, PIXELS))
+    return np.asarray(20000.0 + 20.0 * noise)
 
 
-def bits(*flags: tuple[int, Status]) -> npt.NDArray[np.uint32]:
-    """Status (pixel) with a bit in some pixels."""
-    result = np.zeros(6, dtype=np.uint32)
-    for pixel, bit in flags:
-        result[pixel] |= np.uint32(bit)
-    return result
+def response_of(noise: float) -> xr.Dataset:
+    """Response of so much noise in both bands [count]."""
+    response = RIG.response()
+    return response.assign(noise=response["noise"].copy(data=[noise, noise]))
 
 
-def test_good_samples_pass_unchanged() -> None:
-    """Counts as float64, all valid, no bit."""
-    counts, valid, status = quality.read(part())
-    np.testing.assert_array_equal(counts, part()["counts"].values[:, :, 0].astype(np.float64))
-    assert valid.all()
-    assert not status.any()
+def read(capture: xr.Dataset, noise: float = 20.0, **options: xr.DataArray) -> xr.Dataset:
+    """Temperatures as the camera reads them, with what is said of the samples."""
+    return separation.solve(capture, response_of(noise), "apparent", **options)  # type: ignore[arg-type]
+
+
+def bits(result: xr.Dataset) -> npt.NDArray[np.uint32]:
+    """What is said of the samples of each pixel."""
+    status: npt.NDArray[np.uint32] = result["status"].values[0]
+    return status & CHECKED
 
 
 def test_bits_of_bad_pixels() -> None:
-    """NaN in one band is invalid in all; pixels of few, constant or frozen frames are flagged."""
-    every, some = slice(None), slice(0, 11)
-    bad = spoilt(
-        ((0, 3, 0), np.nan),
-        ((1, some, 1), np.nan),
-        ((0, every, 2), 7.0),
-        ((every, slice(4, 9), 3), 1000.0),
-    )
-    counts, valid, status = quality.read(bad)
-    expected = bits(
-        (1, Status.INVALID_SAMPLES), (2, Status.CONSTANT_SIGNAL), (3, Status.FROZEN_FRAMES)
-    )
-    np.testing.assert_array_equal(status, expected)
-    assert valid[:, 0].sum() == FRAMES - 1
-    assert np.all(counts[:, 3, 0] == 0.0)
-    assert np.all(counts[:, :, [1, 2]] == 0.0)  # unusable
-    np.testing.assert_array_equal(quality.unusable(status), [False, True, True] + 3 * [False])
+    """Too few samples, a constant band, a pixel that stands for frames: each its own bit."""
+    counts = plain()
+    assert not bits(read(capture_of(counts))).any()
+    counts[0, 3, 0] = np.nan
+    counts[1, :11, 1] = np.nan
+    counts[0, :, 2] = 20007.0
+    counts[:, 4:9, 3] = 20000.0
+    flags = [0, Status.INVALID_SAMPLES, Status.CONSTANT_SIGNAL, Status.FROZEN_FRAMES, 0, 0]
+    np.testing.assert_array_equal(bits(read(capture_of(counts))), flags)
 
 
 def test_a_heap_on_one_level_is_saturation() -> None:
     """Samples that heap on the highest or lowest value are flagged, except masked ones."""
-    low, high = ((0, slice(2, 9), 1), 900.0), ((1, slice(2, 9), 4), 1100.0)
-    wild = spoilt(low, high, ((1, slice(2, 9), 5), 1100.0))
-    mask = np.ones((FRAMES, 1, 6), dtype=bool)
+    counts = plain()
+    counts[0, 2:9, 1], counts[1, 2:9, 4:] = 19900.0, 20100.0
+    capture, mask = capture_of(counts), np.ones((FRAMES, 1, PIXELS), dtype=bool)
     mask[2:9, 0, 5] = False
-    _, valid, status = quality.read(wild.assign(mask=(("time", "y", "x"), mask)))
-    flagged = np.flatnonzero(status & np.uint32(Status.SATURATED))
-    np.testing.assert_array_equal(flagged, [1, 4])
-    assert not valid[2:9, 5].any()
+    used = xr.DataArray(mask, dims=("time", "y", "x"))
+    np.testing.assert_array_equal(np.flatnonzero(bits(read(capture, mask=used))), [1, 4])
 
 
-def test_one_band_that_stands_is_frozen_and_copies_are_left_out() -> None:
-    """A frame that repeats in one band is no sample; three are flagged, and so is one pixel."""
-    for copies, flag in ((1, 0), (2, 0), (3, Status.FROZEN_FRAMES)):
-        _, valid, status = quality.read(spoilt(*repeats(1, 7, copies)))
-        np.testing.assert_array_equal(np.flatnonzero(~valid[:, 0]), 7 + np.arange(copies))
-        assert np.all(status == flag)
-    _, valid, status = quality.read(spoilt(((0, slice(4, 13), 3), 1000.0)))
-    np.testing.assert_array_equal(status, bits((3, Status.FROZEN_FRAMES)))
-    assert valid.all()
-
-
-def repeats(band: int, first: int, number: int) -> list[tuple[Place, float]]:
-    """Replacements that make so many frames of a band copies of the one before."""
-    before = part()["counts"].values[band, first - 1, 0]
-    frames = slice(first, first + number)
-    return [((band, frames, pixel), float(value)) for pixel, value in enumerate(before)]
+@pytest.mark.parametrize(("copies", "flag"), [(1, 0), (2, 0), (3, Status.FROZEN_FRAMES)])
+def test_copies_of_a_frame_are_left_out(copies: int, flag: int) -> None:
+    """A frame that repeats in one band is no sample; three are flagged."""
+    counts = plain()
+    counts[1, 7 : 7 + copies] = counts[1, 6]
+    result = read(capture_of(counts))
+    assert np.all(bits(result) == flag)
+    empty = result["object_temperature"].isnull().all(("y", "x"))
+    np.testing.assert_array_equal(np.flatnonzero(empty), 7 + np.arange(copies))
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.3, 0.8, 1.2, 3.4, 30.0])
@@ -99,7 +87,7 @@ def test_whole_counts_repeat_by_chance(noise: float) -> None:
     assert flags_of_whole_counts(noise, range(2)) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.4, 30.0])
 def test_whole_counts_repeat_by_chance_in_many(noise: float) -> None:
     """At most one in 1e3 of 6400 such pixels is flagged."""
@@ -122,85 +110,6 @@ def flags_of_whole_counts(noise: float, seeds: range) -> int:
         signal = np.stack([0.9 * rise[:, None] + 0.1 * pulses, 0.2 * rise[:, None] + 0.1 * pulses])
         raw = np.rint(20000.0 + signal + noise * rng.standard_normal(signal.shape))
         gain, offset = 1.0 + 0.02 * rng.standard_normal(320), 40.0 * rng.standard_normal(320)
-        counts = (raw * gain + offset).astype(np.float32)[:, :, np.newaxis]
-        capture = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)})
-        known = quality.grains(capture, np.array([noise, noise])) if seed % 2 else None
-        status = quality.read(capture, 1, known)[2]
-        number += int(np.count_nonzero(status & np.uint32(Status.SATURATED | Status.FROZEN_FRAMES)))
+        flags = bits(read(capture_of(raw * gain + offset), noise))
+        number += int(np.count_nonzero(flags & ~np.uint32(Status.CONSTANT_SIGNAL)))
     return number
-
-
-def test_status_of_the_capture_is_kept() -> None:
-    """A pixel that the correction marked as dead is unusable, and keeps its bit."""
-    known = part().assign(status=(("y", "x"), bits((2, Status.DEAD_PIXEL))[np.newaxis]))
-    counts, _, status = quality.read(known)
-    assert status[2] == Status.DEAD_PIXEL
-    assert np.all(counts[:, :, 2] == 0.0)
-
-
-def test_short_gaps_are_bridged_by_a_line() -> None:
-    """Gaps of one and two frames are interpolated in time; longer ones and ends are not."""
-    time = np.cumsum(np.r_[1.0, np.full(FRAMES - 1, 0.1)])
-    time[7:] += 0.3  # an uneven clock
-    counts = np.stack([5.0 * time, -3.0 * time])[..., np.newaxis] * np.ones(6)
-    valid = np.ones((FRAMES, 6), dtype=bool)
-    valid[6, 0] = valid[8:10, 1] = valid[12:15, 2] = valid[0, 3] = False
-    filled, usable = quality.bridge(np.where(valid, counts, 0.0), valid, time)
-    np.testing.assert_allclose(filled[:, :, :2], counts[:, :, :2], rtol=1e-12)
-    np.testing.assert_array_equal(usable.all(axis=0), [True, True, False, False, True, True])
-
-
-def test_gaps_beside_an_object_are_bridged() -> None:
-    """Pixels without any sample, as most are beside an object, do not say which gaps are short."""
-    counts, valid = np.ones((2, FRAMES, 6)), np.zeros((FRAMES, 6), dtype=bool)
-    valid[:, :3] = True
-    valid[6, 0] = valid[9, :3] = False
-    usable = quality.bridge(counts, valid, np.arange(float(FRAMES)))[1]
-    np.testing.assert_array_equal(usable[6], [True, True, True, False, False, False])
-    assert not usable[9].any()  # a frame that all of the object lack is one that was lost
-
-
-def test_longer_gaps_of_a_long_capture_are_bridged() -> None:
-    """A hundredth of the capture is bridged, and not a frame more."""
-    frames = 1000
-    counts, valid = np.ones((2, frames, 5)), np.ones((frames, 5), dtype=bool)
-    valid[100:110, 0] = valid[100:111, 1] = False
-    usable = quality.bridge(counts, valid, np.arange(float(frames)))[1]
-    np.testing.assert_array_equal(usable.all(axis=0), [True, False, True, True, True])
-
-
-def test_pixels_of_the_same_frames_are_one_set() -> None:
-    """Every usable pixel is in one set, and has its frames."""
-    valid = np.ones((FRAMES, 6), dtype=bool)
-    valid[3, [1, 4]] = valid[9, 2] = False
-    status = bits((5, Status.DEAD_PIXEL))
-    pairs = quality.frame_sets(valid, status)
-    sets = {tuple(map(int, np.flatnonzero(pixels))): frames for frames, pixels in pairs}
-    assert set(sets) == {(0, 3), (1, 4), (2,)}
-    assert not sets[(1, 4)][3]
-    assert sets[(1, 4)].sum() == FRAMES - 1
-    assert list(quality.frame_sets(valid, np.full(6, Status.DEAD_PIXEL, np.uint32))) == []
-
-
-def test_common_frames_leave_out_who_lacks_one() -> None:
-    """A frame that most pixels lack is left out for all; pixels that lack another are unsolved."""
-    valid = np.ones((FRAMES, 6), dtype=bool)
-    valid[3, :5] = valid[9, 2] = False
-    counts, status = np.ones((2, FRAMES, 6)), bits()
-    ((frames, pixels),) = quality.common_frames(counts, valid, status)
-    np.testing.assert_array_equal(np.flatnonzero(~frames), [3])
-    np.testing.assert_array_equal(np.flatnonzero(~pixels), [2])
-    np.testing.assert_array_equal(status, bits((2, Status.INVALID_SAMPLES)))
-    assert np.all(counts[:, :, 2] == 0.0)
-    assert quality.common_frames(counts, valid, status, fewest=FRAMES) == []
-    assert np.all(status == Status.INVALID_SAMPLES)
-
-
-def test_sample_is_even_and_good() -> None:
-    """A sample has about the requested number of unflagged pixels, at their common frames."""
-    whole = part(pixels=600)
-    whole["counts"].values[0, 4, 0, :] = np.nan
-    whole["counts"].values[0, 7, 0, :60] = np.nan
-    counts, frames = quality.sample(whole, 150)
-    np.testing.assert_array_equal(np.flatnonzero(~frames), [4])
-    assert counts.shape == (2, FRAMES - 1, 270)

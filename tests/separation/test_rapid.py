@@ -1,14 +1,11 @@
 """Objects that heat rapidly: followed with true error bars, or flagged, in several scenes."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
 
 from dbthermal import separation, simulation
-from reproduction import twins
 from reproduction.experiments.pictures import Picture
 
 TIME = np.arange(300) / 10.0
@@ -35,17 +32,13 @@ def heated(kind: str, rng: np.random.Generator) -> xr.Dataset:
     return scene.assign(object_temperature=(warm.dims, 295.15 + curves[kind], warm.attrs))
 
 
-def judge(name: str, scene: xr.Dataset, rng: np.random.Generator, **options: Any) -> dict[str, Any]:
-    """Share of the moving pixels without a flag, their RMSE [K], and what 95 % intervals hold."""
-    capture = simulation.observe(scene, RIG.response(), rng)
-    result = separation.solve(capture, RIG.response(), **options)
+def assert_followed(name: str, scene: xr.Dataset, rng: np.random.Generator) -> None:
+    """Of the moving pixels 70 % have no flag; intervals hold in the rise and at the ends too."""
+    result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
     moving = scene["background_temperature"].std("time") > 0.3
-    if "on_object" in scene:
-        moving &= scene["on_object"]
-    good = moving & (result["status"] == 0)
-    truth = scene["object_temperature"]
-    error = (result["object_temperature"] - truth).where(good)
-    within = (abs(error) < 1.96 * result["object_temperature_std"]).where(good)
+    good, truth = moving & (result["status"] == 0), scene["object_temperature"]
+    error = abs(result["object_temperature"] - truth)
+    within = (error < 1.96 * result["object_temperature_std"]).where(good)
     rate = abs(truth.differentiate("time"))
     shares = {
         "cover": within,
@@ -54,60 +47,25 @@ def judge(name: str, scene: xr.Dataset, rng: np.random.Generator, **options: Any
         "last": within.isel(time=slice(-10, None)),
     }
     scored = {key: float(value.mean()) for key, value in shares.items()}
-    scored["good"] = float(good.sum() / moving.sum())
-    scored["rmse"] = float(((error**2).mean("time") ** 0.5).median())
-    print(name, {key: round(value, 3) for key, value in scored.items()})
-    return scored
-
-
-def assert_true(scored: dict[str, Any]) -> None:
-    """As the issue of rapid heating demands."""
-    assert scored["good"] >= 0.7
-    assert 0.92 <= scored["cover"] <= 0.98
-    assert min(scored["first"], scored["last"], scored["rise"]) >= 0.9
+    share = float(good.sum() / moving.sum())
+    print(f"{name}: {share:.2f} without a flag", scored)
+    assert share >= 0.7
+    assert 0.92 <= scored.pop("cover") <= 0.98
+    assert min(scored.values()) >= 0.9
 
 
 def test_a_kinked_rise_is_followed() -> None:
     """A front of kinked rises of 0.3 to 3 s: most pixels without a flag, true intervals."""
     rng = np.random.default_rng(1)
-    assert_true(judge("kink", heated("kink", rng), rng))
+    assert_followed("kink", heated("kink", rng), rng)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rise", RISES)
-def test_a_climbing_front_is_followed(rise: str) -> None:
-    """Rises of any speed: 70 % of the moving pixels without a flag, intervals hold everywhere."""
+@pytest.mark.long
+@pytest.mark.parametrize("kind", [*RISES, "kink", "two steps", "touch", "cooling"])
+def test_rapid_curves_are_followed(kind: str) -> None:
+    """Fronts of any speed, two steps, a touch that fades, and cooling."""
     for seed in (1, 2, 3):
         rng = np.random.default_rng(seed)
-        scene = Picture((40, 56), rise=RISES[rise]).draw(TIME, GLASS, rng)
-        assert_true(judge(f"{rise}, seed {seed}", scene, rng))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["kink", "two steps", "touch", "cooling"])
-def test_other_rapid_curves_are_followed(kind: str) -> None:
-    """Kinks, two steps, a touch that fades, and cooling, as rises."""
-    for seed in (2, 3):
-        rng = np.random.default_rng(seed)
-        assert_true(judge(f"{kind}, seed {seed}", heated(kind, rng), rng))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["wineglass", "coffee_pot"])
-def test_a_pour_before_the_capture_is_followed(name: str) -> None:
-    """Simulated twins whose curves begin steeply, as rises; also in the first second."""
-    rng = np.random.default_rng(21)
-    scene = twins.twin(name, twins.Capture(GLASS, shape=(48, 64)), rng)
-    assert_true(judge(name, scene, rng))
-
-
-def test_rapid_pixels_of_one_material_are_pooled() -> None:
-    """Known to be of one material, rapid pixels nearly all lose their flags; intervals hold."""
-    rng = np.random.default_rng(4)
-    scene = Picture((16, 24), rise=(0.5, 2.0)).draw(TIME, GLASS, rng)
-    one = xr.zeros_like(scene["object_temperature"].isel(time=0, drop=True), dtype=np.int64)
-    alone = judge("alone", scene, np.random.default_rng(5))
-    pooled = judge("pooled", scene, np.random.default_rng(5), pool=one)
-    assert pooled["good"] > max(0.9, alone["good"])
-    assert pooled["rmse"] < 0.8 * alone["rmse"]
-    assert 0.9 <= pooled["cover"] <= 0.98
+        front = Picture((40, 56), rise=RISES.get(kind))
+        scene = front.draw(TIME, GLASS, rng) if kind in RISES else heated(kind, rng)
+        assert_followed(f"{kind}, seed {seed}", scene, rng)

@@ -6,10 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import emissivity_of, polynomials
 from numpy.typing import NDArray
 
-from dbthermal import _smooth as smooth
 from dbthermal import response as responses
 from dbthermal import separation, simulation
 from dbthermal.simulation import Background, Rig
@@ -93,30 +92,13 @@ def test_emission_and_reflection_are_the_first_band(
 
 def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
     """The reflection's error is that of the best linear estimate, without the scaling."""
-    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
+    functions = polynomials(TIME, found.attrs["order"])
     true = pulses().reshape(FRAMES, -1)
     true -= functions @ (functions.T @ true)
     error = found["reflection"].values.reshape(FRAMES, -1) - true
     noise = (NOISE[0] ** -2 + RATIO**2 * NOISE[1] ** -2) ** -0.5
     assert float(np.sqrt(np.mean(error**2))) == pytest.approx(noise, rel=0.1)
     assert float(np.std(true)) > 3 * noise
-
-
-def test_units_and_provenance(signal: xr.DataArray, found: xr.Dataset) -> None:
-    """The movies keep the input's unit and its mark, the maps have none; the order is written."""
-    assert {str(name): variable.attrs["units"] for name, variable in found.items()} == {
-        "ratio": "1",
-        "correlation": "1",
-        "reflection": "1",
-        "emission": "1",
-    }
-    assert (
-        separation.uncalibrated_reflection(signal.assign_attrs(units="K"))["emission"].attrs[
-            "units"
-        ]
-        == "K"
-    )
-    assert (found.attrs["radiometric"], found.attrs["order"]) == (0, 9)
 
 
 def test_unit_does_not_matter(signal: xr.DataArray, found: xr.Dataset) -> None:

@@ -114,12 +114,3 @@ def test_intervals_hold_the_residual_pattern() -> None:
     shares = cover(1)
     assert 0.92 <= shares["with"] <= 0.98
     assert shares["without"] < 0.8
-
-
-@pytest.mark.slow
-def test_intervals_hold_the_residual_pattern_of_many() -> None:
-    """The same over five scenes."""
-    parts = [cover(seed) for seed in range(2, 7)]
-    shares = {name: float(np.mean([part[name] for part in parts])) for name in parts[0]}
-    assert 0.92 <= shares["with"] <= 0.98
-    assert shares["without"] < 0.8

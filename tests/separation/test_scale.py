@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from captures import polynomials
 from numpy.typing import NDArray
 
-from dbthermal import _smooth as smooth
 from dbthermal import separation
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     with pytest.raises(ValueError, match="pixels have a correlation below"):
         separation.uncalibrated_reflection(shown)  # for its scale moves all of them together
     found = separation.uncalibrated_reflection(separation.unscaled(shown, still()))
-    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
+    functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
     rapid = [part - functions @ (functions.T @ part) for part in rapid]
@@ -97,17 +97,6 @@ def test_constant_scale_is_left() -> None:
     assert max(undone.attrs["scale_explained"]) < 0.5
     np.testing.assert_array_equal(undone, shown)
     assert float(abs(undone["gain"] - 1).max()) == 0.0
-
-
-def test_each_band_is_judged_by_itself() -> None:
-    """Of two bands the one is undone, the other stays as it is."""
-    rng = np.random.default_rng(8)
-    truth, _ = scene(rng)
-    shown = picture(truth, rng)
-    shown[0] = picture(truth, rng, between=False)[0]
-    undone = separation.unscaled(shown, still())
-    assert undone.attrs["scale_undone"] == ["9.5"]
-    np.testing.assert_array_equal(undone[0], shown[0])
 
 
 @pytest.mark.parametrize(

@@ -87,24 +87,6 @@ def test_intervals_of_the_object_hold(noise_known: bool) -> None:
     assert float((result["status"] != 0).mean()) < 0.02
 
 
-@pytest.mark.parametrize(
-    ("background", "limit"),
-    [
-        ({"kind": "random walk", "correlation_time": 0.3}, 0.11),
-        ({"kind": "random walk", "correlation_time": 3.0}, 0.15),
-        ({"kind": "random walk", "correlation_time": 30.0}, 0.42),
-        ({"drift": 5.0}, 0.19),
-    ],
-)
-def test_temperature_is_robust(background: dict[str, object], limit: float) -> None:
-    """A background that never rests, or drifts, leaves the temperature's accuracy as it is."""
-    case = glass_case(stop=45, background=background)
-    scene, result = experiments.run_case(case, RIG, TIME, 400, seed=9)
-    rmse = float(experiments.score(scene, result)["object_temperature_rmse"])
-    print(f"{background}: {rmse:.3f} K")
-    assert rmse <= limit
-
-
 def test_constant_object_keeps_its_temperature() -> None:
     """With a constant object only the temperature is found; the rest is NaN and flagged."""
     case = glass_case(start=40, stop=40)
@@ -122,15 +104,6 @@ def test_still_background_is_flagged() -> None:
     flagged = result["status"].values & schema.Status.NO_BACKGROUND_MOTION != 0
     assert flagged.mean() > 0.97
     assert np.all(np.isnan(result["object_temperature"].values[:, flagged]))
-
-
-def test_gray_body_is_flagged() -> None:
-    """Equal emissivities are singular: no temperature, and the flag."""
-    case = glass_case(emissivity=[0.8, 0.8])
-    _, result = experiments.run_case(case, RIG, TIME, 200, seed=2)
-    flagged = result["status"].values & schema.Status.GRAY != 0
-    assert flagged.mean() > 0.97
-    assert np.all(np.isnan(result["emissivity"].values[:, flagged]))
 
 
 def test_fast_object_is_as_true_as_a_slow_one() -> None:
@@ -190,3 +163,47 @@ def test_large_changes_of_the_background_do_not_bias() -> None:
     for name in ("object_temperature", "reflection_ratio"):
         assert spread[name] == pytest.approx(1.0, abs=0.2)
     assert spread["emissivity"] < 1.2
+
+
+@pytest.mark.parametrize(
+    ("emissivity", "warmer"),
+    [
+        *(((0.86, 0.72), 0.0), ((0.3, 0.5), 0.0), ((0.9, 0.6, 0.8), 0.0)),
+        *(((0.92, 0.78), 90.0), ((0.9, 0.6, 0.8), 90.0)),
+    ],
+)
+def test_everything_is_exact_without_noise(emissivity: tuple[float, ...], warmer: float) -> None:
+    """Object, ratios, emissivities and background come back, of a body of 400 K too.
+
+    There the bands' responses differ most: after two rounds without extrapolation the background
+    was 4 to 6 K off. The smooth functions follow the exponential to a few millikelvins only.
+    """
+    names = ("8-14", "9.5", "10.6")[: len(emissivity)]
+    rig = Rig(bands=names, noise=(1e-4, 1e-3, 1e-3)[: len(names)], highest=440.0)
+    warm = 300.0 + warmer + 30.0 * (1.0 - np.exp(-TIME / 12.0))
+    cold = 293.0 + 3.0 * ((TIME // 3.0) % 2)
+    pair = emissivity_of(*emissivity, bands=names)
+    scene = simulation.scene(TIME, warm[:, None, None], cold[:, None, None], pair)
+    capture = simulation.observe(scene, rig.response(), np.random.default_rng(1), dtype="float64")
+    result = separation.solve(capture, rig.response())
+    expected = (1.0 - np.array(emissivity)) / (1.0 - emissivity[0])
+    # Low emissivities are also those of an object and a background that are exchanged.
+    assert not (result["status"] & ~np.uint32(schema.Status.ROLES_MAY_BE_SWAPPED)).any()
+    np.testing.assert_allclose(result["reflection_ratio"][:, 0, 0], expected, rtol=5e-4)
+    np.testing.assert_allclose(result["object_temperature"][:, 0, 0], warm, rtol=0, atol=0.03)
+    np.testing.assert_allclose(result["emissivity"][:, 0, 0], emissivity, rtol=0, atol=3e-3)
+    np.testing.assert_allclose(result["background_temperature"][:, 0, 0], cold, rtol=0, atol=0.2)
+
+
+@pytest.mark.parametrize("louder", [1.0, 2.0, 10.0])
+def test_a_long_rest_is_explained(louder: float) -> None:
+    """A room that rests for all but 60 of 3000 frames sets no flag, whichever band is louder."""
+    time, rig = np.arange(3000) / 10.0, Rig(noise=(0.03, 0.03 * louder))
+    warm = 300.0 + 20.0 * (1.0 - np.exp(-time / 100.0))
+    cold = 293.0 + 6.0 * (np.abs(time - 120.0) < 3.0)
+    films = np.broadcast_to(np.stack([warm, cold])[..., None, None], (2, 3000, 10, 20))
+    scene = simulation.scene(time, films[0], films[1], emissivity_of(0.86, 0.72))
+    capture = simulation.observe(scene, rig.response(), np.random.default_rng(8))
+    status = separation.solve(capture, rig.response())["status"]
+    print(f"noise 1:{louder:g}: flagged {float((status != 0).mean()):.4f}")
+    assert float((status != 0).mean()) < 0.02

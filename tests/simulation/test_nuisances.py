@@ -17,15 +17,6 @@ def test_lag_is_that_of_a_small_body() -> None:
     np.testing.assert_allclose(seen[0, :, 0, 0], -np.expm1(-time / 0.010), rtol=0, atol=1e-12)
 
 
-def test_steps_leave_their_input() -> None:
-    """A new dataset comes out of each step, and the old one is as it was."""
-    capture, rng = still(), np.random.default_rng(0)
-    before = capture.copy(deep=True)
-    made = [simulation.lag(capture, 0.01), simulation.spoil_pixels(capture, 0.01, rng)]
-    xr.testing.assert_identical(capture, before)
-    assert all(one is not capture for one in made)
-
-
 def test_simulated_nuisances_refuse_nonsense() -> None:
     """Shares, times and bands outside their range raise a ValueError."""
     capture, rng = still(), np.random.default_rng(0)

@@ -61,16 +61,6 @@ def test_heating_is_newton_s(start: float, stop: float, constant: float) -> None
     np.testing.assert_allclose(curve[[0, -1]], [start, stop], rtol=0, atol=1e-11)
 
 
-def test_heating_obeys_its_equation() -> None:
-    """The rate is (limit - T) / tau, for a time constant a column, whenever the clock starts."""
-    constants, step = np.array([3.0, 12.0]), 1e-3
-    time = np.linspace(0.0, 2.0, 2001)
-    curve = heating(time + 500.0, 300.0, 320.0, constants)
-    limit = 300.0 + 20.0 / -np.expm1(-time[-1] / constants)
-    rate = np.gradient(curve, step, axis=0)[1:-1]
-    np.testing.assert_allclose(rate, ((limit - curve) / constants)[1:-1], rtol=0, atol=1e-5)  # K/s
-
-
 def test_still_background_drifts(rng: np.random.Generator) -> None:
     """A still background is its level, and a drift a straight line over the capture."""
     still = Background("still", level=290.0).draw(TIME, 3, rng)
@@ -89,14 +79,6 @@ def test_one_pulse(rng: np.random.Generator) -> None:
     length = on.sum(axis=0)[~on[-1]]
     assert 10 <= length.min() <= 11  # frames
     assert 19 <= length.max() <= 20
-
-
-def test_number_of_pulses(rng: np.random.Generator) -> None:
-    """The number of pulses is uniform from six to nine."""
-    drawn = Background(duration=(100.0, 101.0)).draw(TIME, 2000, rng)
-    number, times = np.unique(np.rint((drawn[-1] - 295.15) / 3.0), return_counts=True)
-    assert number.tolist() == [6, 7, 8, 9]
-    np.testing.assert_allclose(times, 500, rtol=0, atol=80)  # 4 standard deviations
 
 
 def test_random_walk(rng: np.random.Generator) -> None:
@@ -126,12 +108,6 @@ def test_time_constants_are_positive(constant: float) -> None:
         heating(TIME, 300.0, 320.0, constant)
 
 
-def test_unknown_background() -> None:
-    """An unknown kind of background raises an error that lists the known ones."""
-    with pytest.raises(ValueError, match=r"Unknown background 'waves'. Must be one of .*'pulses'"):
-        Background("waves")
-
-
 def test_walkers(twin: xr.Dataset) -> None:
     """The room is reflected but where someone walks by; the plate's middle heats up."""
     background = twin["background_temperature"]
@@ -154,17 +130,6 @@ def test_independent_pixels(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(ends.T, [[293.15, 333.15]] * 50, rtol=0, atol=1e-10)
     assert np.unique(made["object_temperature"].isel(time=60)).size == 50
     np.testing.assert_array_equal(made["emissivity"].isel(y=0, x=7), GLASS)
-
-
-def test_side_by_side() -> None:
-    """Panels stand from left to right, as equal as the width allows."""
-    table = xr.DataArray(
-        [[0.9, 0.8], [0.7, 0.6], [0.5, 0.4]],
-        dims=("material", "band"),
-        coords={"band": ["8-14", "9.5"]},
-    )
-    image = simulation.side_by_side(table, (2, 6))
-    np.testing.assert_array_equal(image.sel(band="9.5"), [[0.8, 0.8, 0.6, 0.6, 0.4, 0.4]] * 2)
 
 
 def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
