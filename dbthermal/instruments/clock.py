@@ -51,6 +51,11 @@ class Clock:
         with lock:
             yield
 
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Let this thread take part in the order of a clock that has one, while a block lasts."""
+        yield
+
     def enter(self, entered: threading.Event) -> None:
         """Begin the work of a thread, and set an event when it has its place in the order."""
         entered.set()

@@ -11,6 +11,7 @@ from faulty_tc08 import FaultyTC08
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
@@ -21,30 +22,23 @@ QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
 
 
-class Clock:
-    """
-    A simulated clock, which advances only by waiting.
-
-    Attributes
-    ----------
-    now : float
-        The time [s].
-    events : list of tuple
-        What is to be done, and when [s].
-    """
+class Clock(EmulatedClock):
+    """Emulated time from a start [s], with things to do at some times [s]."""
 
     def __init__(self, now: float = 100.0) -> None:
-        self.now = now
+        super().__init__()
+        super().sleep(now)
         self.events: list[tuple[float, Callable[[], None]]] = []
 
-    def __call__(self) -> float:
-        """Time [s]."""
-        return self.now
+    @property
+    def now(self) -> float:
+        """The time [s]."""
+        return self()
 
-    def sleep(self, duration: float) -> None:
+    def sleep(self, seconds: float) -> None:
         """Let time pass [s], and do what is due."""
-        self.now += duration
-        due = [event for event in self.events if event[0] <= self.now]
+        super().sleep(seconds)
+        due = [event for event in self.events if event[0] <= self()]
         for event in due:
             self.events.remove(event)
             event[1]()
@@ -58,8 +52,8 @@ class BosonBench:
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
         self.device = FaultyBoson(self.world, "boson")
-        self.loop = Line(self.device, clock=self.clock, sleep=self.clock.sleep)
-        self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
+        self.loop = Line(self.device, self.clock)
+        self.camera = Boson(self.loop, first_sequence=1)
 
     def spoil(self, *faults: Fault | None) -> None:
         """Set faults of the next requests."""
@@ -78,9 +72,9 @@ class WheelBench:
         self.clock = Clock(0.0)
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
-        loop = Line(self.device, clock=self.clock, sleep=self.clock.sleep)
+        loop = Line(self.device, self.clock)
         chosen = Settings(**options)  # type: ignore[arg-type]
-        self.wheel = FilterWheel(loop, FILTERS, chosen, clock=self.clock, sleep=self.clock.sleep)
+        self.wheel = FilterWheel(loop, FILTERS, chosen)
 
     def homed(self) -> FilterWheel:
         """Connect and home the wheel."""
@@ -104,12 +98,8 @@ class LoggerBench:
     def __init__(self) -> None:
         self.clock = Clock(1000.0)
         self.tips = {1: 350.0, 2: 300.0}
-        self.unit = FaultyTC08(
-            lambda channel: self.tips.get(channel, np.nan),
-            clock=self.clock,
-            sleep=self.clock.sleep,
-        )
-        self.driver = TC08(self.unit, clock=self.clock, sleep=self.clock.sleep)
+        self.unit = FaultyTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
+        self.driver = TC08(self.unit)
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""

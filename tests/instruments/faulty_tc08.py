@@ -1,6 +1,5 @@
 """An emulated TC-08 with faults, each set by an attribute of `faults`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,9 +45,8 @@ class Faults:
 class FaultyTC08(EmulatedTC08):
     """The emulated library with faults."""
 
-    def __init__(self, *arguments: Any, clock: Callable[[], float], **settings: Any) -> None:
-        super().__init__(*arguments, **settings)
-        self._clock = clock
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self.faults = Faults()
         self._opening = 0.0
 
@@ -63,12 +61,12 @@ class FaultyTC08(EmulatedTC08):
 
     def usb_tc08_open_unit_async(self) -> int:
         """Begin the firmware's download."""
-        self._opening = self._clock()
+        self._opening = self.clock()
         return super().usb_tc08_open_unit_async()
 
     def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
         """Wait for the firmware."""
-        if self._clock() - self._opening < self.faults.firmware_delay:
+        if self.clock() - self._opening < self.faults.firmware_delay:
             return 0
         self._is_open |= self.faults.no_unit
         return super().usb_tc08_open_unit_progress(handle, percent)

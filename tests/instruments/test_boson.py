@@ -35,7 +35,7 @@ def reply(sequence: int, command: int, data: bytes = b"", status: int = 0) -> by
 def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
     """Driver that takes part in a dialogue."""
     clock = Clock()
-    return Boson(line, first_sequence=first_sequence, clock=clock, sleep=clock.sleep)
+    return Boson(line, first_sequence=first_sequence)
 
 
 def test_the_public_serial_number_is_read() -> None:

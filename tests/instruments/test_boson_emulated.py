@@ -191,8 +191,8 @@ def test_frames_are_counted_once(has_frames: bool) -> None:
     world = World(clock=(clock := Clock()))
     state = world.add_camera("boson", 7)
     state.has_frames, state.frame_count = has_frames, 41
-    line = Line(EmulatedBoson(world, "boson"), clock=clock, sleep=clock.sleep)
-    camera = Boson(line, clock=clock, sleep=clock.sleep)
+    line = Line(EmulatedBoson(world, "boson"), clock)
+    camera = Boson(line)
     clock.sleep(5)
     assert camera.run_ffc() == (41 if has_frames else 300)
 
@@ -204,7 +204,7 @@ def test_every_reply_comes_until_the_plug_is_pulled() -> None:
     device = FaultyBoson(world, "boson")
     device.faults.single_bytes = True
     device.faults.once = deque([Fault.DEBUG_TEXT, None] * 50)
-    with Boson(Line(device)) as camera:
+    with Boson(Line(device, world.clock)) as camera:
         assert {camera.serial_number() for _ in range(100)} == {2**32 - 1}
         world.camera("boson").plugged = False
         with pytest.raises(TransportError, match="must stay connected"):

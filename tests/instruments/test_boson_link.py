@@ -48,7 +48,7 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
     ]
     clock = Clock()
     with Dialogue(pairs) as line:
-        camera = Boson(line, first_sequence=1, clock=clock, sleep=clock.sleep)
+        camera = Boson(line, first_sequence=1)
         assert camera.run_ffc() == 1234
 
 
@@ -69,7 +69,7 @@ def test_each_program_begins_at_another_number(monkeypatch: pytest.MonkeyPatch) 
     for microseconds in (1_700_000_000_000_001, 1_700_000_000_100_001):
         monkeypatch.setattr(time, "time_ns", lambda now=microseconds: 1000 * now)
         bench = BosonBench()
-        bench.camera = Boson(bench.loop, clock=bench.clock, sleep=bench.clock.sleep)
+        bench.camera = Boson(bench.loop)
         bench.camera.serial_number()
         first.append(bench.camera._sequence)
         assert first[-1] == fslp.next_sequence((microseconds - 1) % 2**32)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from device_benches import Clock
 from faulty_camera import Faults, FaultyCamera, Movie, frames
 
 from dbthermal.instruments import telemetry
@@ -18,21 +19,6 @@ from dbthermal.instruments.emulated.world import World
 SHAPE, RATE = (8, 80), 10.0
 
 
-class Clock:
-    """A simulated clock, which advances only by waiting."""
-
-    def __init__(self) -> None:
-        self.time = 1000.0
-
-    def __call__(self) -> float:
-        """The time [s]."""
-        return self.time
-
-    def sleep(self, duration: float) -> None:
-        """Let time pass."""
-        self.time += duration
-
-
 def level(counts: int) -> Movie:
     """A movie of 100 even frames, each one count above the one before."""
     steps = np.arange(counts, counts + 100, dtype=np.uint16)
@@ -41,13 +27,11 @@ def level(counts: int) -> Movie:
 
 def camera(faults: Faults | None = None, band: str | None = "8-14", rows: int = 0) -> FaultyCamera:
     """A camera on a bench with a wheel of two filters, on a simulated clock."""
-    clock = Clock()
+    clock = Clock(1000.0)
     world = World(clock=clock, filters={1: "9.5", 2: "11"})
     world.add_camera("wide", 93588)
     pictures = {"8-14": level(1000), "9.5": level(2000), "11": level(3000)}
-    return FaultyCamera(
-        world, "wide", pictures, band, SHAPE, RATE, rows, clock.sleep, faults=faults or Faults()
-    )
+    return FaultyCamera(world, "wide", pictures, band, SHAPE, RATE, rows, faults=faults or Faults())
 
 
 def shown(frame: Frame) -> int:
@@ -125,9 +109,9 @@ def test_nobody_reads() -> None:
     """Frames beyond the buffers are lost while nobody reads, and leave a gap in the numbers."""
     source = camera()
     source.read()
-    source.sleep(0.75)
+    source.clock.sleep(0.75)
     assert source.read().sequence == 1
-    source.sleep(4.0)
+    source.clock.sleep(4.0)
     assert source.read().sequence == 47
 
 
@@ -181,13 +165,13 @@ def test_no_frame_in_time() -> None:
 
 def test_scene_begins_when_it_is_told() -> None:
     """Before, its beginning is seen; then pictures and thermocouples go with its own time."""
-    clock = Clock()
+    clock = Clock(1000.0)
     world = World(clock=clock, scene=lambda time: {"plate": 300.0 + time}, waits=True)
     world.add_camera("wide", 1)
     world.thermocouples[1] = "plate"
     clock.sleep(5.0)
     source = FaultyCamera(
-        world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE, sleep=clock.sleep
+        world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE
     )
     assert [shown(frame) for frame in frames(source, 3)] == [1000] * 3
     assert (world.scene_time(), world.thermocouple_temperature(1)) == (0.0, 300.0)
@@ -225,7 +209,7 @@ def test_unknown_names() -> None:
 
 def test_world_has_places_and_slots() -> None:
     """Thermocouples read what they are at; names are checked."""
-    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock())
+    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock(1000.0))
     world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
     world.blackbody_temperature = 320.0
     assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 320.0]

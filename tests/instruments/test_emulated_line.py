@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.transport import TransportError
 
@@ -33,8 +34,7 @@ class Echo:
 
 def test_reads_are_short_and_time_out() -> None:
     """All bytes come back unchanged, in order, and silence takes no time on an injected clock."""
-    times = iter(range(100))
-    line = Line(Echo(), clock=lambda: float(next(times)), sleep=lambda _: None)
+    line = Line(Echo(), EmulatedClock())
     line.write(AWKWARD)
     line.write(b"ab")
     assert (line.read(10, 1.0) + line.read(4096, 1.0), line.read(2, 1.0)) == (AWKWARD, b"ab")
@@ -43,11 +43,11 @@ def test_reads_are_short_and_time_out() -> None:
 
 def test_an_end_is_an_end() -> None:
     """A line that was closed, twice, and one whose device was unplugged raise errors."""
-    closed, device = Line(Echo()), Echo()
+    closed, device = Line(Echo(), EmulatedClock()), Echo()
     for _ in range(2):
         closed.close()
     device.plugged = False
-    for line in (closed, Line(device)):
+    for line in (closed, Line(device, EmulatedClock())):
         with pytest.raises(TransportError, match="It must stay connected and open"):
             line.write(b"x")
         with pytest.raises(TransportError, match="It must stay connected and open"):

@@ -239,7 +239,7 @@ def read_beside_frames(device: Instrument) -> Read:
         return device.position
     if isinstance(device, Boson):
         return Devices(session(), {}, {"9.5": device}).readings()["fpa 9.5"].read
-    tips = Thermocouples(device, {1: "tip"}, clock=device._clock)
+    tips = Thermocouples(device, {1: "tip"})
     return Devices(session(), {}, thermocouples=tips).readings()["tip"].read
 
 
@@ -288,7 +288,7 @@ def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> 
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
     device = FaultyBoson(recorded.world, "9.5")
     device.faults.ffc_stalls = True
-    with Boson(Line(device), timeout=20) as boson:
+    with Boson(Line(device, device._world.clock), timeout=20) as boson:
         recorded.record(1.0, {"fpa": read_beside_frames(boson)})
     assert "shutter_closed" in recorded.kinds("9.5")
     assert {*recorded.kinds("fpa")} == {"reading"}

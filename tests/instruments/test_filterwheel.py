@@ -113,8 +113,8 @@ def test_a_controller_that_was_homed_before_is_taken_over() -> None:
     """A new program need not home the wheel again if the controller kept its power."""
     bench = WheelBench()
     bench.homed().move_to(5)
-    loop = Line(bench.device, clock=bench.clock, sleep=bench.clock.sleep)
-    with FilterWheel(loop, FILTERS, clock=bench.clock, sleep=bench.clock.sleep) as wheel:
+    loop = Line(bench.device, bench.clock)
+    with FilterWheel(loop, FILTERS) as wheel:
         wheel.connect()
         assert wheel.band() == "LW"
 

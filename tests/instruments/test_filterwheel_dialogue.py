@@ -65,7 +65,7 @@ def test_dialogue_of_a_move() -> None:
         ]
     )
     with dialogue:
-        wheel = FilterWheel(dialogue, FILTERS, clock=clock, sleep=clock.sleep)
+        wheel = FilterWheel(dialogue, FILTERS)
         assert wheel.connect().model == "BSC201"
         wheel.move_to(2)
 
@@ -97,7 +97,7 @@ def test_arbitrary_answers(answers: list[bytes]) -> None:
 
     babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
-        FilterWheel(babbler, FILTERS, clock=clock, sleep=clock.sleep).connect()
+        FilterWheel(babbler, FILTERS).connect()
 
 
 @pytest.mark.parametrize("bits", [b"\x12\x02\x01\x00\x01\x21", b"\x12\x02\x01\x03\x01\x21"])

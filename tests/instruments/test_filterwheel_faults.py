@@ -259,7 +259,7 @@ class Endless(Closing):
     is_simulated = True
 
     def __init__(self, limit: int) -> None:
-        self.left = limit
+        self.left, self.clock = limit, Clock()
 
     def write(self, data: bytes) -> None:
         """Take anything."""
@@ -277,9 +277,8 @@ class Endless(Closing):
 
 def test_a_device_that_never_ends_is_another_one() -> None:
     """An endless stream of bytes ends the wait with an error."""
-    clock = Clock()
     line = Endless(2 * MAXIMUM_UNSOLICITED)
-    wheel = FilterWheel(line, {}, clock=clock, sleep=clock.sleep)
+    wheel = FilterWheel(line, {})
     with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
         wheel.connect()
 
@@ -290,7 +289,7 @@ class Unplugged(Closing):
     is_simulated = True
 
     def __init__(self, line: Closing, steps: int) -> None:
-        self.line, self.steps = line, steps
+        self.line, self.steps, self.clock = line, steps, line.clock
 
     def _step(self, name: str, *arguments: object) -> bytes:
         self.steps -= 1
@@ -317,7 +316,7 @@ def test_unplugging_at_any_step(steps: int) -> None:
     """Unplugging at any step raises the documented error, and closing still works."""
     bench = WheelBench()
     line = Unplugged(bench.wheel._transport, steps)  # type: ignore[arg-type]
-    wheel = FilterWheel(line, FILTERS, clock=bench.clock, sleep=bench.clock.sleep)
+    wheel = FilterWheel(line, FILTERS)
 
     def use() -> None:
         wheel.connect()

@@ -19,7 +19,7 @@ from dbthermal.instruments.clock import Clock, Item
 START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # date and time of day at time 0 of every clock
 
 _ROOM: Final = 1.0  # emulated wait for a place in a buffer whose reader has ended [s]
-_POLL: Final = 0.01  # wait for a thread that is no `Task` [s], by the computer's clock
+_POLL: Final = 0.05  # by the computer's clock, until a wait looks for what other threads did [s]
 
 
 class _Wait:
@@ -34,16 +34,16 @@ class _Wait:
 class EmulatedClock(Clock):
     """Clock of an emulated bench, which begins at time 0, on 1 January 2000.
 
-    Threads are started as `Task`, by any thread. A condition must not wait itself. RuntimeError if
-    all threads wait for one another without an end.
+    Threads take part in its order if they are a `Task`, or inside `joined`. Others may wait on it,
+    too, but run beside those, so that what happens then is of the computer's making.
     """
 
     def __init__(self) -> None:
         self._now = 0.0
         self._lock = threading.Lock()
         self._waits: list[_Wait] = []
-        self._running: set[int] = set()  # threads that wait for nothing
-        self._tasks = 0
+        self._members: set[int] = set()  # threads that take part in the order
+        self._running: set[int] = set()  # those of them that do not wait
 
     def __call__(self) -> float:
         """Time since the start [s]."""
@@ -79,19 +79,30 @@ class EmulatedClock(Clock):
         finally:
             lock.release()
 
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Take part in the order while a block lasts, as the thread that runs now."""
+        with self._lock:
+            self._members.add(threading.get_ident())
+            self._running.add(threading.get_ident())
+        try:
+            yield
+        finally:
+            self.leave()
+
     def enter(self, entered: threading.Event) -> None:
         """Take a place in the order behind all that wait, and wait for the turn."""
         with self._lock:
-            self._tasks += 1
+            self._members.add(threading.get_ident())
             turn = _Wait(lambda: True, self._now)
             self._waits.append(turn)
         entered.set()
-        turn.over.wait()
+        self._await(turn)
 
     def leave(self) -> None:
-        """End the work of a thread: the next one runs."""
+        """End the part of a thread: the next one runs."""
         with self._lock:
-            self._tasks -= 1
+            self._members.discard(threading.get_ident())
             self._running.discard(threading.get_ident())
             self._next()
 
@@ -103,9 +114,7 @@ class EmulatedClock(Clock):
                 self._waits.append(turn)
                 self._running.discard(turn.thread)
                 self._next()
-            while not turn.over.wait(None if self._tasks else _POLL):
-                with self._lock:
-                    self._next()
+            self._await(turn)
         except BaseException:  # an interrupt: this thread goes on
             with self._lock:
                 self._waits = [wait for wait in self._waits if wait is not turn]
@@ -113,26 +122,28 @@ class EmulatedClock(Clock):
             raise
         return turn.held
 
+    def _await(self, turn: _Wait) -> None:
+        while not turn.over.wait(_POLL):
+            with self._lock:
+                self._next()
+
     def _next(self) -> None:
         """Let the next thread run, if none does."""
-        if self._running or not self._waits:
-            return
-        chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
-        if chosen is None:
-            chosen = min(self._waits, key=lambda wait: wait.end)
-            if math.isinf(chosen.end):
-                if not self._tasks:
-                    return
-                raise RuntimeError("All threads wait for one another. One must have a time limit.")
-            self._now = chosen.end
-        self._run(chosen)
-        self._waits.remove(chosen)
+        while self._waits and not self._running:
+            chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
+            if chosen is None:
+                chosen = min(self._waits, key=lambda wait: wait.end)
+                if math.isinf(chosen.end):
+                    return  # a thread that takes no part has what all wait for
+                self._now = chosen.end
+            self._run(chosen)
+            self._waits.remove(chosen)
 
     def _is_over(self, wait: _Wait) -> bool:
         wait.held = wait.condition()
         return wait.held or wait.end <= self._now
 
     def _run(self, wait: _Wait) -> None:
-        if self._tasks:  # without any, a single thread waits, and may be another one next time
+        if wait.thread in self._members:
             self._running.add(wait.thread)
         wait.over.set()

@@ -89,9 +89,9 @@ def record(
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    with raised_signals():
+    clock = next(iter(sources.values())).clock
+    with raised_signals(), clock.joined():
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-        clock = next(iter(sources.values())).clock
         start = clock()  # to make the file may have taken a while
         file.begin(start, _utc(clock))
         end, stop = start + session.duration, stop or threading.Event()
