@@ -4,7 +4,6 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from device_benches import Clock
 from dialogue import Dialogue
 from faulty_boson import DEBUG_CHANNEL
 from hypothesis import given
@@ -34,7 +33,6 @@ def reply(sequence: int, command: int, data: bytes = b"", status: int = 0) -> by
 
 def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
     """Driver that takes part in a dialogue."""
-    clock = Clock()
     return Boson(line, first_sequence=first_sequence)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from device_benches import BosonBench, Clock
+from device_benches import BosonBench
 from dialogue import Dialogue, Pair
 from faulty_boson import Fault
 from test_boson import reply
@@ -19,6 +19,7 @@ from dbthermal.instruments.boson import (
     commands,
 )
 from dbthermal.instruments.camera import FfcStatus
+from dbthermal.instruments.clock import SYSTEM
 from dbthermal.instruments.transport import Closing, TransportError
 
 
@@ -46,7 +47,6 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
         (fslp.encode(number, command), reply(number, command, data))
         for number, (command, data) in enumerate(asked, start=1)
     ]
-    clock = Clock()
     with Dialogue(pairs) as line:
         camera = Boson(line, first_sequence=1)
         assert camera.run_ffc() == 1234
@@ -63,17 +63,16 @@ def test_a_mute_camera_ends_a_wait_in_time() -> None:
     assert bench.clock.now - start <= 3.0 + REPLY_TIMEOUT + 0.2
 
 
-def test_each_program_begins_at_another_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_program_begins_at_another_number() -> None:
     """The first sequence number depends on the time of day, which identifies stale replies."""
-    first = []
-    for microseconds in (1_700_000_000_000_001, 1_700_000_000_100_001):
-        monkeypatch.setattr(time, "time_ns", lambda now=microseconds: 1000 * now)
-        bench = BosonBench()
-        bench.camera = Boson(bench.loop)
-        bench.camera.serial_number()
-        first.append(bench.camera._sequence)
-        assert first[-1] == fslp.next_sequence((microseconds - 1) % 2**32)
-    assert first[0] != first[1]
+    asked = []
+    for later in (0.0, 0.1):
+        line = Dialogue([])
+        line.clock.sleep(later)
+        with pytest.raises(AssertionError, match="Must be nothing more") as sent:
+            Boson(line).serial_number()
+        asked.append(str(sent.value))
+    assert asked[0] != asked[1]
 
 
 class Slow(Closing):
@@ -86,7 +85,7 @@ class Slow(Closing):
         Requests that came before the last was answered, or after the line was closed.
     """
 
-    is_simulated = True
+    is_simulated, clock = True, SYSTEM
 
     def __init__(self) -> None:
         self.overlaps = 0

@@ -6,7 +6,6 @@ are counted as losses, and every recording is checked against its frames (`check
 """
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -259,16 +258,17 @@ def test_what_the_user_sees(name: str) -> None:
 @pytest.fixture(scope="module")
 def troubled(tmp_path_factory: pytest.TempPathFactory) -> CheckedRecording:
     """One recording during which every instrument has faults and is slow."""
+    recorded = CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr")
 
     def slowly(read: Read) -> Read:
         def wait_and_read() -> float:
-            time.sleep(0.002)
+            recorded.world.clock.sleep(0.002)
             return read()
 
         return wait_and_read
 
     readings = {name: slowly(read_beside_frames(make())) for name, (make, _) in TROUBLES.items()}
-    return CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr").record(0.8, readings)
+    return recorded.record(0.8, readings)
 
 
 @pytest.mark.parametrize("name", TROUBLES)

@@ -1,7 +1,7 @@
 """The filter wheel's driver byte for byte, and among foreign and invalid answers."""
 
 import pytest
-from device_benches import FILTERS, Clock
+from device_benches import FILTERS
 from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -52,7 +52,7 @@ def _status(position: int, bits: int) -> bytes:
 
 def test_dialogue_of_a_move() -> None:
     """Every byte of a connection and a move, with the report of the end between two answers."""
-    clock, ask = Clock(), bytes.fromhex("80 04 01 00 21 01")
+    ask = bytes.fromhex("80 04 01 00 21 01")
     move = bytes.fromhex("53 04 06 00 A1 01 01 00 AB 0A 01 00")
     end = bytes.fromhex("64 04 01 00 01 21")
     dialogue = Dialogue(
@@ -87,7 +87,6 @@ def test_answers_of_others() -> None:
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
     """Connecting ends with a documented error for arbitrary answers."""
-    clock = Clock()
 
     class Babbler(Dialogue):
         """A device that sends arbitrary bytes."""
