@@ -183,7 +183,10 @@ class FrameSource(Protocol):
     frame_rate: float  # nominal [Hz]
     identity: Mapping[str, str]  # model, serial number and device; text by name
     is_simulated: bool  # True if the camera is emulated
-    clock: Clock  # of the times of arrival
+
+    @property
+    def clock(self) -> Clock:
+        """Clock of the times of arrival."""
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait at most `timeout` [s] for the next frame; damaged ones come with flags.

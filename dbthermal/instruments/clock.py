@@ -71,7 +71,12 @@ class Task(threading.Thread):
     """A thread that waits on a clock; the event `ended` is set at the end of its work."""
 
     def __init__(
-        self, clock: Clock, name: str, work: Callable[..., None], *values: Any, daemon: bool = True
+        self,
+        clock: Clock,
+        name: str,
+        work: Callable[..., object],
+        *values: Any,
+        daemon: bool = True,
     ) -> None:
         super().__init__(name=name, daemon=daemon)
         self.ended = threading.Event()

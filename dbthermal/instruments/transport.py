@@ -108,7 +108,10 @@ class Transport(Protocol):
     """A line to a device, as a driver needs it; a context manager in each implementation."""
 
     is_simulated: bool  # True if the device is emulated
-    clock: Clock  # of the device's times and time limits
+
+    @property
+    def clock(self) -> Clock:
+        """Clock of the device's times and time limits."""
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device is gone."""

@@ -18,11 +18,11 @@ from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.clock import START, EmulatedClock
 from dbthermal.instruments.recording import Limits, Preview, open_capture
 
-LIMITS = Limits(chunk=5, reserve=0, queue=3)
+LIMITS = Limits(chunk=30, reserve=0, queue=3)
 SWEEP = from_yaml(
     replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.6"))
 )
-SCENE = from_yaml(replaced(("duration: 0.15", "duration: 4.0"), text=scene_text()))
+SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text()))
 
 
 def recorded(folder: Path) -> dict[str, str]:

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from checked_recording import CheckedRecording, Read, session
-from device_benches import BosonBench, LoggerBench, WheelBench
-from faulty_boson import Fault, FaultyBoson
+from device_benches import BosonBench, Fault, FaultyBoson, LoggerBench, WheelBench
 from faulty_camera import Faults
 
 from dbthermal import store

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
+from test_capture_file import CaptureFile
 
 from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
@@ -27,7 +28,6 @@ from dbthermal.instruments.recording import (
     open_capture,
     record,
 )
-from dbthermal.instruments.recording._capture_file import CaptureFile
 from dbthermal.instruments.session import Camera, Session
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
@@ -359,7 +359,12 @@ def test_device_that_hangs(tmp_path: Path) -> None:
     """A device that never answers costs an error that names it, and no frame."""
     limits = Limits(chunk=CHUNK, reserve=0, patience=0.1)
     sources = bench()
-    readings = {"plate": Reading(lambda: float(sources["9.5"].clock.sleep(20.0) or 0.0))}
+
+    def hang() -> float:
+        sources["9.5"].clock.sleep(20.0)
+        return 0.0
+
+    readings = {"plate": Reading(hang)}
     with pytest.raises(TimeoutError, match="No answer of the device of 'readings' within 0"):
         record(session(), sources, tmp_path / "a.zarr", readings=readings, limits=limits)
     assert store.open_dataset(tmp_path / "a.zarr").attrs["frames_written"]["9.5"] > 20

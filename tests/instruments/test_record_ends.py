@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_camera import Faults, FaultyCamera
+from test_capture_file import CaptureFile
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
@@ -23,7 +24,6 @@ from dbthermal.instruments.recording import (
     open_capture,
     record,
 )
-from dbthermal.instruments.recording._capture_file import CaptureFile
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +87,7 @@ def written(path: Path) -> int:
 
 def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
     """While something is drawn, frames are written."""
-    path, seen = tmp_path / "a.zarr", []
+    path, seen = tmp_path / "a.zarr", list[int]()
 
     def draw(_: Preview) -> None:
         while not (chunks := written(path) // CHUNK) and clock() < 0.9:

@@ -17,11 +17,11 @@ import pytest
 import xarray as xr
 from file_operations import before_operation, operations_of
 from rig_session import replaced, scene_text
+from test_capture_file import CaptureFile
 from test_record import SMALL, bench, session
 
 from dbthermal import store
 from dbthermal.instruments.recording import Preview, record
-from dbthermal.instruments.recording._capture_file import CaptureFile
 from dbthermal.instruments.signals import SignalExit, raised_signals
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
