@@ -31,6 +31,8 @@ from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import notes
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 
+__all__ = ["CaptureFile", "Note"]  # other tests take them from here
+
 SHAPE, RATE, BANDS = (4, 80), 100.0, ("8-14", "9.5")
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)
 

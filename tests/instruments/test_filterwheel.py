@@ -866,7 +866,7 @@ class Unplugged(Closing):
 
     is_simulated = True
 
-    def __init__(self, line: Closing, steps: int) -> None:
+    def __init__(self, line: Line, steps: int) -> None:
         self.line, self.steps, self.clock = line, steps, line.clock
 
     def _step(self, name: str, *arguments: object) -> bytes:
@@ -893,7 +893,7 @@ class Unplugged(Closing):
 def test_unplugging_at_any_step(steps: int) -> None:
     """Unplugging at any step raises the documented error, and closing still works."""
     bench = WheelBench()
-    line = Unplugged(bench.wheel._transport, steps)  # type: ignore[arg-type]
+    line = Unplugged(Line(bench.device, bench.clock), steps)
     wheel = FilterWheel(line, FILTERS)
 
     def use() -> None:

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from types import ModuleType
 
 import pytest
-from device_benches import apt
 
+from dbthermal.instruments import _apt as apt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.world import World
 
