@@ -16,8 +16,6 @@ units, and addresses). Facts alone, no code.
 
 import logging
 import threading
-import time as system_time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 
@@ -143,18 +141,12 @@ class Controller:
     and NoReplyError if it is silent.
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        settings: Settings,
-        *,
-        clock: Callable[[], float] = system_time.monotonic,
-    ) -> None:
+    def __init__(self, transport: Transport, settings: Settings) -> None:
         self.unit, self.motor = ADDRESSES[0]
         self._decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
         self._transport = transport
         self._settings = settings
-        self._clock = clock
+        self._clock = transport.clock
         self._info: apt.Info | None = None
         # A recorder asks for the position in a thread of its own, while others turn the wheel.
         self._line = threading.Lock()
@@ -292,7 +284,7 @@ class Controller:
         """
         source, channel = (self.motor, CHANNEL) if unit is None else (unit, 0)
         request = apt.command(identifier, channel, destination=source)
-        with self._line:
+        with self._clock.hold(self._line):
             for _ in range(ATTEMPTS if unit is None else 1):
                 self._collect()
                 self._transport.write(request)
@@ -346,7 +338,7 @@ class Controller:
 
     def _forget_events(self) -> None:
         """Forget the ends of earlier motions, and raise the errors that were reported."""
-        with self._line:
+        with self._clock.hold(self._line):
             self._collect()
         self._events.clear()
         self.raise_notice()

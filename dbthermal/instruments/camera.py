@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from dbthermal import _text as texts
 from dbthermal.correction._shutter import FEWEST_COPIES
+from dbthermal.instruments.clock import Clock
 from dbthermal.schema import Flags
 
 __all__ = [
@@ -182,6 +183,10 @@ class FrameSource(Protocol):
     frame_rate: float  # nominal [Hz]
     identity: Mapping[str, str]  # model, serial number and device; text by name
     is_simulated: bool  # True if the camera is emulated
+
+    @property
+    def clock(self) -> Clock:
+        """Clock of the times of arrival."""
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait at most `timeout` [s] for the next frame; damaged ones come with flags.

@@ -7,7 +7,6 @@ imported only then.
 
 import importlib
 import threading
-import time as system_time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,6 +25,7 @@ from dbthermal.instruments.camera import (
     Stream,
     camera_kind,
 )
+from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import Session
@@ -49,7 +49,6 @@ class Thermocouples:
 
     logger: TC08
     names: Mapping[int, str]
-    clock: Callable[[], float] = system_time.monotonic
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -61,9 +60,9 @@ class Thermocouples:
 
         `ReadingError` if it is no temperature, or the logger fails.
         """
-        with self._lock:
+        with self.logger.clock.hold(self._lock):
             scan = self._scan
-            if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
+            if scan is None or channel in self._read or self.logger.clock() - scan.time > SCAN_AGE:
                 try:
                     self._scan = scan = self.logger.single()
                 except TC08Error as error:
@@ -88,6 +87,11 @@ class Devices:
     wheel: FilterWheel | None = None
     thermocouples: Thermocouples | None = None  # readings of the logger
     world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
+
+    @property
+    def clock(self) -> Clock:
+        """Clock of all devices."""
+        return SYSTEM if self.world is None else self.world.clock
 
     def readings(self) -> dict[str, Reading]:
         """Instruments that are read beside the frames, for `recording.record`.
@@ -176,9 +180,9 @@ class Devices:
 
     def flush(self) -> None:
         """Discard frames that the drivers hold of the scene before; SourceLostError if lost."""
-        start = system_time.monotonic()
+        start = self.clock()
         for source in self.sources.values():
-            while system_time.monotonic() - start < FLUSH_TIMEOUT:
+            while self.clock() - start < FLUSH_TIMEOUT:
                 try:
                     frame = source.read(0.0)
                 except NoFrameError:

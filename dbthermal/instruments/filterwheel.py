@@ -10,7 +10,6 @@ and the wheel is where it should be. Neither is enough alone. Bits were seen to 
 an earlier move may come late, and before a move starts the bits are clear too.
 """
 
-import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Self
@@ -69,14 +68,11 @@ class FilterWheel(Closing):
         transport: Transport,
         filters: Mapping[int, str],
         settings: Settings | None = None,
-        *,
-        clock: Callable[[], float] = system_time.monotonic,
-        sleep: Callable[[float], None] = system_time.sleep,
     ) -> None:
         self.filters, self.settings = filters, settings or Settings()
         self._transport = transport
-        self._controller = Controller(transport, self.settings, clock=clock)
-        self._clock, self._sleep = clock, sleep
+        self._controller = Controller(transport, self.settings)
+        self._clock = transport.clock
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
@@ -234,7 +230,7 @@ class FilterWheel(Closing):
             confirmed = confirmed + 1 if is_over(motion, status) else 0
             if not confirmed:
                 self._check(motion, status)
-            self._sleep(POLL_INTERVAL)
+            self._clock.sleep(POLL_INTERVAL)
 
     def _check(self, motion: "_Motion", status: apt.Status) -> None:
         """Raise if the wheel rests where it should not, stands still, or takes too long."""

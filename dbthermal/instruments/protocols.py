@@ -6,7 +6,6 @@ of these is a recording of its own. `dbthermal.instruments.recording` opens the 
 """
 
 import threading
-import time as system_time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import store
 from dbthermal.instruments.camera import Identity, SourceLostError
+from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording import _reader as reader
@@ -61,8 +61,7 @@ def wait_stable(
     temperature: float,
     read: Callable[[], float],
     *,
-    clock: Callable[[], float] = system_time.monotonic,
-    sleep: Callable[[float], None] = system_time.sleep,
+    clock: Clock = SYSTEM,
 ) -> float:
     """Wait until a temperature is stable near its set point, and return its mean [K].
 
@@ -75,8 +74,10 @@ def wait_stable(
         Session with a blackbody.
     temperature : float
         Set point [K].
-    read, clock, sleep : callable
-        Reads the temperature [K]; time [s], and a pause of some time [s].
+    read : callable
+        Reads the temperature [K].
+    clock : Clock
+        Clock of the device.
 
     Raises
     ------
@@ -96,7 +97,7 @@ def wait_stable(
             return float(values.mean())
         while whole and readings[-1][0] - readings[0][0] >= steps.window:
             readings.popleft()
-        sleep(STABILITY_PERIOD)
+        clock.sleep(STABILITY_PERIOD)
     raise TimeoutError(
         f"No rest at {temperature} K within {steps.timeout:g} s: last {values[-1]} K. Must stay "
         f"within {steps.stability} K for {steps.window:g} s, and within {steps.tolerance} K of it."
@@ -161,7 +162,7 @@ def record_sweep(
     for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
         if was is None and resting != number:
             set_temperature(temperature)
-            wait_stable(session, temperature, readings[BLACKBODY].read)
+            wait_stable(session, temperature, readings[BLACKBODY].read, clock=devices.clock)
             devices.correct_offsets()
             resting = number
         path = held.place() / planned.name
@@ -191,7 +192,8 @@ def record_scene(
 
     Examples
     --------
-    >>> from dbthermal.instruments.devices import open_devices
+    >>> from dbthermal.instruments.clock import SYSTEM, Clock
+    from dbthermal.instruments.devices import open_devices
     >>> from dbthermal.instruments.session import Camera, Session
     >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))

@@ -13,8 +13,7 @@ import ctypes
 import ctypes.util
 import importlib
 import os
-import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
 from dataclasses import dataclass
 from enum import IntFlag
@@ -25,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments.camera import Identity
+from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
 __all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
@@ -129,18 +129,12 @@ class Scan:
 class TC08(Closing):
     """A TC-08, for one thread at a time; opened by `from_url` or `open`.
 
-    The `library` is from `load`, or an emulated one; `clock` [s] and `sleep` are the host's.
+    The `library` is from `load`, or an emulated one.
     """
 
-    def __init__(
-        self,
-        library: Library,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, library: Library) -> None:
         self._library = library
-        self._clock, self._sleep = clock, sleep
+        self.clock: Clock = getattr(library, "clock", SYSTEM)  # an emulated library has its own
         self._handle = 0
         self._has_channels = False
 
@@ -168,7 +162,7 @@ class TC08(Closing):
             )
         if world is not None:
             module: Any = importlib.import_module("dbthermal.instruments.emulated.tc08")
-            return cls(module.EmulatedTC08(world.thermocouple_temperature)).open()
+            return cls(module.EmulatedTC08(world.thermocouple_temperature, world.clock)).open()
         parse(url, ("tc08",))
         return cls(load()).open()
 
@@ -188,14 +182,14 @@ class TC08(Closing):
         if not self._library.usb_tc08_open_unit_async():
             raise self._error("be opened")
         handle, percent = (c_int16 * 1)(), (c_int16 * 1)()
-        deadline = self._clock() + timeout
+        deadline = self.clock() + timeout
         while not (progress := self._library.usb_tc08_open_unit_progress(handle, percent)):
-            if self._clock() >= deadline:
+            if self.clock() >= deadline:
                 raise TimeoutError(
                     f"The TC-08 is not open after {timeout} s, at {percent[0]} %. Must have its "
                     "firmware by then: pull it out and plug it in again."
                 )
-            self._sleep(POLL)
+            self.clock.sleep(POLL)
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
@@ -257,9 +251,9 @@ class TC08(Closing):
         if not self._has_channels:
             raise RuntimeError("The TC-08 has no channels yet. Must be set by set_channels first.")
         values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
-        start = self._clock()
+        start = self.clock()
         done = self._library.usb_tc08_get_single(handle, values, overflow, KELVIN)
-        middle = 0.5 * (start + self._clock())
+        middle = 0.5 * (start + self.clock())
         if not done:
             raise self._error("take a single reading")
         return Scan(middle, *flagged(np.array(values, dtype=np.float64), overflow[0]))

@@ -7,7 +7,6 @@ never names a program or a library: that of the TC-08 is told by an environment 
 
 import importlib
 import re
-import time as system_time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
 
 from dbthermal import _text as texts
+from dbthermal.instruments.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     import serial
@@ -109,6 +109,10 @@ class Transport(Protocol):
 
     is_simulated: bool  # True if the device is emulated
 
+    @property
+    def clock(self) -> Clock:
+        """Clock of the device's times and time limits."""
+
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device is gone."""
 
@@ -125,7 +129,7 @@ class Transport(Protocol):
 class SerialTransport(Closing):
     """An open serial port of pyserial, see `open_serial`; `url` is its name in messages."""
 
-    is_simulated = False
+    is_simulated, clock = False, SYSTEM
 
     def __init__(self, port: "serial.Serial", url: str) -> None:
         self.url = url
@@ -148,7 +152,7 @@ class SerialTransport(Closing):
         """Take the line RTS down and up again; `TransportError` if the device is gone."""
         with self._named("set RTS of"):
             self._port.rts = False
-            system_time.sleep(SETTLING)
+            self.clock.sleep(SETTLING)
             self._port.rts = True
 
     def close(self) -> None:

@@ -13,7 +13,6 @@ import os
 import select
 import struct
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -32,6 +31,7 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
+from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
 if not sys.platform.startswith("linux"):
@@ -92,7 +92,7 @@ class Kernel:
         default=lambda file, length, offset: mmap.mmap(file, length, offset=offset)
     )
     select: Callable[..., tuple[Sequence[Any], Sequence[Any], Sequence[Any]]] = select.select
-    clock: Callable[[], float] = time.monotonic
+    clock: Clock = SYSTEM
 
     def ask(self, file: int, number: int, argument: bytearray) -> None:
         """Call `ioctl`, again where a signal came between; OSError if the kernel refuses."""
@@ -122,7 +122,7 @@ class Capture(Closing):
         self.shape, self.frame_rate = stream.shape, stream.frame_rate
         self.telemetry_rows = stream.telemetry_rows
         self._kernel = kernel or Kernel()
-        self._decode = decode
+        self.clock, self._decode = self._kernel.clock, decode
         self._maps: list[Any] = []
         self._file: int | None = self._kernel.open(path, os.O_RDWR | os.O_NONBLOCK)
         try:
@@ -137,7 +137,7 @@ class Capture(Closing):
         """Wait for the next frame, a copy; see `camera.FrameSource.read`."""
         if self._file is None:
             raise SourceLostError(f"No frames from '{self.path}': it is closed.")
-        file, buffer, clock = self._file, _buffer(0), self._kernel.clock
+        file, buffer, clock = self._file, _buffer(0), self.clock
         deadline = clock() + timeout
         while self._kernel.select([file], [], [], max(0.0, deadline - clock()))[0]:
             if self._taken(file, buffer):

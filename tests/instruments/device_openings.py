@@ -41,7 +41,7 @@ class Opened(NamedTuple):
 def stub_camera(_: ExitStack) -> Opened:
     """A Boson's driver on a table of answers."""
     clock = Clock()
-    return Opened(Boson(StubCamera(clock), clock=clock, sleep=clock.sleep), True)
+    return Opened(Boson(StubCamera(clock)), True)
 
 
 def loop_camera(_: ExitStack) -> Opened:
@@ -62,8 +62,7 @@ def real_camera(_: ExitStack) -> Opened:
 
 def stub_wheel(_: ExitStack) -> Opened:
     """A wheel's driver on a controller that takes no time."""
-    clock = Clock()
-    wheel = FilterWheel(StubController(), FILTERS, QUICK, clock=clock, sleep=clock.sleep)
+    wheel = FilterWheel(StubController(Clock()), FILTERS, QUICK)
     wheel.connect()
     return Opened(wheel, True)
 
@@ -119,7 +118,7 @@ def emulated_video(_: ExitStack) -> Opened:
     world.add_camera("wide", 1)
     picture = np.ones((4, 6), dtype=np.uint16)
     pictures = {"8-14": lambda _: picture}
-    camera = EmulatedCamera(world, "wide", pictures, "8-14", (4, 6), 60.0, sleep=clock.sleep)
+    camera = EmulatedCamera(world, "wide", pictures, "8-14", (4, 6), 60.0)
     return Opened(camera, True)
 
 

@@ -24,8 +24,8 @@ class _Stub(Closing):
 
     is_simulated = True
 
-    def __init__(self) -> None:
-        self._said, self._closed = b"", False
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self._said, self._closed = clock, b"", False
 
     def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - no time goes by
         """Give the pending answer."""
@@ -46,8 +46,7 @@ class StubCamera(_Stub):
     """Answers a Boson's commands from a table."""
 
     def __init__(self, clock: Clock) -> None:
-        super().__init__()
-        self._clock = clock
+        super().__init__(clock)
         self._values = {
             SERIAL: struct.pack(">I", 0x8E9EAE),
             0x50004: b"EMULATED-STUB".ljust(20, b"\0"),
@@ -69,7 +68,7 @@ class StubCamera(_Stub):
             rb"\x9e(.)", lambda pair: bytes([pair[1][0] + 13]), data[1:-1], flags=re.DOTALL
         )
         _, sequence, command, _ = struct.unpack_from(">BIII", body)
-        self._values[FRAME_COUNT] = struct.pack(">I", int(60 * self._clock()))
+        self._values[FRAME_COUNT] = struct.pack(">I", int(60 * self.clock()))
         if command == RUN_FFC:
             self._values[LAST_FFC] = self._values[FRAME_COUNT]
         elif command == FFC_MODE - 1:
@@ -83,8 +82,8 @@ class StubCamera(_Stub):
 class StubController(_Stub):
     """Answers as an APT controller whose wheel takes no time."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(clock)
         self._position, self._homed = 123, 0
         self._kept = {0x415: bytes(14), 0x442: struct.pack("<HHHii", 1, 2, 1, 0, 0)}
 

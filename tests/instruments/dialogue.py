@@ -6,6 +6,7 @@ The idea is pymeasure's ``expected_protocol``.
 from collections.abc import Iterable, Sequence
 from types import TracebackType
 
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.transport import Closing
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
@@ -24,6 +25,7 @@ class Dialogue(Closing):
     is_simulated = True
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
+        self.clock = EmulatedClock()
         self._pairs = list(pairs)
         self._written = b""
         self._answers: list[bytes] = []

@@ -94,7 +94,7 @@ class FaultyCamera(EmulatedCamera):
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Give the next frame, unless the camera is mute."""
         if self.faults.mute:
-            self.sleep(timeout)
+            self.clock.sleep(timeout)
             raise NoFrameError(f"No frame from emulated camera '{self.name}': it is mute.")
         return super().read(timeout)
 

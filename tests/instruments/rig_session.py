@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def scene_text() -> str:
     return "\n".join(line for line in lines if not line.startswith(("sweep", "blackbody")))
 
 
-def bench(session: Session, **settings: float) -> World:
+def bench(session: Session, **settings: Any) -> World:
     """World of a session, with a plate at 330 K and quick flat-field corrections."""
     world = emulated_world(session, scene=lambda _: {"plate": 330.0}, **settings)
     vars(world)["start_ffc"] = partial(world.start_ffc, duration=0.05)

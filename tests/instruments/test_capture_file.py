@@ -1,20 +1,37 @@
-"""A capture file flags impossible time stamps and telemetry, and does not use them."""
+"""The capture file frame by frame, telemetry rows, and the rule of the shutter."""
 
 import errno
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from dbthermal import store
+from dbthermal.correction._shutter import FEWEST_COPIES
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import DAMAGED, GOOD, Frame, FrameFlag
+from dbthermal.instruments.camera import (
+    DAMAGED,
+    GOOD,
+    FfcStatus,
+    Frame,
+    FrameFlag,
+    Shutter,
+    camera_kind,
+    next_shutter,
+)
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import notes
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
+
+__all__ = ["CaptureFile", "Note"]  # other tests take them from here
 
 SHAPE, RATE, BANDS = (4, 80), 100.0, ("8-14", "9.5")
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)
@@ -187,3 +204,152 @@ def test_full_disk_leaves_what_was_written(tmp_path: Path, monkeypatch: pytest.M
     expected = IMAGE + np.arange(4)[:, None, None]
     np.testing.assert_array_equal(opened["counts"], np.stack([expected] * 2))
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
+
+
+COLUMNS = 640
+
+
+def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
+    """Values that a field can hold."""
+    lowest = -(1 << 16 * field.words - 1) if field.signed else 0
+    every = st.integers(lowest, lowest + (1 << 16 * field.words) - 1)
+    return every.map(lambda number: number / field.steps + field.zero) if field.steps else every
+
+
+@pytest.mark.parametrize(
+    ("values", "offset", "expected"),
+    [
+        ({"frame_counter": 1234567}, 84, "12 00 87 D6"),
+        ({"fpa_temperature": 311.2}, 94, "28 0C"),
+        ({"uptime": 20576.117}, 280, "39 01 75 F7"),
+    ],
+)
+def test_vectors(values: dict[str, float], offset: int, expected: str) -> None:
+    """The bytes in the buffer are those of the public decoders, both ways."""
+    wanted = bytes.fromhex(expected)
+    rows = telemetry.encode(values, COLUMNS)
+    found = rows.astype("<u2").tobytes()[offset : offset + len(wanted)]
+    assert found == wanted
+    buffer = bytearray(2 * telemetry.WORDS)
+    buffer[offset : offset + len(wanted)] = wanted
+    decoded = telemetry.decode(np.frombuffer(bytes(buffer), dtype="<u2"))
+    for name, value in values.items():
+        assert decoded[name] == pytest.approx(value, abs=1e-9)
+
+
+@given(st.fixed_dictionaries({name: numbers(field) for name, field in telemetry.FIELDS.items()}))
+def test_fields_come_back(fields: dict[str, float]) -> None:
+    """Encoded fields are decoded unchanged, and give the metadata of a frame."""
+    rows = telemetry.encode(fields, COLUMNS)
+    assert telemetry.decode(rows) == pytest.approx(fields, rel=0, abs=1e-6)
+    found = telemetry.metadata(rows)
+    assert found.frame_counter == fields["frame_counter"]
+    assert found.last_ffc_frame == fields["last_ffc_frame"]
+    assert found.fpa_temperature == pytest.approx(fields["fpa_temperature"], abs=1e-6)
+
+
+@given(rows=arrays(np.uint16, (2, 80)))
+def test_anything_is_read(rows: npt.NDArray[np.uint16]) -> None:
+    """Any words give a record, as the rows have no checksum."""
+    assert 0 <= telemetry.decode(rows)["frame_counter"] < 2**32
+
+
+def test_short_rows_are_refused() -> None:
+    """Too few words are an error that says how many it takes."""
+    with pytest.raises(ValueError, match=r"Invalid telemetry of 10 words\. Must hold 142"):
+        telemetry.decode(np.zeros(10, dtype=np.uint16))
+
+
+def test_other_numbers_are_refused() -> None:
+    """Rows of another type than uint16 raise a TypeError."""
+    with pytest.raises(TypeError, match=r"Invalid telemetry of float32\. Must be uint16"):
+        telemetry.decode(np.zeros((2, COLUMNS), dtype=np.float32))
+
+
+def test_values_that_do_not_fit_are_refused() -> None:
+    """A field is not written modulo its size."""
+    with pytest.raises(ValueError, match="Invalid frame_counter of 4294967296 steps"):
+        telemetry.encode({"frame_counter": 2**32}, COLUMNS)
+
+
+IMMINENT, BUSY, DONE = FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS, FfcStatus.COMPLETE
+
+
+def closed(
+    copies: str,
+    last: Sequence[int | None] | None = None,
+    status: Sequence[FfcStatus | None] | None = None,
+) -> str:
+    """Frames that count as closed, x, of frames that repeat the image before, also x."""
+    state, found = Shutter(), ""
+    nothing = [None] * len(copies)
+    for mark, frame, read in zip(copies, last or nothing, status or nothing, strict=True):
+        state = next_shutter(state, repeated=mark == "x", last_ffc_frame=frame, ffc_status=read)
+        found += "x" if state.closed else "."
+    return found
+
+
+def test_a_renewal_at_the_start_of_a_correction_closes_all_copies() -> None:
+    """The camera counts the correction from its first frozen frame."""
+    assert closed("...xxxx..", [0, 0, 0, 3, 3, 3, 3, 3, 3]) == "...xxxx.."
+
+
+def test_a_renewal_at_the_end_of_a_correction_marks_the_frame_after_it() -> None:
+    """The run of copies touches the marked frame, so that `find_shutter` joins them."""
+    assert closed("...xxxx..", [0, 0, 0, 0, 0, 0, 0, 7, 7]) == ".......x."
+
+
+def test_a_renewal_whose_frozen_frames_were_lost_is_marked() -> None:
+    """A correction marks one frame without a repeated image; damaged telemetry is not used."""
+    assert closed(".....", [0, 0, 3, 3, 3]) == "..x.."
+    assert closed(".....", [0, 0, None, 3, 3]) == "...x."
+
+
+def test_repeated_images_of_a_camera_with_telemetry_are_no_shutter() -> None:
+    """With telemetry, repeated images without a correction are not marked as a shutter."""
+    assert closed("..x.xxxxx.", [5] * 10) == ".........."
+
+
+@pytest.mark.parametrize("status", [IMMINENT, BUSY])
+def test_the_serial_line_closes_a_frozen_image(status: FfcStatus) -> None:
+    """From the first copy after the reading to the last copy, however old the reading is."""
+    read = [DONE, DONE, DONE, status, status, DONE, DONE, DONE]
+    assert closed("..xxxx..", status=read) == "...xxx.."
+    assert closed("........", status=[status] * 8) == "........"
+
+
+def test_without_telemetry_a_run_of_copies_is_the_shutter() -> None:
+    """Without telemetry three copies or more mark a closed shutter, fewer are lost frames."""
+    expected = "....xx."
+    assert closed("..xxxx.") == expected
+    assert closed("..xxxx.", status=[DONE] * 7) == expected
+    assert closed("..xx.x.") == "......."
+    assert FEWEST_COPIES == 3
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.booleans(),
+            st.none() | st.integers(0, 3),
+            st.none() | st.sampled_from(FfcStatus),
+        )
+    )
+)
+def test_a_changing_image_is_closed_by_a_renewal_alone(
+    frames: list[tuple[bool, int | None, FfcStatus | None]],
+) -> None:
+    """A frame with a new image is marked only if the number of the last correction changed."""
+    state = Shutter()
+    for repeated, last, status in frames:
+        after = next_shutter(state, repeated=repeated, last_ffc_frame=last, ffc_status=status)
+        renewed = None not in {last, state.last_ffc_frame} and last != state.last_ffc_frame
+        assert after.closed is renewed or repeated
+        assert after.copies == (state.copies + 1 if repeated else 0)
+        state = after
+
+
+def test_an_unknown_kind_is_named() -> None:
+    """An unknown kind of camera raises an error that lists the known ones."""
+    with pytest.raises(ValueError, match=r"Unknown kind of camera 'lepton'\. Must be one of \["):
+        camera_kind("lepton")

@@ -134,7 +134,7 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
     """A correction ends, and has the number of a frame after the last."""
     camera: Boson = opened.device
     before = camera.read(commands.LAST_FFC_FRAME)
-    camera._sleep(0.05)
+    camera._clock.sleep(0.05)
     assert camera.run_ffc() > before
     assert camera.ffc_status() is FfcStatus.COMPLETE
 

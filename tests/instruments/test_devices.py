@@ -1,6 +1,5 @@
 """The devices of a session are opened by their addresses, prepared, and say what they are."""
 
-import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import cast
@@ -20,6 +19,7 @@ from dbthermal.instruments.devices import (
     open_devices,
 )
 from dbthermal.instruments.emulated.camera import EmulatedCamera
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import emulated_world
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.tc08 import TC08, Flag, Scan
@@ -148,7 +148,7 @@ def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
     assert devices.world is not None
     source = devices.sources["8-14"]
     source.read()
-    threading.Event().wait(0.05)
+    devices.clock.sleep(0.05)
     start = devices.world.clock()
     devices.flush()
     assert source.read().device_time >= start
@@ -158,7 +158,7 @@ class Logger:
     """A logger that counts its scans; channel 2 is open."""
 
     def __init__(self) -> None:
-        self.scans = 0
+        self.scans, self.clock = 0, EmulatedClock()
 
     def single(self) -> Scan:
         """Scan once more: each one is a kelvin warmer."""
@@ -170,12 +170,12 @@ class Logger:
 
 def test_one_scan_gives_all_channels_once() -> None:
     """One scan of the logger serves all channels, and each value is read once."""
-    logger, now = Logger(), [0.0]
+    logger = Logger()
     names = {1: "plate", 2: "room", 3: "wall"}
-    thermocouples = Thermocouples(cast(TC08, logger), names, lambda: now[0])
+    thermocouples = Thermocouples(cast(TC08, logger), names)
     assert [thermocouples.read(1), thermocouples.read(3), logger.scans] == [301.0, 301.0, 1]
     assert [thermocouples.read(1), logger.scans] == [302.0, 2]
-    now[0] = 1.1
+    logger.clock.sleep(1.1)
     assert [thermocouples.read(3), logger.scans] == [303.0, 3]
     with pytest.raises(ReadingError, match=r"No temperature of thermocouple 'room' in channel 2"):
         thermocouples.read(2)

@@ -6,7 +6,6 @@ are counted as losses, and every recording is checked against its frames (`check
 """
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from checked_recording import CheckedRecording, Read, session
-from device_benches import BosonBench, LoggerBench, WheelBench
-from faulty_boson import Fault, FaultyBoson
+from device_benches import BosonBench, Fault, FaultyBoson, LoggerBench, WheelBench
 from faulty_camera import Faults
 
 from dbthermal import store
@@ -239,7 +237,7 @@ def read_beside_frames(device: Instrument) -> Read:
         return device.position
     if isinstance(device, Boson):
         return Devices(session(), {}, {"9.5": device}).readings()["fpa 9.5"].read
-    tips = Thermocouples(device, {1: "tip"}, clock=device._clock)
+    tips = Thermocouples(device, {1: "tip"})
     return Devices(session(), {}, thermocouples=tips).readings()["tip"].read
 
 
@@ -259,16 +257,17 @@ def test_what_the_user_sees(name: str) -> None:
 @pytest.fixture(scope="module")
 def troubled(tmp_path_factory: pytest.TempPathFactory) -> CheckedRecording:
     """One recording during which every instrument has faults and is slow."""
+    recorded = CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr")
 
     def slowly(read: Read) -> Read:
         def wait_and_read() -> float:
-            time.sleep(0.002)
+            recorded.world.clock.sleep(0.002)
             return read()
 
         return wait_and_read
 
     readings = {name: slowly(read_beside_frames(make())) for name, (make, _) in TROUBLES.items()}
-    return CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr").record(0.8, readings)
+    return recorded.record(0.8, readings)
 
 
 @pytest.mark.parametrize("name", TROUBLES)
@@ -288,7 +287,7 @@ def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> 
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
     device = FaultyBoson(recorded.world, "9.5")
     device.faults.ffc_stalls = True
-    with Boson(Line(device), timeout=20) as boson:
+    with Boson(Line(device, device._world.clock), timeout=20) as boson:
         recorded.record(1.0, {"fpa": read_beside_frames(boson)})
     assert "shutter_closed" in recorded.kinds("9.5")
     assert {*recorded.kinds("fpa")} == {"reading"}

@@ -15,10 +15,10 @@ from types import ModuleType
 import pytest
 
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._apt import Id, command
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.world import World
 
+Id, command = apt.Id, apt.command
 TO = apt.BAY_1
 SPEEDS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
 HOME = apt.HomeParameters(1, 2, 1, 4_397_466, -50)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from test_capture_file import CaptureFile, Note
 
 from dbthermal import store
 from dbthermal.instruments.camera import Counts, Frame
@@ -21,7 +22,6 @@ from dbthermal.instruments.recording import (
     open_capture,
     record,
 )
-from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 from dbthermal.instruments.session import Camera, Session
 from dbthermal.store import _recording as durable
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from file_operations import before_operation, operations_of
 from rig_session import from_yaml, rig
+from test_capture_file import Note
 from test_killed import BANDS, RATE, check, frame, two_bands
 from test_protocols import TWO, swept
 from test_record import SMALL, bench, session
 
 from dbthermal import store
 from dbthermal.instruments.recording import Preview, notes, open_sweep, record
-from dbthermal.instruments.recording._capture_file import Note
 
 FRAMES = 15
 

@@ -26,26 +26,12 @@ from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.recording import Preview, Summary, _reader, notes, open_capture
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
 TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), QUICKLY)
-
-
-class Clock:
-    """A simulated clock, which advances only by waiting."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        """The time [s]."""
-        return self.now
-
-    def sleep(self, duration: float) -> None:
-        """Let time pass."""
-        self.now += duration
 
 
 def setter(devices: Devices, log: list[float] | None = None) -> Callable[[float], None]:
@@ -271,7 +257,7 @@ def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
     assert {"plate", "blackbody", "fpa 9.5"} <= {note[2] for note in notes(summary.path)}
 
 
-def wait(readings: list[float], clock: Clock) -> float:
+def wait(readings: list[float], clock: EmulatedClock) -> float:
     """Wait for 300 K with these readings, one a second; the last one stays."""
     values = iter(readings)
     return protocols.wait_stable(
@@ -279,42 +265,40 @@ def wait(readings: list[float], clock: Clock) -> float:
         300.0,
         lambda: next(values, readings[-1]),
         clock=clock,
-        sleep=clock.sleep,
     )
 
 
 def test_rest_is_waited_for() -> None:
     """A window of readings near the set point and near one another ends the wait with its mean."""
-    clock = Clock()
+    clock = EmulatedClock()
     found = wait([299.0, 299.5, 300.02, 300.0, 300.04, 300.02], clock)
     assert found == pytest.approx(300.02)
-    assert clock.now == 5.0
+    assert clock() == 5.0
 
 
 def test_thermocouple_may_be_off() -> None:
     """A stable reading half a kelvin off the set point counts as reached."""
-    clock = Clock()
+    clock = EmulatedClock()
     assert wait([300.6], clock) == pytest.approx(300.6)
-    assert clock.now == 3.0
+    assert clock() == 3.0
 
 
 @pytest.mark.parametrize("readings", [[301.6], [300.0, 300.3] * 20])
 def test_no_rest_is_an_error(readings: list[float]) -> None:
     """A temperature that settles elsewhere or oscillates raises an error."""
     with pytest.raises(TimeoutError, match=r"No rest at 300\.0 K within 20 s"):
-        wait(readings, Clock())
+        wait(readings, EmulatedClock())
 
 
 def test_blackbody_takes_its_time() -> None:
     """The emulated blackbody is waited for until it is near, and no longer."""
-    clock = Clock()
+    clock = EmulatedClock()
     start = clock()
     found = protocols.wait_stable(
         from_yaml(TEXT),
         300.0,
         lambda: 300.0 - 10.0 * math.exp((start - clock()) / 2.0),
         clock=clock,
-        sleep=clock.sleep,
     )
-    assert clock.now == 12.0  # from 9 s on four readings differ by less than 0.1 K
+    assert clock() == 12.0  # from 9 s on four readings differ by less than 0.1 K
     assert found == pytest.approx(300 - 10 * np.exp(-np.arange(9, 13) / 2).mean(), abs=1e-9)

@@ -2,7 +2,6 @@
 
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_camera import Faults, FaultyCamera
+from test_capture_file import CaptureFile
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag, FrameSource
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import CameraState
 from dbthermal.instruments.recording import (
     Limits,
@@ -23,7 +24,6 @@ from dbthermal.instruments.recording import (
     open_capture,
     record,
 )
-from dbthermal.instruments.recording._capture_file import CaptureFile
 
 
 @pytest.fixture(autouse=True)
@@ -41,12 +41,20 @@ def interrupt(_: Preview | None = None) -> None:
     signal.pthread_kill(main, signal.SIGINT)
 
 
+class HastyClock(EmulatedClock):
+    """Emulated time in which no camera waits for the disk."""
+
+    def has_room(self, room: threading.Semaphore) -> bool:
+        """Take a place in a buffer; False if there is none."""
+        return room.acquire(blocking=False)
+
+
 def slow_down(monkeypatch: pytest.MonkeyPatch) -> None:
     """Writing a frame takes 0.03 s, three times as long as to take one."""
     frame = CaptureFile.frame
 
     def slow(own: CaptureFile, band: str, shot: Frame, refused: int = 0) -> FrameFlag:
-        time.sleep(0.03)
+        own._clock.sleep(0.03)
         return frame(own, band, shot, refused)
 
     monkeypatch.setattr(CaptureFile, "frame", slow)
@@ -58,7 +66,7 @@ def test_slow_disk_refuses_frames_and_counts_them(
     """Frames of an overflowing queue are stored, or counted as refused or lost."""
     limits, path = Limits(chunk=CHUNK, reserve=0, queue=2), tmp_path / "a.zarr"
     slow_down(monkeypatch)
-    summary = record(session(0.5), bench(), path, limits=limits)
+    summary = record(session(0.5), bench(clock=HastyClock()), path, limits=limits)
     opened = open_capture(path)
     for place, band in enumerate(BANDS):
         total = summary.totals[band]
@@ -79,15 +87,16 @@ def written(path: Path) -> int:
 
 def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
     """While something is drawn, frames are written."""
-    path, seen = tmp_path / "a.zarr", []
+    path, seen = tmp_path / "a.zarr", list[int]()
 
     def draw(_: Preview) -> None:
-        until = time.monotonic() + 20
-        while not (chunks := written(path) // CHUNK) and time.monotonic() < until:
-            time.sleep(0.01)
+        while not (chunks := written(path) // CHUNK) and clock() < 0.9:
+            clock.sleep(0.01)
         seen.append(chunks)
 
-    record(session(1.0), bench(), path, limits=SMALL, preview=draw)
+    sources = bench()
+    clock = sources["9.5"].clock
+    record(session(1.0), sources, path, limits=SMALL, preview=draw)
     assert seen[0] >= 1
 
 
@@ -159,7 +168,7 @@ def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def stampless(camera: FaultyCamera, timeout: float = 1.0) -> Frame:
         frame = read(camera, timeout)
-        return replace(frame, device_time=0.0) if camera.name == "9.5" else frame
+        return replace(frame, device_time=-1.0) if camera.name == "9.5" else frame
 
     monkeypatch.setattr(FaultyCamera, "read", stampless)
     record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from faulty_camera import Movie
 
+from dbthermal.instruments.clock import SYSTEM
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record
@@ -58,7 +59,7 @@ class Measured:
 def measure(rate: float, seconds: float, path: Path) -> Measured:
     """Record two emulated cameras, with noise in their frames, which compresses badly."""
     noise = np.random.default_rng(0).normal(20_000, 15, (20, *SHAPE)).astype(np.uint16)
-    world, sources = World(), {}
+    world, sources = World(clock=SYSTEM), {}  # in real time
     for number, band in enumerate(("8-14", "9.5")):
         world.add_camera(band, number)
         movie = Movie(noise, rate, endless=True)

@@ -1,6 +1,5 @@
 """A shutter event from the serial command to the corrected capture, on the emulated Boson."""
 
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from test_y16 import SESSION
 
 from dbthermal import correction
 from dbthermal.instruments.camera import FrameFlag
+from dbthermal.instruments.clock import Task
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.emulated.world import FFC_DURATION
 from dbthermal.instruments.protocols import record_scene
@@ -31,7 +31,7 @@ def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
         corrector = _Corrector(devices)
         limits = Limits(reserve=0, reading_period=0.05, preview_period=0.02)
         record_scene(devices, path, limits=limits, preview=corrector)
-        corrector.thread.join()
+        assert corrector.task.ended.is_set()
     capture = open_capture(path)
     padded = capture["frame_flags"] & int(FrameFlag.PADDED)
     return capture.isel(time=~padded.any("band").values)
@@ -41,12 +41,12 @@ class _Corrector:
     """A preview that runs one correction, some time after the start."""
 
     def __init__(self, devices: Devices) -> None:
-        self.thread = threading.Thread(target=devices.cameras["9.5"].run_ffc)
+        self.task = Task(devices.clock, "corrector", devices.cameras["9.5"].run_ffc)
 
     def __call__(self, preview: Preview) -> None:
         """Start it once."""
-        if preview.time > 0.3 and self.thread.ident is None:
-            self.thread.start()
+        if preview.time > 0.3 and self.task.ident is None:
+            self.task.start()
 
 
 @pytest.mark.filterwarnings("ignore:Fixed pattern")  # of an emulated detector without correction

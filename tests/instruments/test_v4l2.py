@@ -1,5 +1,6 @@
-"""Capture by Video4Linux2: calls to the kernel, and frames with its stamps and flags."""
+"""Capture by Video4Linux2: numbers and layouts of its calls, and frames with stamps and flags."""
 
+import ctypes
 import errno
 import importlib
 import struct
@@ -16,10 +17,19 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream
+from dbthermal.instruments.clock import Clock
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6
 GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
+
+
+class Late(Clock):
+    """A clock that stands."""
+
+    def __call__(self) -> float:
+        """Return 12.5 s."""
+        return 12.5
 
 
 class Memory(bytearray):
@@ -57,7 +67,7 @@ class Driver:
             ioctl=self._ioctl,
             map=self._map,
             select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
-            clock=lambda: 12.5,
+            clock=Late(),
         )
 
     def _open(self, path: str, flags: int) -> int:  # noqa: ARG002 - as os.open
@@ -318,3 +328,53 @@ def test_whatever_the_kernel_says_is_a_frame(answers: list[tuple[int, int, int, 
             frame = capture.read()
             assert (frame.sequence, frame.counts.shape) == (answer[3] % 60_000, (4, 6))
             assert (answer[0] != BYTES) == (FrameFlag.WRONG_SIZE in frame.flags)
+
+
+class Buffer(ctypes.Structure):
+    """``struct v4l2_buffer`` as in ``linux/videodev2.h``, laid out by the compiler's rules."""
+
+    _fields_ = (
+        *((name, ctypes.c_uint32) for name in ("index", "type", "bytesused", "flags", "field")),
+        ("seconds", ctypes.c_int64),  # struct timeval
+        ("microseconds", ctypes.c_int64),
+        ("timecode", ctypes.c_uint32 * 4),
+        *((name, ctypes.c_uint32) for name in ("sequence", "memory")),
+        ("offset", ctypes.c_uint64),  # union with a pointer
+        *((name, ctypes.c_uint32) for name in ("length", "reserved2", "request_fd")),
+    )
+
+
+def test_layouts_have_the_kernels_sizes() -> None:
+    """The structures are as large as on 64-bit Linux."""
+    assert (v4l2.BUFFER.size, v4l2.FORMAT.size) == (88, 208)
+    assert (v4l2.CAPABILITY.size, v4l2.PARAMETERS.size) == (104, 204)
+
+
+def test_buffer_has_the_kernels_layout() -> None:
+    """Each number of a buffer is where a C compiler puts it, the 64-bit time stamp too."""
+    left_out = {"timecode", "reserved2", "request_fd"}
+    names = [field[0] for field in Buffer._fields_ if field[0] not in left_out]
+    buffer = Buffer.from_buffer_copy(v4l2.BUFFER.pack(*range(1, 12)))
+    assert ctypes.sizeof(Buffer) == v4l2.BUFFER.size
+    assert [getattr(buffer, name) for name in names] == list(range(1, 12))
+
+
+@pytest.mark.parametrize(
+    ("name", "direction", "number", "size"),
+    [
+        ("QUERYCAP", 2, 0, 104),
+        ("ENUM_FMT", 3, 2, 64),
+        ("S_FMT", 3, 5, 208),
+        ("REQBUFS", 3, 8, 20),
+        ("QUERYBUF", 3, 9, 88),
+        ("QBUF", 3, 15, 88),
+        ("DQBUF", 3, 17, 88),
+        ("STREAMON", 1, 18, 4),
+        ("STREAMOFF", 1, 19, 4),
+        ("S_PARM", 3, 22, 204),
+    ],
+)
+def test_calls_have_the_kernels_numbers(name: str, direction: int, number: int, size: int) -> None:
+    """A call's number is made of direction (1 write, 2 read), size, 'V' and its own number."""
+    expected = direction << 30 | size << 16 | ord("V") << 8 | number
+    assert getattr(v4l2, name) == expected

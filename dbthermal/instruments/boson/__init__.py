@@ -7,8 +7,6 @@ sends and resets nothing, and nothing is ever written to the camera's flash memo
 """
 
 import threading
-import time as system_time
-from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, Final
 
@@ -79,16 +77,14 @@ class Boson(Closing):
         *,
         timeout: float = REPLY_TIMEOUT,
         first_sequence: int | None = None,
-        clock: Callable[[], float] = system_time.monotonic,
-        sleep: Callable[[float], None] = system_time.sleep,
     ) -> None:
         # From the time of day: replies to a program that ended are not taken for this one's.
-        first = system_time.time_ns() // 1000 if first_sequence is None else first_sequence
+        moment = int(1e6 * transport.clock.utc().timestamp())
+        first = moment if first_sequence is None else first_sequence
         self.is_simulated = transport.is_simulated
         self.timeout = timeout
         self._transport = transport
-        self._clock = clock
-        self._sleep = sleep
+        self._clock = transport.clock
         self._decoder = fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
@@ -100,7 +96,7 @@ class Boson(Closing):
 
     def close(self) -> None:
         """Release the port, once an exchange of another thread is over; the camera goes on."""
-        with self._lock:
+        with self._clock.hold(self._lock):
             self._transport.close()
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
@@ -184,7 +180,7 @@ class Boson(Closing):
                 pass  # no reply while the shutter is closed: requested again until the time limit
             if self._clock() >= deadline:
                 raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
-            self._sleep(POLL)
+            self._clock.sleep(POLL)
 
     def _tell(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
@@ -201,7 +197,7 @@ class Boson(Closing):
                 return self._exchange(name, command, data)
             except BosonTimeoutError:
                 continue
-        with self._lock:
+        with self._clock.hold(self._lock):
             self._sequence = fslp.next_sequence(self._sequence)
             self._transport.write(fslp.encode(self._sequence, command, data))
             reply = self._reply(name)

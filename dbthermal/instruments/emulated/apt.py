@@ -233,4 +233,5 @@ class EmulatedApt:
 
 def start(_: str, world: World | None) -> Line:
     """Line to the emulated wheel of a world, or of a new one."""
-    return Line(EmulatedApt(World() if world is None else world))
+    world = World() if world is None else world
+    return Line(EmulatedApt(world), world.clock)

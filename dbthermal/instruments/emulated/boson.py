@@ -122,4 +122,4 @@ def start(name: str, world: World | None) -> Line:
     if world is None:
         world = World()
         world.add_camera(name, SERIAL_NUMBERS)
-    return Line(EmulatedBoson(world, name))
+    return Line(EmulatedBoson(world, name), world.clock)

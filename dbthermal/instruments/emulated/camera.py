@@ -7,7 +7,6 @@ telemetry, serial line and frozen image, see `camera.next_shutter`.
 """
 
 import math
-import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -57,7 +56,6 @@ class EmulatedCamera(Closing):
     shape: tuple[int, int] = (512, 640)
     frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
-    sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     kind: str = "boson"  # of `MODELS`
 
     is_simulated: bool = field(default=True, init=False)
@@ -66,7 +64,7 @@ class EmulatedCamera(Closing):
         if self.kind not in MODELS:
             rule = f"Must be one of {sorted(MODELS)}"
             raise ValueError(f"Unknown emulated camera '{self.kind}'. {rule}.")
-        self._state = self.world.camera(self.name)
+        self.clock, self._state = self.world.clock, self.world.camera(self.name)
         self._state.has_frames = True
         self.identity: Mapping[str, str] = {
             "device": f"sim://{self.kind}/{self.name}",
@@ -85,15 +83,15 @@ class EmulatedCamera(Closing):
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame; see `camera.FrameSource.read`."""
         if self._start is None:
-            self._start = self.world.time
+            self._start = self.world.time + self._state.phase / self.frame_rate
         self._number = self.next_number(self._number, self.world.time - self._start)
         due = self._start + self._number / self.frame_rate
         wait = due - self.world.time
         if wait > timeout:
-            self.sleep(timeout)
+            self.clock.sleep(timeout)
             raise NoFrameError(f"No frame from emulated camera '{self.name}' in {timeout} s.")
         if wait > 0:
-            self.sleep(wait)
+            self.clock.sleep(wait)
         if not (self._open and self._state.plugged):
             state = "it is unplugged" if self._open else "it is closed"
             raise SourceLostError(f"No more frames from emulated camera '{self.name}': {state}.")

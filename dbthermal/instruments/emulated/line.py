@@ -1,10 +1,9 @@
 """The line between an emulated device and its driver: byte for byte, in memory."""
 
 import threading
-import time as system_time
-from collections.abc import Callable
 from typing import Final, Protocol
 
+from dbthermal.instruments.clock import Clock
 from dbthermal.instruments.transport import Closing, TransportError
 
 TICK: Final = 0.01  # shortest wait until the device is asked again if it has something to say [s]
@@ -35,14 +34,8 @@ class Line(Closing):
 
     is_simulated = True
 
-    def __init__(
-        self,
-        device: Device,
-        *,
-        clock: Callable[[], float] = system_time.monotonic,
-        sleep: Callable[[float], None] = system_time.sleep,
-    ) -> None:
-        self._device, self._clock, self._sleep = device, clock, sleep
+    def __init__(self, device: Device, clock: Clock) -> None:
+        self._device, self.clock = device, clock
         self._lock = threading.Lock()
         self._pieces: list[bytes] = []
         self._closed = False
@@ -55,7 +48,7 @@ class Line(Closing):
 
     def read(self, size: int, timeout: float) -> bytes:
         """Give one piece of the device's output; see `Transport.read`."""
-        deadline = self._clock() + timeout
+        deadline = self.clock() + timeout
         while True:
             with self._lock:
                 self._check()
@@ -66,10 +59,10 @@ class Line(Closing):
                         self._pieces.insert(0, piece[size:])
                     return piece[:size]
                 pause = max(self._device.next_due(), TICK)
-            remaining = deadline - self._clock()
+            remaining = deadline - self.clock()
             if remaining <= 0:
                 return b""
-            self._sleep(min(remaining, pause))
+            self.clock.sleep(min(remaining, pause))
 
     def close(self) -> None:
         """End; a second time does nothing."""

@@ -9,6 +9,8 @@ import math
 from collections.abc import Callable, MutableSequence
 from typing import Any, Final
 
+from dbthermal.instruments.clock import Clock
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import ROOM
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
@@ -22,19 +24,14 @@ _HANDLE = 1
 class EmulatedTC08:
     """The library and one unit, with type-T thermocouples whatever letter they are set to.
 
-    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; `sleep` waits
-    while a reading is converted.
+    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; a reading is
+    converted on its `clock`.
     """
 
     is_simulated: Final = True
 
-    def __init__(
-        self,
-        temperature: Callable[[int], float],
-        *,
-        sleep: Callable[[float], None] = lambda _: None,
-    ) -> None:
-        self._temperature, self._sleep = temperature, sleep
+    def __init__(self, temperature: Callable[[int], float], clock: Clock | None = None) -> None:
+        self._temperature, self.clock = temperature, clock or EmulatedClock()
         self._is_open, self._error = False, 0
         self._kinds: dict[int, str] = {}
 
@@ -89,7 +86,7 @@ class EmulatedTC08:
             return 0
         if units != KELVIN or not self._kinds:
             return self._fail(2 if units == KELVIN else 3)
-        self._sleep(CONVERSION * len(self._kinds))
+        self.clock.sleep(CONVERSION * len(self._kinds))
         readings = [self.convert(channel) for channel in range(CHANNELS)]
         values[:] = [value for value, _ in readings]
         overflow[0] = sum(beyond << channel for channel, (_, beyond) in enumerate(readings))

@@ -3,22 +3,24 @@
 The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
 camera's emulator starts a flat-field correction, and the frame source freezes; a program sets
 `World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
-Temperatures are in kelvin, times in seconds since the world began, on the clock that was injected;
+Temperatures are in kelvin, times in seconds since the world began, on its clock;
 events in the scene have a time of their own, so that a recording can begin with it.
 """
 
 import math
 import threading
-import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from dbthermal.instruments.clock import Clock
+from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.session import Session
 
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 FFC_DURATION: Final = 0.5  # of a flat-field correction [s]; the real one is not documented publicly
+PHASE: Final = 0.382  # by which each camera of a session is exposed after the one before [frame]
 SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the others follow
 
 
@@ -29,6 +31,7 @@ class CameraState:
     serial_number: int
     fpa_temperature: float = FPA  # of its focal-plane array [K]
     plugged: bool = True  # False once it was pulled out
+    phase: float = 0.0  # of its frames against those of other cameras [frame]
     has_frames: bool = False  # True if an emulated frame source counts its frames
     frame_count: int = 0  # frames since its sensor started
     ffc_count: int = 0  # flat-field corrections started
@@ -40,6 +43,7 @@ class CameraState:
 class World:
     """One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
 
+    Its clock is an `EmulatedClock`, or `dbthermal.instruments.clock.SYSTEM` for real time.
     `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
     the beam, None while the wheel turns, between two. `scene` has temperatures [K] by name
     at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
@@ -51,7 +55,7 @@ class World:
     def __init__(
         self,
         *,
-        clock: Callable[[], float] = system_time.monotonic,
+        clock: Clock | None = None,
         filters: Mapping[int, str] | None = None,
         wheel_position: int = 1,
         blackbody_temperature: float = ROOM,
@@ -59,12 +63,12 @@ class World:
         waits: bool = False,
     ) -> None:
         self.lock = threading.RLock()
-        self.clock = clock
+        self.clock = clock or EmulatedClock()
         self.filters = dict(filters or {})
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
         self.blackbody_temperature = blackbody_temperature
-        self.epoch = clock()
+        self.epoch = self.clock()
         self.scene_began = math.inf if waits else self.epoch
         self._scene = scene
         self.wheel_position: int | None = wheel_position
@@ -125,7 +129,7 @@ class World:
         """Put the cameras, by band, and thermocouples of an emulated session on the bench."""
         self.thermocouples.update(session.thermocouples)
         for number, band in enumerate(session.bands):
-            self.add_camera(band, SERIAL_NUMBERS + number)
+            self.add_camera(band, SERIAL_NUMBERS + number).phase = PHASE * number % 1.0
 
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:
         """Start a correction, maybe anew: the shutter closes, the image freezes until its end."""

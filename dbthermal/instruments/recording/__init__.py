@@ -11,6 +11,7 @@ from dbthermal.instruments.recording._reader import (
     open_capture,
     open_sweep,
     overview,
+    require_whole,
 )
 from dbthermal.instruments.recording._recorder import record
 from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
@@ -26,5 +27,6 @@ __all__ = [
     "open_sweep",
     "overview",
     "record",
+    "require_whole",
 ]
 __dir__ = __all__.copy

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
-from time import monotonic
 from types import MappingProxyType
 from typing import Any, Final, Self
 
@@ -194,6 +193,7 @@ class CaptureFile:
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
         self._origin, self._chunk = origin, chunk
+        self._clock = next(iter(sources.values())).clock
         self._start: dict[str, Any] = {}  # attributes of `begin`
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []
@@ -347,7 +347,7 @@ class CaptureFile:
         self.broken = True
         if (place := self.recording.place()) != self._place:
             self._place = place
-            self._notes.append(self._row(Note.FOLDER_MOVED, _RECORDER, monotonic(), math.nan))
+            self._notes.append(self._row(Note.FOLDER_MOVED, _RECORDER, self._clock(), math.nan))
         if self._notes:
             names = ("log_time", "log_kind", "log_source", "log_value")
             columns = zip(names, zip(*self._notes, strict=True), strict=True)

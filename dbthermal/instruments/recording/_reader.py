@@ -6,7 +6,7 @@ of; temperatures are the readings during them.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,8 @@ from dbthermal.instruments.camera import UNTIMED, FrameFlag
 from dbthermal.instruments.session import BLACKBODY
 
 Region = tuple[slice, slice]
+
+_WHOLE: Final = 0.95  # share of the promised frames with which a recording is whole [1]
 
 
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
@@ -114,9 +116,10 @@ def overview(folder: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        One row for each recording and band: `frames`, of which `damaged`; `lost` by camera or
-        driver, and `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN
-        without two; `complete`, whether the recording went to its planned end. Coordinates
+        One row for each recording and band: `frames`, of which `damaged`; `good` ones, which are
+        whole, have a time and show the view, of those `promised` by duration and nominal rate;
+        `lost` by camera or driver, and `refused` by a full queue; `frame_rate` by the stamps [Hz],
+        NaN without two; `complete`, whether the recording went to its planned end. Coordinates
         `recording` and `band`.
     """
     rows = [
@@ -132,11 +135,45 @@ def overview(folder: str | Path) -> xr.Dataset:
 
 
 def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
-    stamps = recording["device_time"].sel(band=band)
-    usable = (recording["frame_flags"].sel(band=band) & int(UNTIMED)) == 0
-    steps = np.diff(stamps.values[usable.values & np.isfinite(stamps.values)])
-    rate = 1.0 / float(np.median(steps)) if steps.size else np.nan
-    return {"frame_rate": rate, "complete": bool(recording.attrs["complete"])}
+    one = recording[["device_time", "frame_flags"]].sel(band=band)
+    one = one.isel(time=slice(0, recording.attrs["frames_written"][band]))
+    stamps, flags = one["device_time"].values, one["frame_flags"].values
+    usable = ((flags & int(UNTIMED)) == 0) & np.isfinite(stamps)
+    steps = np.diff(stamps[usable])
+    session = recording.attrs["provenance"]["parameters"]
+    return {
+        "good": np.count_nonzero(usable & ((flags & int(FrameFlag.SHUTTER_CLOSED)) == 0)),
+        "promised": round(session["duration"] * session["frame_rate"]),
+        "frame_rate": 1.0 / float(np.median(steps)) if steps.size else np.nan,
+        "complete": bool(recording.attrs["complete"]),
+    }
+
+
+def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
+    """Raise unless every recording of a folder has its frames in every band.
+
+    Parameters
+    ----------
+    folder : str or Path
+        With recordings, see `overview`.
+    share : float
+        Good frames of those promised that a band must have [1].
+
+    Raises
+    ------
+    ValueError
+        If a recording did not go to its planned end, or a band has too few good frames: it names
+        each of these, with the good and the promised frames.
+    """
+    table = overview(folder)
+    short = table.isel(row=~table["complete"] | (table["good"] < share * table["promised"]))
+    if cases := [
+        f"'{row['recording']}', band '{row['band']}': {row['good']} good frames of "
+        f"{row['promised']} promised" + ("" if row["complete"] else ", cut short")
+        for row in short.to_dataframe().to_dict("records")
+    ]:
+        rule = f"Must have {share:.0%} of them: move these away, and record them again"
+        raise ValueError(f"Invalid recordings in '{folder}': {'; '.join(cases)}. {rule}.")
 
 
 def good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:

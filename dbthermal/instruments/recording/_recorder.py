@@ -15,9 +15,7 @@ import shutil
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
-from time import monotonic
 from typing import Final
 
 from dbthermal import store
@@ -28,6 +26,7 @@ from dbthermal.instruments.camera import (
     NoFrameError,
     SourceLostError,
 )
+from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
 from dbthermal.instruments.session import Session
@@ -90,14 +89,15 @@ def record(
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    with raised_signals():
+    clock = next(iter(sources.values())).clock
+    with raised_signals(), clock.joined():
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-        start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
-        file.begin(start, _utc())
+        start = clock()  # to make the file may have taken a while
+        file.begin(start, _utc(clock))
         end, stop = start + session.duration, stop or threading.Event()
-        run = _Run(file, sources, readings, limits, start, end, stop)
+        run = _Run(file, sources, readings, limits, clock, start, end, stop)
         # No daemon: it ends its work whatever becomes of this thread.
-        writer = threading.Thread(target=run.write, name="writer")
+        writer = Task(clock, "writer", run.write, daemon=False)
         try:
             writer.start()
             run.show(preview)
@@ -107,7 +107,8 @@ def record(
         finally:
             run.over.set()
             if writer.ident is not None:  # None only where an interrupt came before its start
-                run.done.wait()
+                while not clock.wait(run.done, limits.silence):
+                    pass
     if run.errors:
         raise run.errors[0]
     return Summary(file.recording.place(), run.ended, file.totals)
@@ -118,7 +119,10 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
         raise ValueError(
             f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
         )
+    clock = next(iter(sources.values())).clock
     for band, source in sources.items():
+        if source.clock is not clock:
+            raise ValueError(f"Invalid clock of band '{band}'. Must be that of the other sources.")
         for name, value, expected in (
             ("is_simulated", source.is_simulated, session.simulated),
             ("shape", source.shape, session.shape),
@@ -141,6 +145,7 @@ def _new_file(
     folder.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
     _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
+    clock = next(iter(sources.values())).clock
     known = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
@@ -150,15 +155,17 @@ def _new_file(
             for name in {**known, **identities}
         },
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
-        "started": _utc(),
+        "started": _utc(clock),
         "provenance": store.provenance(asdict(session)),
     }
-    units, start = {name: reading.units for name, reading in readings.items()}, monotonic()
-    return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
+    units = {name: reading.units for name, reading in readings.items()}
+    return CaptureFile(
+        path, sources, readings=units, origin=clock(), attrs=attrs, chunk=limits.chunk
+    )
 
 
-def _utc() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
+def _utc(clock: Clock) -> str:
+    return clock.utc().isoformat(timespec="milliseconds")
 
 
 @dataclass(eq=False)
@@ -169,6 +176,7 @@ class _Run:
     sources: Mapping[str, FrameSource]
     readings: Mapping[str, Reading]
     limits: Limits
+    clock: Clock
     start: float
     end: float
     stop: threading.Event
@@ -188,14 +196,14 @@ class _Run:
         self._lost_sources: list[str] = []
         self._refused_last: dict[str, int] = {}
         self._fetching = [
-            threading.Thread(target=self.fetch, args=item, name=item[0], daemon=True)
-            for item in self.sources.items()
+            Task(self.clock, band, self.fetch, band, source)
+            for band, source in self.sources.items()
         ]
-        self._reading = threading.Thread(target=self.read, name="readings", daemon=True)
+        self._reading = Task(self.clock, "readings", self.read)
 
     def is_going(self) -> bool:
         """True until the end of the duration, a stop or an error."""
-        return not (self.over.is_set() or self.stop.is_set() or monotonic() >= self.end)
+        return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
 
     def fetch(self, band: str, source: FrameSource) -> None:
         """Put the frames of one source into the queue, until the end.
@@ -208,16 +216,16 @@ class _Run:
                 try:
                     frame = source.read(self.limits.silence)
                 except NoFrameError:
-                    self._notes.put((Note.NO_FRAME, band, monotonic(), self.limits.silence))
+                    self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
                     continue
-                if self._room[band].acquire(blocking=False):
+                if self.clock.has_room(self._room[band]):
                     self._frames.put((band, frame, refused))
                     refused = 0
                 else:
                     refused += 1
         except SourceLostError:
             self._lost_sources.append(band)
-            self._notes.put((Note.SOURCE_LOST, band, monotonic(), math.nan))
+            self._notes.put((Note.SOURCE_LOST, band, self.clock(), math.nan))
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             self._fail(error)
         finally:
@@ -232,8 +240,9 @@ class _Run:
                         value, kind = float(reading.read()), Note.READING
                     except (OSError, RuntimeError, ValueError):
                         value, kind = math.nan, Note.READING_FAILED
-                    self._notes.put((kind, name, monotonic(), value))
-                self.over.wait(min(self.limits.reading_period, max(0.0, self.end - monotonic())))
+                    self._notes.put((kind, name, self.clock(), value))
+                remaining = max(0.0, self.end - self.clock())
+                self.clock.wait(self.over, min(self.limits.reading_period, remaining))
         except BaseException as error:  # noqa: BLE001 - as above
             self._fail(error)
 
@@ -246,10 +255,10 @@ class _Run:
         units = {name: reading.units for name, reading in self.readings.items()}
         period = _SHOW_POLL  # until there is something to show
         # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.
-        while not self.done.wait(period):
+        while not self.clock.wait(self.done, period):
             if preview and self.last_frames and self.is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
-                time, totals = monotonic() - self.start, self.totals
+                time, totals = self.clock() - self.start, self.totals
                 frames, readings = dict(self.last_frames), dict(self.last_readings)
                 preview(Preview(time, frames, totals, readings, units))
 
@@ -274,7 +283,7 @@ class _Run:
                     self._take(*self._frames.get_nowait())
                 self._take_notes()
                 for band, number in self._refused_last.items():
-                    self.file.refused(band, number, monotonic())
+                    self.file.refused(band, number, self.clock())
                 self.ended = self._reason()
                 is_complete = self.ended in {"duration", "stopped"}
                 self.file.close(complete=is_complete, ended=self.ended)
@@ -285,10 +294,10 @@ class _Run:
 
     def _write_frames(self) -> None:
         number = 0
-        while self.is_going() and any(thread.is_alive() for thread in self._fetching):
+        while self.is_going() and not all(task.ended.is_set() for task in self._fetching):
             self._take_notes()
             try:
-                band, frame, refused = self._frames.get(timeout=_WRITE_POLL)
+                band, frame, refused = self.clock.get(self._frames, _WRITE_POLL)
             except queue.Empty:
                 continue
             self._take(band, frame, refused)
@@ -326,12 +335,11 @@ class _Run:
             return "no frames"
         return "stopped" if self.stop.is_set() else "duration"
 
-    def _join(self, thread: threading.Thread) -> None:
+    def _join(self, thread: Task) -> None:
         """Wait for a thread; one that hangs in its device must not keep what was recorded."""
         if thread.ident is None:
             return
-        thread.join(self.limits.patience)
-        if thread.is_alive():
+        if not self.clock.wait(thread.ended, self.limits.patience):
             late = f"within {self.limits.patience} s after the end. Must keep its time limits."
             self.errors.append(TimeoutError(f"No answer of the device of '{thread.name}' {late}"))
 

@@ -1,7 +1,10 @@
-"""The emulated camera shows its world, and has the faults that are set."""
+"""The emulated camera and its line: they show their world, and have the faults that are set."""
+
+import math
 
 import numpy as np
 import pytest
+from device_benches import Clock
 from faulty_camera import Faults, FaultyCamera, Movie, frames
 
 from dbthermal.instruments import telemetry
@@ -13,24 +16,58 @@ from dbthermal.instruments.camera import (
     SourceLostError,
 )
 from dbthermal.instruments.emulated import camera as emulated
+from dbthermal.instruments.emulated.clock import EmulatedClock
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.transport import TransportError
 
-SHAPE, RATE = (8, 80), 10.0
+AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
 
 
-class Clock:
-    """A simulated clock, which advances only by waiting."""
+class Echo:
+    """A device that echoes its input."""
 
     def __init__(self) -> None:
-        self.time = 1000.0
+        self.plugged = True
+        self.said: list[bytes] = []
 
-    def __call__(self) -> float:
-        """The time [s]."""
-        return self.time
+    def receive(self, data: bytes) -> None:
+        """Take in bytes."""
+        self.said.append(data)
 
-    def sleep(self, duration: float) -> None:
-        """Let time pass."""
-        self.time += duration
+    def poll(self) -> list[bytes]:
+        """Give them back."""
+        said, self.said = self.said, []
+        return said
+
+    def next_due(self) -> float:
+        """Nothing comes by itself."""
+        return math.inf
+
+
+def test_reads_are_short_and_time_out() -> None:
+    """All bytes come back unchanged, in order, and silence takes no time on an injected clock."""
+    line = Line(Echo(), EmulatedClock())
+    line.write(AWKWARD)
+    line.write(b"ab")
+    assert (line.read(10, 1.0) + line.read(4096, 1.0), line.read(2, 1.0)) == (AWKWARD, b"ab")
+    assert line.read(2, 5.0) == b""
+
+
+def test_an_end_is_an_end() -> None:
+    """A line that was closed, twice, and one whose device was unplugged raise errors."""
+    closed, device = Line(Echo(), EmulatedClock()), Echo()
+    for _ in range(2):
+        closed.close()
+    device.plugged = False
+    for line in (closed, Line(device, EmulatedClock())):
+        with pytest.raises(TransportError, match="It must stay connected and open"):
+            line.write(b"x")
+        with pytest.raises(TransportError, match="It must stay connected and open"):
+            line.read(1, 30.0)
+
+
+SHAPE, RATE = (8, 80), 10.0
 
 
 def level(counts: int) -> Movie:
@@ -41,13 +78,11 @@ def level(counts: int) -> Movie:
 
 def camera(faults: Faults | None = None, band: str | None = "8-14", rows: int = 0) -> FaultyCamera:
     """A camera on a bench with a wheel of two filters, on a simulated clock."""
-    clock = Clock()
+    clock = Clock(1000.0)
     world = World(clock=clock, filters={1: "9.5", 2: "11"})
     world.add_camera("wide", 93588)
     pictures = {"8-14": level(1000), "9.5": level(2000), "11": level(3000)}
-    return FaultyCamera(
-        world, "wide", pictures, band, SHAPE, RATE, rows, clock.sleep, faults=faults or Faults()
-    )
+    return FaultyCamera(world, "wide", pictures, band, SHAPE, RATE, rows, faults=faults or Faults())
 
 
 def shown(frame: Frame) -> int:
@@ -125,9 +160,9 @@ def test_nobody_reads() -> None:
     """Frames beyond the buffers are lost while nobody reads, and leave a gap in the numbers."""
     source = camera()
     source.read()
-    source.sleep(0.75)
+    source.clock.sleep(0.75)
     assert source.read().sequence == 1
-    source.sleep(4.0)
+    source.clock.sleep(4.0)
     assert source.read().sequence == 47
 
 
@@ -181,14 +216,12 @@ def test_no_frame_in_time() -> None:
 
 def test_scene_begins_when_it_is_told() -> None:
     """Before, its beginning is seen; then pictures and thermocouples go with its own time."""
-    clock = Clock()
+    clock = Clock(1000.0)
     world = World(clock=clock, scene=lambda time: {"plate": 300.0 + time}, waits=True)
     world.add_camera("wide", 1)
     world.thermocouples[1] = "plate"
     clock.sleep(5.0)
-    source = FaultyCamera(
-        world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE, sleep=clock.sleep
-    )
+    source = FaultyCamera(world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE)
     assert [shown(frame) for frame in frames(source, 3)] == [1000] * 3
     assert (world.scene_time(), world.thermocouple_temperature(1)) == (0.0, 300.0)
     world.begin()
@@ -225,7 +258,7 @@ def test_unknown_names() -> None:
 
 def test_world_has_places_and_slots() -> None:
     """Thermocouples read what they are at; names are checked."""
-    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock())
+    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock(1000.0))
     world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
     world.blackbody_temperature = 320.0
     assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 320.0]

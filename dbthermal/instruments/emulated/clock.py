@@ -1,0 +1,149 @@
+"""Emulated time: a clock that advances from event to event, whatever the computer does meanwhile.
+
+One of the threads that wait on it runs at a time. When that thread waits, too, the next one is the
+first in the order of their waits whose condition holds or whose time has come; if there is none
+the clock leaps to the earliest end of a wait. So the course of a program, and all that it writes,
+depends on nothing but itself: not on the load of the machine, its cores, or the speed of its disk.
+"""
+
+import math
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from dbthermal.instruments.clock import Clock, Item
+
+START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # date and time of day at time 0 of every clock
+
+_ROOM: Final = 1.0  # emulated wait for a place in a buffer whose reader has ended [s]
+_POLL: Final = 0.05  # by the computer's clock, until a wait looks for what other threads did [s]
+
+
+class _Wait:
+    """Wait of one thread: it ends when a condition holds, or at a time [s]."""
+
+    def __init__(self, condition: Callable[[], bool], end: float) -> None:
+        self.condition, self.end, self.thread = condition, end, threading.get_ident()
+        self.held = False  # True if the condition held before the end
+        self.over = threading.Event()
+
+
+class EmulatedClock(Clock):
+    """Clock of an emulated bench, which begins at time 0, on 1 January 2000.
+
+    Threads take part in its order if they are a `Task`, or inside `joined`. Others may wait on it,
+    too, but run beside those, so that what happens then is of the computer's making.
+    """
+
+    def __init__(self) -> None:
+        self._now = 0.0
+        self._lock = threading.Lock()
+        self._waits: list[_Wait] = []
+        self._members: set[int] = set()  # threads that take part in the order
+        self._running: set[int] = set()  # those of them that do not wait
+
+    def __call__(self) -> float:
+        """Time since the start [s]."""
+        return self._now
+
+    def utc(self) -> datetime:
+        """Emulated date and time of day."""
+        return START + timedelta(seconds=self._now)
+
+    def sleep(self, seconds: float) -> None:
+        """Let other threads run until a time has passed [s]."""
+        self._wait(lambda: False, seconds)
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Let other threads run until an event is set, at most `timeout` [s]."""
+        return self._wait(event.is_set, timeout)
+
+    def get(self, items: "queue.SimpleQueue[Item]", timeout: float) -> Item:
+        """Let other threads run until a queue has an item; `queue.Empty` if none came in time."""
+        self._wait(lambda: not items.empty(), timeout)
+        return items.get_nowait()
+
+    def has_room(self, room: threading.Semaphore) -> bool:
+        """Wait for a place in a buffer: its reader is awaited in emulated time."""
+        return self._wait(lambda: room.acquire(blocking=False), _ROOM)
+
+    @contextmanager
+    def hold(self, lock: threading.Lock) -> Iterator[None]:
+        """Hold a lock while a block lasts; other threads run until it is free."""
+        self._wait(lambda: lock.acquire(blocking=False))
+        try:
+            yield
+        finally:
+            lock.release()
+
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Take part in the order while a block lasts, as the thread that runs now."""
+        with self._lock:
+            self._members.add(threading.get_ident())
+            self._running.add(threading.get_ident())
+        try:
+            yield
+        finally:
+            self.leave()
+
+    def enter(self, entered: threading.Event) -> None:
+        """Take a place in the order behind all that wait, and wait for the turn."""
+        with self._lock:
+            self._members.add(threading.get_ident())
+            turn = _Wait(lambda: True, self._now)
+            self._waits.append(turn)
+        entered.set()
+        self._await(turn)
+
+    def leave(self) -> None:
+        """End the part of a thread: the next one runs."""
+        with self._lock:
+            self._members.discard(threading.get_ident())
+            self._running.discard(threading.get_ident())
+            self._next()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float = math.inf) -> bool:
+        """Wait until a condition holds, at most `timeout` [s]; True if it does."""
+        turn = _Wait(condition, self._now + timeout)
+        try:
+            with self._lock:
+                self._waits.append(turn)
+                self._running.discard(turn.thread)
+                self._next()
+            self._await(turn)
+        except BaseException:  # an interrupt: this thread goes on
+            with self._lock:
+                self._waits = [wait for wait in self._waits if wait is not turn]
+                self._run(turn)
+            raise
+        return turn.held
+
+    def _await(self, turn: _Wait) -> None:
+        while not turn.over.wait(_POLL):
+            with self._lock:
+                self._next()
+
+    def _next(self) -> None:
+        """Let the next thread run, if none does."""
+        while self._waits and not self._running:
+            chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
+            if chosen is None:
+                chosen = min(self._waits, key=lambda wait: wait.end)
+                if math.isinf(chosen.end):
+                    return  # a thread that takes no part has what all wait for
+                self._now = chosen.end
+            self._run(chosen)
+            self._waits.remove(chosen)
+
+    def _is_over(self, wait: _Wait) -> bool:
+        wait.held = wait.condition()
+        return wait.held or wait.end <= self._now
+
+    def _run(self, wait: _Wait) -> None:
+        if wait.thread in self._members:
+            self._running.add(wait.thread)
+        wait.over.set()
