@@ -77,7 +77,7 @@ def draw_over_bound(**attrs: object) -> Figure:
     """Draw errors of 1.2 times one of two bounds, the other of which is missing once."""
     over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
     bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
-    parts = {}
+    parts: dict[str, tuple[object, np.ndarray]] = {}
     for name in ("reflection_ratio", "object_temperature"):
         parts[f"{name}_error"] = ("noise", 1.2 * bound[0])
         parts[f"{name}_bound"] = (("case", "noise"), bound.copy())

@@ -59,7 +59,8 @@ def test_scene_is_complete(name: str) -> None:
         assert float(scene[part].max()) < 345.0
     beyond = scene["object_share"].values == 0
     assert (name in FILLED) == (not beyond.any())
-    np.testing.assert_array_equal(*(scene[part].values[:, beyond] for part in (OBJECT, BACKGROUND)))
+    emitted, seen = (scene[part].values[:, beyond] for part in (OBJECT, BACKGROUND))
+    np.testing.assert_array_equal(emitted, seen)
     corrected = schema.check(simulation.observe(scene, RESPONSE, rng()), "corrected")
     assert corrected["counts"].shape[1:] == scene[OBJECT].shape
     if name in ("fingers", "fingerprint"):
@@ -125,8 +126,8 @@ def test_the_whole_scan_is_seen(scan: trimesh.Trimesh) -> None:
 )
 def test_vessels_peak_where_the_paper_s_did(name: str, celsius: float) -> None:
     """The outer wall at the thermocouple peaks at 63.6 and 63.1 degrees Celsius."""
-    exact = {"std": 0.0, "offset_std": 0.0, "bead": 1}
-    readings = twins.thermocouple_readings(twins.twin(name, SLOW, rng()), rng(), **exact)
+    scene = twins.twin(name, SLOW, rng())
+    readings = twins.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.0, bead=1)
     np.testing.assert_allclose(float(readings.max()) - 273.15, celsius, rtol=0, atol=0.15)  # K
 
 
@@ -295,9 +296,9 @@ def bead(name: str, size: int) -> Callable[[], object]:
     return lambda: twins.thermocouple_readings(twins.twin(name, SHORT, rng()), rng(), bead=size)
 
 
-def probe(*place: float) -> Callable[[], object]:
+def probe(height: float, angle: float) -> Callable[[], object]:
     """A wineglass with a thermocouple at a height [m] and an angle [degree]."""
-    moved = replace(vessels.WINEGLASS, probe=place)
+    moved = replace(vessels.WINEGLASS, probe=(height, angle))
     return lambda: twins.twin("wineglass", SHORT, rng(), vessel=moved)
 
 
