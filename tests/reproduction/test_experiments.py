@@ -35,11 +35,12 @@ def test_scores_of_known_errors() -> None:
     off = xr.DataArray([0.02, -0.005], dims="band")
     wrong = {OBJECT: truth[OBJECT] - 0.2, "emissivity": truth["emissivity"] + off}
     # Error of the object [K]; errors, coverage of the emissivities, coverage and shares [1].
-    for changes, expected in (
+    table: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
         ({}, (0.0, [0.0, 0.0], [1.0, 1.0], 1.0, 1.0, 1.0)),
         (some, (0.0, [0.0, 0.0], [1.0, 1.0], 1.0, 0.75, 0.75)),
         (wrong, (0.2, [0.02, 0.005], [0.0, 1.0], 0.0, 1.0, 1.0)),
-    ):
+    ]
+    for changes, expected in table:
         scores = experiments.score(truth, perfect.assign(changes))
         names = (f"{OBJECT}_rmse", "emissivity_error", "emissivity_coverage", "object_coverage")
         for name, value in zip((*names, "good", "with_temperature"), expected, strict=True):

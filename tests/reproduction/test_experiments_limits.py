@@ -1,5 +1,7 @@
 """Experiments on limits and nuisances: known numbers; notebooks 10 and 11 assert what they find."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,7 +13,7 @@ from reproduction.experiments import cases, limits, nuisances
 
 GLASS, PAIR = [0.86, 0.72], ["8-14", "9.5"]
 COMMON = {"ends": [20.0, 45.0], "clock": [350, 10.0]}
-VIEWS = {"shape": [24, 32], "clock": [50, 10.0], "seed": 1}
+VIEWS: dict[str, Any] = {"shape": [24, 32], "clock": [50, 10.0], "seed": 1}
 
 
 def test_summary_of_known_errors() -> None:
@@ -69,7 +71,7 @@ def test_border_is_judged_beyond_two_pixels(moved: int | None, right: float, ble
 
 def test_lost_frames_are_undone() -> None:
     """Marked copies of a frame cost at most a quarter of the error, and flag few pixels."""
-    options = {"pixels": {"pixels": 400}, "nuisance": {"share": 0.05}, "seed": 3}
+    options: dict[str, Any] = {"pixels": {"pixels": 400}, "nuisance": {"share": 0.05}, "seed": 3}
     measured = nuisances.disturbed("lost frames", **options)
     rmse, flagged = measured["object_temperature_rmse"].values, measured["flagged"].values
     assert rmse[1] <= 1.25 * rmse[2]

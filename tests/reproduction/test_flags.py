@@ -1,5 +1,7 @@
 """Rates of false alarms and of misses of the flags."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -14,8 +16,11 @@ BASE = {"emissivity": [0.86, 0.72], "start": 20.0, "stop": 45.0}
 @pytest.fixture(scope="module")
 def rates() -> xr.Dataset:
     """Rates over few pixels, with one clean scene; the "gray" scene is clean as well."""
-    pictures = {"completed_from_prior": {"still": 0.5}, "no_reflection_pair": {"shift": [6.0, 2.0]}}
-    expected = {flag: {} for flag in (*flags.FAULTS, "gray")} | pictures
+    pictures: dict[str, dict[str, Any]] = {
+        "completed_from_prior": {"still": 0.5},
+        "no_reflection_pair": {"shift": [6.0, 2.0]},
+    }
+    expected: dict[str, dict[str, Any]] = {flag: {} for flag in (*flags.FAULTS, "gray")} | pictures
     scenes = {flag: [scene] for flag, scene in expected.items()}
     return flags.rates(scenes, {"clean": {}}, BASE, pixels=40, clock=[350, 10.0], seed=3)
 
