@@ -34,7 +34,8 @@ rig := $(recorded:%=results/rig/%.ipynb)
 # The long ones start first, but for those that would compile what 00_quickstart compiles at the same time. Make puts one off to the end
 # that still waits for another when its turn comes: so a short one stands between.
 early := full/00_acquisition full/00_quickstart full/01_calibration full/02_emissivity full/07_bench full/03_simulation full/08_twins \
-    full/04_separation full/05_methods rig/01_calibration full/06_optimiser rig/04_separation full/12_published
+    full/04_separation full/05_methods rig/01_calibration full/10_limits full/14_live rig/04_separation full/13_whole full/06_optimiser \
+    full/12_published
 smoke := $(stems:%=results/smoke/%.ipynb)
 sources := $(shell LC_ALL=C find dbthermal notebooks/reproduction -type f -not -path '*/__pycache__/*' $(plainly)) $(wildcard data_manifest.yaml)
 execute = @$(python) -m reproduction.execute

@@ -10,6 +10,10 @@ from sketches import BANDS, DEGREE, array, check_measured, titles
 
 from reproduction import figures
 
+NOISE = "noise of the quieter band [K]"
+OBJECT, RMSE = "error of the object temperature [K]", "RMSE of the object temperature [K]"
+RATIO = "error of the reflection ratio [1]"
+
 
 def draw_accuracy(**attrs: object) -> Figure:
     """Draw the errors of two cases."""
@@ -27,8 +31,7 @@ def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
 def draw_scores(**attrs: object) -> Figure:
     """Draw the scores of two quantities."""
     parts = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
-    scores = {name: part.assign_attrs(attrs) for name, part in parts.items()}
-    return figures.error_bar_calibration(scores)
+    return figures.error_bar_calibration({n: part.assign_attrs(attrs) for n, part in parts.items()})
 
 
 def draw_noise(**attrs: object) -> Figure:
@@ -40,20 +43,9 @@ def draw_noise(**attrs: object) -> Figure:
 
 def draw_emissivity(**attrs: object) -> Figure:
     """Draw the errors of two methods over emissivity and noise."""
-    errors = array("variant emissivity noise", 2, 2, 3, **attrs) - 300
     coords = {"noise": [0.01, 0.1, 1.0], "emissivity": [0.3, 0.9], "variant": ["a", "b"]}
-    errors = errors.assign_coords(coords).assign_attrs(attrs)
-    return figures.emissivity_errors(errors, title="emissivity")
-
-
-def draw_reductions(**attrs: object) -> Figure:
-    """Draw the error reduced by two loss terms."""
-    return figures.reductions(array("term", 2, **attrs).assign_coords(term=["a", "b"]), [90.0, 5.0])
-
-
-def draw_sensitivity(**attrs: object) -> Figure:
-    """Draw the error with two settings changed."""
-    return figures.sensitivity(array("variant", 2, **attrs).assign_coords(variant=["a", "b"]), 0.5)
+    errors = (array("variant emissivity noise", 2, 2, 3) - 300).assign_coords(coords)
+    return figures.emissivity_errors(errors.assign_attrs(attrs), title="emissivity")
 
 
 def draw_procedures(**attrs: object) -> Figure:
@@ -65,37 +57,32 @@ def draw_procedures(**attrs: object) -> Figure:
     return figures.emissivity_procedures(xr.Dataset(parts, attrs=attrs), published, "8-14")
 
 
-def draw_thermocouples(**attrs: object) -> Figure:
+def draw_thermocouples(lost: str = "", **attrs: object) -> Figure:
     """Draw the reading and two methods in two scenes."""
-    names = {"scene": ["pot", "glass"], "variant": ["a", "b"]}
-    parts = {
-        "reading": array("scene time", 2, 2),
-        "temperature": array("scene variant time", 2, 2, 2),
-        "relative_error": array("scene variant", 2, 2) - 300,
-    }
-    scores = xr.Dataset(parts).assign_coords(names).assign_attrs(attrs)
-    scores["relative_error"] = scores["relative_error"].where(
-        scores["variant"] != attrs.get("lost")
-    )
-    return figures.thermocouples(scores)
+    parts = {"reading": array("scene time", 2, 2)}
+    parts["temperature"] = array("scene variant time", 2, 2, 2)
+    parts["relative_error"] = array("scene variant", 2, 2) - 300
+    scores = xr.Dataset(parts, {"scene": ["pot", "glass"], "variant": ["a", "b"]}, attrs)
+    kept = scores["relative_error"].where(scores["variant"] != lost)
+    return figures.thermocouples(scores.assign(relative_error=kept))
 
 
-def draw_error_maps(fill: float = 1.0, **attrs: object) -> Figure:
+def draw_error_maps(**attrs: object) -> Figure:
     """Draw the errors of two methods over an image."""
-    error = (fill * (array("y x", 5, 6) - 300)).assign_attrs(attrs)
+    error = (array("y x", 5, 6) - 300).assign_attrs(attrs)
     return figures.error_maps(array("y x", 5, 6), {"a": error, "b": 2 * error})
 
 
 def draw_over_bound(**attrs: object) -> Figure:
-    """Draw errors at three noise levels beside two bounds, one of which is missing once."""
-    over = {"noise": [0.01, 0.03, 0.1], "case": ["free", "known"]}
-    parts = {}
+    """Draw errors of 1.2 times one of two bounds, the other of which is missing once."""
+    over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
+    bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
+    parts: dict[str, tuple[object, np.ndarray]] = {}
     for name in ("reflection_ratio", "object_temperature"):
-        parts[f"{name}_error"] = array("noise", 3) - 299
-        parts[f"{name}_bound"] = array("case noise", 2, 3).assign_coords(case=over["case"]) - 299
-    measured = xr.Dataset(parts).assign_coords(over).assign_attrs(attrs)
-    measured["object_temperature_bound"][1, 0] = np.nan
-    return figures.error_over_bound(measured)
+        parts[f"{name}_error"] = ("noise", 1.2 * bound[0])
+        parts[f"{name}_bound"] = (("case", "noise"), bound.copy())
+    parts["object_temperature_bound"][1][1, 0] = np.nan
+    return figures.error_over_bound(xr.Dataset(parts, over, attrs))
 
 
 def draw_over_bands(**attrs: object) -> Figure:
@@ -124,47 +111,29 @@ def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
 
 def draw_validity(**attrs: object) -> Figure:
     """Draw two cases, one of them without flags and errors."""
-    stress = xr.Dataset(
-        {
-            "status": (("case", "pixel"), [[0, 0, 4], [0, 0, 0]]),
-            "bad": (("case", "kind", "pixel"), [[[False, True, True]], [[False] * 3]]),
-            "object_coverage": (("case", "among"), [[0.95], [0.2]]),
-            "emissivity_coverage": (("case", "among", "band"), [[[0.95, 0.9]], [[1.0, 0.97]]]),
-        },
-        {"case": ["a", "b"], "kind": ["any"], "band": BANDS},
-        attrs,
-    )
-    labels = {"object_coverage": ["unflagged"], "emissivity_coverage": ["all"]}
-    parts = {name: stress[name].assign_coords(among=label) for name, label in labels.items()}
-    both = {name: part.reindex(among=["unflagged", "all"]) for name, part in parts.items()}
-    return figures.validity(stress.drop_dims("among").assign(both))
+    nothing = [[[np.nan] * 2, [0.95, 0.9]], [[np.nan] * 2, [1.0, 0.97]]]
+    parts = {
+        "status": (("case", "pixel"), [[0, 0, 4], [0, 0, 0]]),
+        "bad": (("case", "kind", "pixel"), [[[False, True, True]], [[False] * 3]]),
+        "object_coverage": (("case", "among"), [[0.95, np.nan], [0.2, np.nan]]),
+        "emissivity_coverage": (("case", "among", "band"), nothing),
+    }
+    coords = {"case": ["a", "b"], "kind": ["any"], "band": BANDS, "among": ["unflagged", "all"]}
+    return figures.validity(xr.Dataset(parts, coords, attrs))
 
 
-def treated(over: str, *names: str, **attrs: object) -> xr.Dataset:
-    """Errors of two treatments over two values."""
+def treated(over: str, **attrs: object) -> xr.Dataset:
+    """Errors of two treatments over two values, one share missing."""
     values = {"delay": [0.0, 1.0], "parallax": [0.0, 2.0], "nuisance": ["lost", "shutter"]}
-    here = array(f"{over} treatment", 2, 2) - 299
     coords = {over: values[over], "treatment": ["as recorded", "undone"]}
-    parts = dict.fromkeys(("object_temperature_rmse", *names), here - 0.5)
-    return xr.Dataset(parts).assign_coords(coords).assign_attrs(attrs)
+    part = (array(f"{over} treatment", 2, 2) - 299.5).assign_coords(coords)
+    measured = xr.Dataset(dict.fromkeys(("object_temperature_rmse", "flagged"), part), attrs=attrs)
+    return measured.assign(covered=part.where(part["treatment"] == "undone"))
 
 
 def draw_offsets(**attrs: object) -> Figure:
     """Draw two offsets as found, and what undoing them is worth."""
-    measured = treated("delay", "flagged", **attrs)
-    return figures.offsets(measured.assign(found=("delay", [0.01, 0.98])))
-
-
-def draw_disturbances(**attrs: object) -> Figure:
-    """Draw two nuisances."""
-    return figures.disturbances(treated("nuisance", "flagged", **attrs))
-
-
-def draw_parallax(**attrs: object) -> Figure:
-    """Draw two views, one of them with a missing value."""
-    measured = treated("parallax", "flagged", "covered", **attrs)
-    measured["covered"][1, 0] = np.nan
-    return figures.parallax(measured)
+    return figures.offsets(treated("delay", **attrs).assign(found=("delay", [0.01, 0.98])))
 
 
 DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
@@ -174,40 +143,32 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     ),
     "error_bar_calibration": (draw_scores, {"density [1]", "error / standard deviation [1]"}),
     "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
-    "error_over_noise": (draw_noise, {"median error [K]", "noise of the quieter band [K]"}),
+    "error_over_noise": (draw_noise, {"median error [K]", NOISE}),
     "emissivity_errors": (
         draw_emissivity,
-        {"error [1]", "noise of the quieter band [K]", "emissivity, 8-14 \N{MICRO SIGN}m [1]"},
+        {"error [1]", NOISE, "emissivity, 8-14 \N{MICRO SIGN}m [1]"},
     ),
-    "reductions": (draw_reductions, {"reduction of the error by the term [%]"}),
-    "emissivity_procedures": (
-        draw_procedures,
-        {"emissivity, 8-14 \N{MICRO SIGN}m [1]"},
+    "reductions": (
+        lambda **attrs: figures.reductions(
+            array("term", 2, **attrs).assign_coords(term=["a", "b"]), [90.0, 5.0]
+        ),
+        {"reduction of the error by the term [%]"},
     ),
+    "emissivity_procedures": (draw_procedures, {"emissivity, 8-14 \N{MICRO SIGN}m [1]"}),
     "thermocouples": (draw_thermocouples, {"time [s]", f"object temperature [{DEGREE}]"}),
     "error_maps": (draw_error_maps, {f"apparent [{DEGREE}]", "mean error [K]"}),
-    "sensitivity": (draw_sensitivity, {"median error of the object temperature [K]"}),
-    "error_over_bound": (
-        draw_over_bound,
-        {
-            "error of the reflection ratio [1]",
-            "error of the object temperature [K]",
-            "error / bound [1]",
-            "noise of the quieter band [K]",
-        },
+    "sensitivity": (
+        lambda **attrs: figures.sensitivity(
+            array("variant", 2, **attrs).assign_coords(variant=["a", "b"]), 0.5
+        ),
+        {"median error of the object temperature [K]"},
     ),
+    "error_over_bound": (draw_over_bound, {RATIO, OBJECT, "error / bound [1]", NOISE}),
     "error_over_bands": (
         draw_over_bands,
-        {"error of the object temperature [K]", "error / bound [1]", "bands [\N{MICRO SIGN}m]"},
+        {OBJECT, "error / bound [1]", "bands [\N{MICRO SIGN}m]"},
     ),
-    "pooling": (
-        draw_pooling,
-        {
-            "error of the reflection ratio [1]",
-            "error of the object temperature [K]",
-            "pixels of one material [1]",
-        },
-    ),
+    "pooling": (draw_pooling, {RATIO, OBJECT, "pixels of one material [1]"}),
     "pooled_materials": (draw_pooled, {"reflection ratio [1]"}),
     "validity": (
         draw_validity,
@@ -217,16 +178,16 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
         draw_offsets,
         {
             "error of the offset [frame]",
-            "RMSE of the object temperature [K]",
+            RMSE,
             "flagged [%]",
             "offset of the second band [frame]",
         },
     ),
-    "disturbances": (draw_disturbances, {"RMSE of the object temperature [K]"}),
+    "disturbances": (lambda **attrs: figures.disturbances(treated("nuisance", **attrs)), {RMSE}),
     "parallax": (
-        draw_parallax,
+        lambda **attrs: figures.parallax(treated("parallax", **attrs)),
         {
-            "RMSE of the object temperature [K]",
+            RMSE,
             "flagged [%]",
             "95 % intervals that hold, no flag [%]",
             "parallax of the reflection [pixel]",
@@ -236,48 +197,38 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
 """Name of each function -> how to draw it, and the labels of its axes and bars."""
 
 
-def test_every_figure_of_the_experiments_is_tested() -> None:
-    """The list above is complete."""
-    assert {*figures.__all__} == DRAWN.keys()
-
-
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", figures.__all__)
 def test_figure_of_an_experiment(name: str) -> None:
-    """A figure of measured data is drawn without a warning, has units, and is its caller's."""
+    """Every figure is drawn without a warning, has units, is its caller's, and says what it shows:
+    simulated data and pictures are called so, and measured ones are not.
+    """
     draw, labels = DRAWN[name]
     check_measured(draw(origin="measured", radiometric=1), labels)
+    if name != "error_bar_calibration":
+        assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
 
-@pytest.mark.parametrize("name", sorted(DRAWN.keys() - {"error_bar_calibration"}))
-def test_title_says_what_the_data_are(name: str) -> None:
-    """Simulated data and pictures are called so."""
-    draw, _ = DRAWN[name]
-    assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
-
-
-@pytest.mark.parametrize("name", ["compared_reflections", "pooled_materials"])
-def test_nothing_but_nan(name: str) -> None:
+@pytest.mark.parametrize("draw", [draw_compared, draw_pooled])
+def test_nothing_but_nan(draw: Callable[..., Figure]) -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
-    figure = DRAWN[name][0](fill=np.nan)
+    figure = draw(fill=np.nan)
     figure.draw_without_rendering()
     assert figure.axes
 
 
-def test_errors_without_a_case_are_drawn_once() -> None:
-    """Two bounds, and one row of errors above; two rows in units of them, and 1, below."""
+def test_errors_are_in_units_of_their_bound() -> None:
+    """Two bounds and one row of errors above; below an error of 1.2 times its bound at 1.2."""
     above, _, below, _ = draw_over_bound().axes
-    assert [line.get_label() for line in above.lines] == ["free, bound", "known, bound", "measured"]
+    assert [line.get_label() for line in above.lines] == ["known, bound", "free, bound", "measured"]
     assert len(below.lines) == 3
+    np.testing.assert_allclose(np.asarray(below.lines[0].get_ydata()), 1.2, rtol=1e-12)
 
 
 def test_bars_say_what_is_flagged() -> None:
     """Each treatment of each nuisance has its error and its share as text."""
-    (axis,) = draw_disturbances().axes
-    found = treated("nuisance", "flagged").transpose("treatment", "nuisance")
-    pairs = zip(
-        found["object_temperature_rmse"].values.flat, found["flagged"].values.flat, strict=True
-    )
-    expected = [f"{error:.2f} K\n{100 * share:.0f} % flagged" for error, share in pairs]
+    (axis,) = figures.disturbances(treated("nuisance")).axes
+    values = treated("nuisance").transpose("treatment", "nuisance")["flagged"].values.flat
+    expected = [f"{value:.2f} K\n{100 * value:.0f} % flagged" for value in values]
     assert [text.get_text() for text in axis.texts] == expected
 
 
@@ -285,19 +236,6 @@ def test_a_method_without_a_value_says_so() -> None:
     """In the legend, in place of its error."""
     legend = draw_thermocouples(lost="b").axes[0].get_legend()
     assert legend is not None
-    texts = [text.get_text() for text in legend.get_texts()]
-    assert texts[1] == "b, no value"
-    assert texts[0].endswith(" %")
-
-
-def test_errors_are_in_units_of_their_bound() -> None:
-    """An error of 1.2 times its bound is drawn at 1.2."""
-    level = {"noise": [0.01, 0.03, 0.1]}
-    parts = {
-        f"{name}_{kind}": ("noise", scale * np.array([1.0, 2.0, 4.0]))
-        for name in ("reflection_ratio", "object_temperature")
-        for kind, scale in (("bound", 0.1), ("error", 0.12))
-    }
-    figure = figures.error_over_bound(xr.Dataset(parts, level))
-    ratio = np.asarray(figure.axes[2].lines[0].get_ydata())
-    np.testing.assert_allclose(ratio, 1.2, rtol=1e-12)
+    first, second = (text.get_text() for text in legend.get_texts()[:2])
+    assert second == "b, no value"
+    assert first.endswith(" %")

@@ -54,18 +54,17 @@ def test_parameters_of_recordings(path: Path) -> None:
 
 
 @each_notebook
-def test_notebook_asks_a_question(path: Path) -> None:
-    """The title comes first and is a question."""
-    title = cells(path, "markdown")[0].source.splitlines()[0]
+def test_notebook_is_stored_as_a_question(path: Path) -> None:
+    """The title is a question, one of the last two cells asserts the answer, no outputs and no
+    execution counts are committed, and papermill finds the kernel and the language.
+    """
+    title, code = cells(path, "markdown")[0].source.splitlines()[0], cells(path, "code")
     assert title.startswith("# ")
     assert title.endswith("?")
-
-
-@each_notebook
-def test_notebook_is_stored_without_outputs(path: Path) -> None:
-    """No outputs and no execution counts are committed."""
-    code = cells(path, "code")
+    assert any("assert" in cell.source for cell in code[-2:])
     assert not [cell.source for cell in code if cell.outputs or cell.execution_count]
+    kernel = read(path).metadata.kernelspec
+    assert (kernel.name, kernel.language) == ("python3", "python")
 
 
 @each_notebook
@@ -80,19 +79,6 @@ def test_cells_compose(path: Path) -> None:
         assert len(cell.source.splitlines()) <= longest, cell.source
 
 
-@each_notebook
-def test_notebook_checks_what_it_shows(path: Path) -> None:
-    """One of the last two cells asserts the answer."""
-    assert any("assert" in cell.source for cell in cells(path, "code")[-2:])
-
-
-@each_notebook
-def test_kernel_is_set(path: Path) -> None:
-    """Papermill takes the kernel and the language from the notebook."""
-    kernel = read(path).metadata.kernelspec
-    assert (kernel.name, kernel.language) == ("python3", "python")
-
-
 def code_lines(path: Path) -> list[str]:
     """Lines of code without those of the parameters, imports, comments and blanks."""
     tagged = [
@@ -102,13 +88,8 @@ def code_lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith(("#", "import ", "from "))]
 
 
-def test_bookkeeping_is_a_small_share(capsys: pytest.CaptureFixture[str]) -> None:
-    """Few code lines are about the paths of inputs and results; printed for each notebook."""
-    counts = {}
-    for path in NOTEBOOKS:
-        lines = code_lines(path)
-        counts[path.stem] = sum(bool(BOOKKEEPING.search(line)) for line in lines), len(lines)
-    with capsys.disabled():
-        print("".join(f"\n{stem}: {kept} of {count}" for stem, (kept, count) in counts.items()))
-    kept, count = (sum(part) for part in zip(*counts.values(), strict=True))
-    assert kept / count <= LARGEST_SHARE, f"{kept} of {count} lines"
+def test_bookkeeping_is_a_small_share() -> None:
+    """Few code lines are about the paths of inputs and results."""
+    lines = [line for path in NOTEBOOKS for line in code_lines(path)]
+    kept = sum(bool(BOOKKEEPING.search(line)) for line in lines)
+    assert kept / len(lines) <= LARGEST_SHARE, f"{kept} of {len(lines)} lines"

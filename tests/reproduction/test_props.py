@@ -1,4 +1,4 @@
-"""Moving bodies around the twins: writing, cups, hands, routes, and invalid settings."""
+"""Moving bodies around the twins: writing, cups, hands and routes."""
 
 import numpy as np
 
@@ -8,8 +8,6 @@ from reproduction.twins.people import FINGERS, Route, imprint, pacing
 from reproduction.twins.props import Writing, board, cup
 from reproduction.twins.stage import AMBIENT, clock
 from reproduction.twins.surroundings import Pose
-
-PLATE = surfaces.plate(0.1, 0.1, 0.1)
 
 
 def test_writing_appears_and_fades() -> None:
@@ -39,16 +37,13 @@ def test_the_index_writes_the_strokes() -> None:
 def test_a_cup_is_uncovered() -> None:
     """The top jumps from the lid's temperature to the drink's; the wall stays."""
     mug = cup(uncovered=5.0, wall=318.0, lid=299.0, drink=335.0)
-    before, after = mug.warmth(4.9), mug.warmth(5.0)
-    assert set(before) == {318.0, 299.0}
-    assert set(after) == {318.0, 335.0}
+    assert [set(mug.warmth(time)) for time in (4.9, 5.0)] == [{318.0, 299.0}, {318.0, 335.0}]
 
 
 def test_pacing_keeps_its_pace() -> None:
     """Between the corners of the way the pace lies in its range, and pauses are pauses."""
-    route = pacing(
-        ((-2.0, 0.0), (0.0, 0.0), (2.0, 1.0)), clock(), np.random.default_rng(1), pace=(0.5, 1.0)
-    )
+    corners, rng = ((-2.0, 0.0), (0.0, 0.0), (2.0, 1.0)), np.random.default_rng(1)
+    route = pacing(corners, clock(), rng, pace=(0.5, 1.0))
     lengths = np.linalg.norm(np.diff(route.places, axis=0), axis=1)
     speeds = lengths / np.diff(route.times)
     np.testing.assert_array_equal(speeds[::2], 0.0)

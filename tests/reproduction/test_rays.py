@@ -13,14 +13,16 @@ from reproduction.twins.surroundings import Actor, Motion, Pose, incident
 
 CAMERA = Camera(position=(0.1, -0.6, 0.3), target=(0.0, 0.0, 0.05), shape=(45, 60))
 FRONT = Camera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), shape=(90, 120))
+DIRECTIONS = FRONT.directions()
+ORIGINS = np.broadcast_to(FRONT.position, DIRECTIONS.shape)
 RADIUS = 0.1  # m
-ROOM = 295.15  # K
-SKIN = 307.15  # K
+ROOM, SKIN = 295.15, 307.15  # K
 
 
-def sphere(radius: float = RADIUS, subdivisions: int = 4) -> Caster:
+def sphere(subdivisions: int = 4) -> Caster:
     """Sphere about the origin."""
-    return Caster(ellipsoid((radius,) * 3, (0.0, 0.0, 0.0), radius * 1.107 / 2**subdivisions))
+    spacing = RADIUS * 1.107 / 2**subdivisions
+    return Caster(ellipsoid((RADIUS,) * 3, (0.0, 0.0, 0.0), spacing))
 
 
 def wall(turn: float = 0.0) -> trimesh.Trimesh:
@@ -36,12 +38,6 @@ def ball(radius: float, temperature: float = SKIN, motion: Motion | None = None)
     return Actor(mesh, np.full(len(mesh.vertices), temperature), motion)
 
 
-def rays_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions of a camera's rays."""
-    directions = camera.directions()
-    return np.broadcast_to(camera.position, directions.shape), directions
-
-
 def test_projection_undoes_directions() -> None:
     """A point along the ray of a pixel appears in that pixel, at any distance."""
     way = np.linspace(0.2, 3.0, 45 * 60)[:, np.newaxis]
@@ -53,11 +49,10 @@ def test_projection_undoes_directions() -> None:
 def test_field_of_view_is_horizontal() -> None:
     """From edge to edge the image spans 24 degrees across; the image's right is the world's."""
     half = np.tan(np.radians(12.0)) * 119 / 120  # to the middle of the last pixel
-    edges = FRONT.directions().reshape(90, 120, 3)[:, -1, 0]
+    edges = DIRECTIONS.reshape(90, 120, 3)[:, -1, 0]
     np.testing.assert_allclose(edges.max(), half / np.hypot(1, half), rtol=0, atol=1e-4)
-    right, down, forward = FRONT.axes
-    expected = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    np.testing.assert_allclose([right, down, forward], expected, rtol=0, atol=1e-15)
+    expected = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # right, down, forward
+    np.testing.assert_allclose(FRONT.axes, expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -69,50 +64,47 @@ def test_field_of_view_is_horizontal() -> None:
     ],
 )
 def test_no_camera(change: dict[str, object], message: str) -> None:
-    """Invalid settings of a camera raise a ValueError with the rule."""
+    """Invalid settings of a camera raise a ValueError with the rule; behind it nothing is seen."""
     arguments = {"position": CAMERA.position, "target": CAMERA.target, "shape": (3, 4)} | change
     with pytest.raises(ValueError, match=message):
         Camera(**arguments)  # type: ignore[arg-type]
-
-
-def test_behind_the_camera() -> None:
-    """A point behind the camera has no place in its image."""
     with pytest.raises(ValueError, match="Must be positive"):
         FRONT.project([0.0, -2.0, 0.0])
 
 
 def test_plane_mirrors_as_the_law_says() -> None:
-    """On a plane y turns round and the rest stays, and the point is where the ray meets it."""
-    origins, directions = rays_of(FRONT)
+    """On a plane y turns round and the rest stays, the point is where the ray meets it, and a
+    linear function on the vertices is itself there.
+    """
     caster = Caster(wall())
-    hits = caster.cast(origins, directions)
-    starts, mirrored = caster.mirrored(hits, directions)
-    np.testing.assert_allclose(mirrored, directions * [1, -1, 1], rtol=0, atol=1e-12)
-    met = origins + directions / directions[:, [1]]
+    hits = caster.cast(ORIGINS, DIRECTIONS)
+    starts, mirrored = caster.mirrored(hits, DIRECTIONS)
+    np.testing.assert_allclose(mirrored, DIRECTIONS * [1, -1, 1], rtol=0, atol=1e-12)
+    met = ORIGINS + DIRECTIONS / DIRECTIONS[:, [1]]
     np.testing.assert_allclose(caster.points(hits), met, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(starts - met, [[0, -2.83e-4, 0]] * len(met), rtol=0, atol=1e-6)
+    slopes = np.array([[3.0, 5.0, 7.0], [1.0, -1.0, 2.0]])
+    values = caster.interpolate(hits, slopes @ wall().vertices.T)
+    np.testing.assert_allclose(values, slopes @ met.T, rtol=0, atol=1e-12)
 
 
 def test_sphere_mirrors_as_the_law_says() -> None:
     """Smooth shading on a faceted sphere gives the mirror directions of the true sphere."""
-    origins, directions = rays_of(FRONT)
     caster = sphere(subdivisions=5)
-    hits = caster.cast(origins, directions)
-    met = hits.met
-    origins, directions = origins[met], directions[met]
+    hits = caster.cast(ORIGINS, DIRECTIONS)
+    origins, directions = ORIGINS[hits.met], DIRECTIONS[hits.met]
     along = np.sum(origins * directions, axis=1)
     root = np.sqrt(along**2 - np.sum(origins**2, axis=1) + RADIUS**2)
     normals = unit(origins + (-along - root)[:, np.newaxis] * directions)
     inner = np.sum(normals * directions, axis=1) < -0.5  # not at the rim, where facets show
-    _, mirrored = caster.mirrored(hits.select(met), directions)
+    _, mirrored = caster.mirrored(hits.select(hits.met), directions)
     cosines = np.sum(mirrored * mirror(directions, normals), axis=1)[inner]
     assert np.degrees(np.arccos(cosines.min())) < 0.2
 
 
 def test_mirror_law() -> None:
     """The angle to the normal is kept, and mirroring twice is the identity."""
-    rng = np.random.default_rng(2)
-    directions, normals = unit(rng.normal(size=(2, 50, 3)))
+    directions, normals = unit(np.random.default_rng(2).normal(size=(2, 50, 3)))
     mirrored = mirror(directions, normals)
     sums = np.sum((directions + mirrored) * normals, axis=1)
     np.testing.assert_allclose(sums, 0.0, rtol=0, atol=1e-15)
@@ -121,50 +113,33 @@ def test_mirror_law() -> None:
 
 def test_sphere_covers_its_solid_angle() -> None:
     """The pixels on a sphere, weighted by their solid angle, add up to that of its cone."""
-    hits = sphere().cast(*rays_of(FRONT))
-    forward = FRONT.directions() @ FRONT.axes[2]
+    forward = DIRECTIONS @ FRONT.axes[2]
     pixel = (2 * np.tan(np.radians(12.0)) / 120) ** 2
-    solid = np.sum(pixel * forward[hits.met] ** 3)
-    expected = 2 * np.pi * (1 - np.sqrt(1 - RADIUS**2))
-    np.testing.assert_allclose(solid, expected, rtol=0.01)
-
-
-def test_values_are_interpolated_linearly() -> None:
-    """A linear function on the vertices is itself at the points that rays meet, at all times."""
-    caster = Caster(wall())
-    hits = caster.cast(*rays_of(FRONT))
-    slopes = np.array([[3.0, 5.0, 7.0], [1.0, -1.0, 2.0]])
-    values = caster.interpolate(hits, slopes @ wall().vertices.T)
-    np.testing.assert_allclose(values, slopes @ caster.points(hits).T, rtol=0, atol=1e-12)
+    solid = np.sum(pixel * forward[sphere().cast(ORIGINS, DIRECTIONS).met] ** 3)
+    np.testing.assert_allclose(solid, 2 * np.pi * (1 - np.sqrt(1 - RADIUS**2)), rtol=0.01)
 
 
 def test_hidden_points() -> None:
     """The visible points of a sphere are those within the horizon's cone."""
     points = RADIUS * unit(np.random.default_rng(4).normal(size=(500, 3)))
-    fine = sphere(subdivisions=5)
     height = points @ np.array([0.0, -1.0, 0.0])
     clear = np.abs(height - RADIUS**2) > 0.006
-    seen = fine.visible(points * (1 - 1e-4), FRONT.position)
+    seen = sphere(subdivisions=5).visible(points * (1 - 1e-4), FRONT.position)
     np.testing.assert_array_equal(seen[clear], (height > RADIUS**2)[clear])
 
 
 def test_concave_surface_sees_itself() -> None:
-    """A ray into a corner of two mirrors comes back along its way, and meets the other mirror."""
-    corner = trimesh.util.concatenate([wall(45.0), wall(-45.0)])
-    caster = Caster(cast("trimesh.Trimesh", corner))
-    origins, directions = rays_of(FRONT)
-    hits = caster.cast(origins, directions)
-    again = caster.cast(*caster.mirrored(hits, directions))
+    """A ray into a corner of two mirrors meets the second mirror; none of a sphere meets it again,
+    at a silhouette either.
+    """
+    corner = Caster(cast("trimesh.Trimesh", trimesh.util.concatenate([wall(45.0), wall(-45.0)])))
+    hits = corner.cast(ORIGINS, DIRECTIONS)
+    again = corner.cast(*corner.mirrored(hits, DIRECTIONS))
     assert again.met.all()
     assert np.all(again.face // 2 != hits.face // 2)
-
-
-def test_convex_surface_does_not() -> None:
-    """No mirrored ray of a sphere meets the sphere, at a silhouette either."""
     coarse = sphere(subdivisions=2)
-    origins, directions = rays_of(FRONT)
-    hits = coarse.cast(origins, directions)
-    again = coarse.cast(*coarse.mirrored(hits.select(hits.met), directions[hits.met]))
+    hits = coarse.cast(ORIGINS, DIRECTIONS)
+    again = coarse.cast(*coarse.mirrored(hits.select(hits.met), DIRECTIONS[hits.met]))
     assert not again.met.any()
 
 
@@ -185,9 +160,7 @@ def test_reflection_is_where_geometry_puts_it() -> None:
     """In a plane mirror a ball's image is centred where its mirror image would be seen."""
     caster, place = Caster(wall()), np.array([0.15, -1.5, 0.1])
     actor = ball(0.06, motion=lambda _: Pose(translation=place))
-    origins, directions = rays_of(FRONT)
-    hits = caster.cast(origins, directions)
-    rays = caster.mirrored(hits, directions)
+    rays = caster.mirrored(caster.cast(ORIGINS, DIRECTIONS), DIRECTIONS)
     seen = incident(*rays, np.zeros(1), ROOM, [actor])[0]
     pixels = np.argwhere((seen > ROOM + 1).reshape(FRONT.shape))
     expected = FRONT.project(place * [1, -1, 1])
@@ -195,30 +168,26 @@ def test_reflection_is_where_geometry_puts_it() -> None:
     assert set(np.round(seen, 6)) == {ROOM, SKIN}
 
 
+RAY = np.zeros((1, 3)), np.array([[0.0, -1.0, 0.0]])
+
+
 def test_person_crosses_when_predicted() -> None:
     """A ball at 1 m/s is seen along a ray while it is within its radius of it."""
     time = np.arange(0.0, 4.0, 0.01)
     actor = ball(0.2, motion=lambda now: Pose(translation=(now - 2.0, -3.0, 0.0)))
-    ray = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, -1.0, 0.0]])
-    seen = incident(*ray, time, ROOM, [actor])[:, 0]
-    warm = time[seen > ROOM + 1]
+    warm = time[incident(*RAY, time, ROOM, [actor])[:, 0] > ROOM + 1]
     np.testing.assert_allclose(warm[[0, -1]], [1.8, 2.2], rtol=0, atol=0.011)  # s
 
 
 def test_the_nearest_actor_hides_the_others() -> None:
-    """Of two bodies along a ray the nearer one is seen, in either order."""
-    near = ball(0.2, 300.0, motion=lambda _: Pose(translation=(0.0, -2.0, 0.0)))
+    """Of two bodies along a ray the nearer one is seen, in either order, as warm as it is now."""
+    mesh = ball(0.2).mesh
+    near = Actor(
+        mesh,
+        lambda now: np.full(len(mesh.vertices), 300 + now),
+        lambda _: Pose(translation=(0.0, -2.0, 0.0)),
+    )
     far = ball(0.4, 310.0, motion=lambda _: Pose(translation=(0.0, -3.0, 0.0)))
-    ray = np.zeros((1, 3)), np.array([[0.0, -1.0, 0.0]])
     for actors in ([near, far], [far, near]):
-        seen = incident(*ray, np.zeros(1), ROOM, actors)
-        np.testing.assert_allclose(seen, 300.0, rtol=0, atol=1e-9)  # K
-
-
-def test_temperature_of_an_actor_may_change() -> None:
-    """A body that stands still is seen at its temperature of the moment."""
-    still = ball(0.2).mesh
-    warming = Actor(still, lambda now: np.full(len(still.vertices), 300 + now))
-    ray = np.array([[0.0, -1.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
-    seen = incident(*ray, np.arange(3.0), ROOM, [warming])[:, 0]
-    np.testing.assert_allclose(seen, [300.0, 301.0, 302.0], rtol=0, atol=1e-9)  # K
+        seen = incident(*RAY, np.arange(3.0), ROOM, actors)[:, 0]
+        np.testing.assert_allclose(seen, [300.0, 301.0, 302.0], rtol=0, atol=1e-9)  # K

@@ -23,19 +23,28 @@ OPEN = {"plate", "wineglass", "coffee_pot", "bulb"}
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_topology(name: str) -> None:
-    """A closed shape is a ball with its normals outward; an open one is a disc; no stray vertex."""
+    """A closed shape is a ball with its normals outward; an open one is a disc; no stray vertex;
+    no face is a sliver, poles, seams and corners included: 1 is equilateral, 0 is flat.
+    """
     mesh = SHAPES[name]()
     assert mesh.is_watertight == (name not in OPEN)
     assert mesh.is_winding_consistent
     assert mesh.euler_number == (1 if name in OPEN else 2)
     assert np.unique(mesh.faces).size == len(mesh.vertices)
     assert name in OPEN or mesh.volume > 0
+    edges = np.roll(mesh.triangles, -1, axis=1) - mesh.triangles
+    assert np.min(4.0 * np.sqrt(3.0) * mesh.area_faces / (edges**2).sum(axis=(1, 2))) > 0.6
 
 
-@pytest.mark.parametrize("name", ["wineglass", "coffee_pot", "bulb"])
-def test_vessels_face_outward(name: str) -> None:
-    """Normals of a vessel's upright wall point away from the axis."""
+@pytest.mark.parametrize(
+    ("name", "width", "height"),
+    [("wineglass", 0.084, 0.21), ("coffee_pot", 0.136, 0.165), ("bulb", 0.06, 0.0855)],
+)
+def test_vessels(name: str, width: float, height: float) -> None:
+    """A vessel is as large as described, stands on z = 0, and its upright wall faces outward."""
     mesh = SHAPES[name]()
+    np.testing.assert_allclose(mesh.extents, [width, width, height], rtol=0, atol=2e-4)
+    assert mesh.vertices[:, 2].min() == 0
     radial = mesh.triangles_center[:, :2]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
     standing = np.abs(mesh.face_normals[:, 2]) < 0.5
@@ -80,25 +89,6 @@ def test_area_and_volume(
     assert np.all(np.array(missing[-1]) > 0)
     assert np.all(np.array(missing[-1]) < 2e-3)
     np.testing.assert_allclose(order, 2.0, rtol=0, atol=0.25)
-
-
-@pytest.mark.parametrize("name", SHAPES)
-def test_even_triangles(name: str) -> None:
-    """No face is a sliver, poles, seams and corners included: 1 is equilateral, 0 is flat."""
-    mesh = SHAPES[name]()
-    edges = np.roll(mesh.triangles, -1, axis=1) - mesh.triangles
-    assert np.min(4.0 * np.sqrt(3.0) * mesh.area_faces / (edges**2).sum(axis=(1, 2))) > 0.6
-
-
-def test_sizes_of_the_vessels() -> None:
-    """The vessels are as large as their descriptions say, and stand on z = 0."""
-    for mesh, width, height in (
-        (surfaces.wineglass(), 0.084, 0.21),
-        (surfaces.coffee_pot(), 0.136, 0.165),
-        (surfaces.bulb(), 0.06, 0.0855),
-    ):
-        np.testing.assert_allclose(mesh.extents, [width, width, height], rtol=0, atol=2e-4)
-        assert mesh.vertices[:, 2].min() == 0
 
 
 @pytest.mark.parametrize("end", [(0, 0, 0.2), (0, 0, -0.2), (0.1, -0.1, 0.1)])

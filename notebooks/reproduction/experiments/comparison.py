@@ -16,7 +16,7 @@ MOVING: Final = 0.5
 WRONG: Final = 0.1
 """Error of an emissivity from which it is called wrong [1]."""
 
-EVERY: Final = 10
+EVERY: Final = 20
 """A method that looks at whole images, each by itself, gets the first of so many frames."""
 
 Options = Mapping[str, Any]
@@ -50,7 +50,7 @@ def compare(
     The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
     variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
     same number of pixels, drawn from those in which the reflection varies by more than `MOVING`;
-    methods that treat each pixel alone get these only, the others all pixels of every tenth frame
+    methods that treat each pixel alone get these only, the others all pixels of some frames
     (`EVERY`), with noise of their own. The noise of the two bands [K] is known to all, the
     emissivities [1] to "calibrated" alone.
     Variables of `judge` over (variant, ...).

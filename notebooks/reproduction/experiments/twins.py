@@ -12,7 +12,7 @@ from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
-from reproduction.experiments.comparison import MOVING, arguments
+from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.experiments.stress import INTERVAL
 from reproduction.twins.views import Registration
 
@@ -22,7 +22,7 @@ BEAD: Final = 3
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
 
-PIXELWISE: Final = ("calibrated", "dbvt", "naive")
+PIXELWISE: Final = ("apparent", "calibrated", "dbvt", "naive")
 """Methods that get the surroundings of a bead only, which they treat pixel by pixel."""
 
 REACH: Final = 5
@@ -42,6 +42,7 @@ def judge_twin(
     material: str,
     capture: twins.Capture,
     registrations: Sequence[Registration] = ("perfect",),
+    whole: bool = True,
     shown: bool = False,
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
@@ -55,11 +56,12 @@ def judge_twin(
     -------
     Dataset
         Over `cameras`, the registrations (with a baseline) and "one place": variables of
-        `at_thermocouple`; over the `way`, "alone" by `solve`, "pooled" and "completed" by
-        `separate` (with a baseline), those of `over_the_image`; `resting` [1], the share of the
-        pixels whose object changes by less than `RESTING`, where two bands leave the emissivity
-        open; `emissivity_difference` (band) [1], mean magnitude of the default method's emissivity
-        less the calibrated one over the pixels without a flag.
+        `at_thermocouple`; over the `way`, "alone" by `solve`, and if it is judged as a `whole`,
+        with a baseline, "pooled" and "completed" by `separate`, those of `over_the_image`, else
+        NaN; `resting` [1], the share of the pixels whose object changes by less than `RESTING`,
+        where two bands leave the emissivity open; `emissivity_difference` (band) [1], mean
+        magnitude of the default method's emissivity less the calibrated one over the pixels
+        without a flag.
     Dataset or None
         As of `separate_twin`, of the first registration; if it is to be shown.
     """
@@ -84,15 +86,16 @@ def judge_twin(
         seen = (scene, corrected, response, separated)
         read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
         ways = {"alone": over_the_image(scene, separated)}
-        if cameras != "one place" or (shown and picture is None):
-            whole = separation.separate(
+        if (whole and cameras != "one place") or (shown and picture is None):
+            result = separation.separate(
                 corrected, response, reflection_shift=shift, alone=separated
             )
-            ways["pooled"] = over_the_image(scene, whole)
-            ways["completed"] = over_the_image(scene, whole, completed=True)
+            ways["pooled"] = over_the_image(scene, result)
+            ways["completed"] = over_the_image(scene, result, completed=True)
             if shown and picture is None:
-                picture = _with_truth(whole, scene, corrected, response)
+                picture = _with_truth(result, scene, corrected, response)
         image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))
+        image = image.reindex(way=["alone", "pooled", "completed"])
         both = {**image.data_vars, "resting": _resting(scene), "emissivity_difference": away}
         parts.append(read.assign_coords(way=image["way"]).assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
@@ -199,14 +202,16 @@ def at_thermocouple(
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
     `method` of `separation.solve` and its arguments, with the shift of the reflections where it
-    takes one; the default method without arguments is what has been separated.
+    takes one; the default method without arguments is what has been separated. A method that looks
+    at whole images, each by itself, gets the first of `EVERY` frames.
 
     Returns
     -------
     Dataset
         `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes,
         NaN where a pixel of the bead has no value in some frame;
-        `temperature` (variant, time) and `reading` (time) of the last probe [K];
+        `temperature` (variant, time) and `reading` (time) of the last probe [K], NaN in frames that
+        a method does not get;
         `highest_reading` [degree Celsius], median over the probes.
     """
     square = _square(scene)
@@ -223,18 +228,24 @@ def at_thermocouple(
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
-    temperature = xr.concat(estimates, dim=label)
-    errors = [metrics.relative_error_celsius(temperature, reading) for reading in readings]
+    errors = [_relative_error(estimate, readings) for estimate in estimates]
     highest = np.median([float(reading.max()) for reading in readings]) - zero_Celsius
     return xr.Dataset(
         {
-            "relative_error": xr.concat(errors, "probe").mean(("probe", "time"), skipna=False),
-            "temperature": temperature.assign_attrs(units="K"),
+            "relative_error": xr.concat(errors, label),
+            "temperature": xr.concat(estimates, label, join="outer").assign_attrs(units="K"),
             "reading": readings[-1],
             "highest_reading": ((), highest, {"units": "degree_Celsius"}),
         },
         attrs={"origin": "simulated twin", "twin": scene.attrs["twin"]},
     )
+
+
+def _relative_error(estimate: xr.DataArray, readings: Sequence[xr.DataArray]) -> xr.DataArray:
+    """Error of a temperature (time), mean over its frames and the probes' readings (time)."""
+    times = {"time": estimate["time"]}
+    errors = [metrics.relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
+    return xr.concat(errors, "probe").mean(("probe", "time"), skipna=False)
 
 
 def _square(scene: xr.Dataset) -> dict[str, slice]:
@@ -269,7 +280,9 @@ def _mean(
         if reach:
             nearby = options["reflection_shift"] = options["reflection_shift"].isel(around)
             if not bool(nearby["shift"].notnull().any()):
-                return corrected["time"].astype(np.float64) * np.nan
+                return (corrected["time"].astype(np.float64) * np.nan).assign_attrs(units="K")
+    if separation.get_method(variant["method"]).whole_image:
+        seen = seen.isel(time=slice(None, None, EVERY))
     estimates = separation.solve(seen, response, **options)["object_temperature"]
     bead = {dim: corrected[dim][part] for dim, part in square.items()}
     return estimates.sel(bead).mean(("y", "x"), skipna=False)

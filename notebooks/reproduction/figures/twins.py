@@ -23,9 +23,10 @@ def thermocouples(scores: xr.Dataset) -> Figure:
         for index, variant in enumerate(here["variant"].values):
             part = here.sel(variant=variant)
             error = float(part["relative_error"])
+            known = part["temperature"].dropna("time")
             axis.plot(
-                part["time"],
-                part["temperature"] - zero_Celsius,
+                known["time"],
+                known - zero_Celsius,
                 color=COLORS[index % len(COLORS)],
                 linewidth=1,
                 linestyle="-" if index < len(COLORS) else "--",
