@@ -91,7 +91,7 @@ def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
 
     def draw(_: Preview) -> None:
         while not (chunks := written(path) // CHUNK) and clock() < 0.9:
-            clock.sleep(0.01)
+            clock.sleep(0.1)
         seen.append(chunks)
 
     sources = bench()
