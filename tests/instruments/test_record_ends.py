@@ -45,7 +45,7 @@ class HastyClock(EmulatedClock):
     """Emulated time in which no camera waits for the disk."""
 
     def has_room(self, room: threading.Semaphore) -> bool:
-        """Take a place in a buffer; False if there is none."""
+        """Take a place in a buffer; False if it is full."""
         return room.acquire(blocking=False)
 
 
