@@ -5,7 +5,8 @@ them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhil
 opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over
 `_fslp`, `filterwheel` over `_controller` and `_apt`, and `tc08`; `camera` is the interface of any
 camera. Imported by name are ``v4l2`` (frames), ``telemetry``, ``transport`` (addresses, serial
-lines), ``signals`` and ``emulated``: devices behind ``sim://`` addresses, below the same drivers.
+lines), ``signals``, `clock` and ``emulated``: devices behind ``sim://`` addresses, below the same
+drivers, on a clock that leaps from event to event.
 All drivers were written from public descriptions and tested against public byte vectors, stand-ins
 for the system's calls and emulators, **never against hardware**. They need the packages of
 ``dbthermal[instruments]``.

@@ -1,4 +1,4 @@
-"""Clock of a rig: the computer's own, or one that advances from event to event.
+"""Clock of a rig: that of the computer, or emulated time that leaps from event to event.
 
 Drivers and recorder take the time, wait, and start their threads by a `Clock` alone. That of
 hardware is `SYSTEM`; `dbthermal.instruments.emulated.clock` has the one of emulated devices.
@@ -42,7 +42,7 @@ class Clock:
         return items.get(timeout=timeout)
 
     def has_room(self, room: threading.Semaphore) -> bool:
-        """Take a place in a buffer; False if there is none."""
+        """Take a place in a buffer; False if it is full."""
         return room.acquire(blocking=False)
 
     @contextmanager

@@ -192,8 +192,7 @@ def record_scene(
 
     Examples
     --------
-    >>> from dbthermal.instruments.clock import SYSTEM, Clock
-    from dbthermal.instruments.devices import open_devices
+    >>> from dbthermal.instruments.devices import open_devices
     >>> from dbthermal.instruments.session import Camera, Session
     >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))

@@ -100,7 +100,7 @@ def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Pat
     assert all(total["refused"] == total["lost"] == 0 for total in capture.attrs["totals"].values())
 
 
-def test_real_time_is_an_option(tmp_path: Path) -> None:
+def test_real_time_is_an_option() -> None:
     """A bench on the computer's clock takes the time that it says."""
     world = bench(SCENE, clock=SYSTEM)
     with open_devices(SCENE, world, pictures(world)) as devices:
@@ -108,7 +108,6 @@ def test_real_time_is_an_option(tmp_path: Path) -> None:
         devices.clock.sleep(0.05)
         assert time.monotonic() - start >= 0.05
         assert abs(devices.sources["9.5"].read().host_time - time.monotonic()) < 60
-    del tmp_path
 
 
 def test_tasks_take_turns_in_the_order_of_their_times() -> None:

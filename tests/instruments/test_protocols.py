@@ -302,3 +302,26 @@ def test_blackbody_takes_its_time() -> None:
     )
     assert clock() == 12.0  # from 9 s on four readings differ by less than 0.1 K
     assert found == pytest.approx(300 - 10 * np.exp(-np.arange(9, 13) / 2).mean(), abs=1e-9)
+
+
+def test_a_short_recording_is_named(tmp_path: Path) -> None:
+    """A recording that is short in a band, or was cut, is named with good and promised frames."""
+    session = from_yaml(replaced(("duration: 0.15", "duration: 0.5"), text=scene_text()))
+    for name, frames in (("whole", None), ("short", 29)):
+        with rig(session) as devices:
+            devices.prepare()
+            camera = devices.sources["9.5"]
+            if frames is not None:
+                faults = Faults(corrupt=frozenset(range(frames, 10_000)))
+                world = devices.world
+                assert world is not None
+                camera = FaultyCamera(
+                    world, "9.5", pictures(world), None, SHAPE, 100.0, 2, faults=faults
+                )
+            sources = {**devices.sources, "9.5": camera}
+            path = tmp_path / name / f"{name}.zarr"
+            protocols.record_scene(replace(devices, sources=sources), path, limits=QUICK)
+    recording.require_whole(tmp_path / "whole")
+    told = r"short': 'short', band '9\.5': \d+ good frames of 50 promised\. Must have 95%"
+    with pytest.raises(ValueError, match=told):
+        recording.require_whole(tmp_path / "short")

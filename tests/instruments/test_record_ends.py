@@ -45,7 +45,7 @@ class HastyClock(EmulatedClock):
     """Emulated time in which no camera waits for the disk."""
 
     def has_room(self, room: threading.Semaphore) -> bool:
-        """Take a place in a buffer; False if there is none."""
+        """Take a place in a buffer; False if it is full."""
         return room.acquire(blocking=False)
 
 
@@ -91,7 +91,7 @@ def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
 
     def draw(_: Preview) -> None:
         while not (chunks := written(path) // CHUNK) and clock() < 0.9:
-            clock.sleep(0.01)
+            clock.sleep(0.1)
         seen.append(chunks)
 
     sources = bench()
