@@ -4,12 +4,8 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from faulty_apt import FaultyApt
-from faulty_boson import Fault, FaultyBoson
-from faulty_tc08 import FaultyTC08
+from faulty_devices import Fault, FaultyApt, FaultyBoson, FaultyTC08
 
-from dbthermal.instruments import _apt as apt
-from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.line import Line
@@ -59,10 +55,10 @@ class BosonBench:
         """Set faults of the next requests."""
         self.device.faults.once = deque(faults)
 
-    def exchange(self, request: bytes) -> list[fslp.Frame]:
-        """Send bytes without the driver, and decode the answer."""
+    def exchange(self, request: bytes) -> bytes:
+        """Send bytes without the driver, and return the answer."""
         self.loop.write(request)
-        return fslp.Decoder().feed(self.loop.read(4096, 0.1))
+        return self.loop.read(4096, 0.1)
 
 
 class WheelBench:
@@ -84,12 +80,7 @@ class WheelBench:
 
     def move(self, position: int) -> None:
         """Move the motor without the driver."""
-        data = apt.Position(1, position).pack()
-        self.device.receive(apt.command(apt.Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
-
-    def sent(self, identifier: apt.Id) -> list[apt.Message]:
-        """Messages of one identifier that the driver has sent."""
-        return [message for message in self.device.received if message.id == identifier]
+        self.device.turn_to(position)
 
 
 class LoggerBench:

@@ -170,9 +170,7 @@ def test_scene_begins_when_it_is_told() -> None:
     world.add_camera("wide", 1)
     world.thermocouples[1] = "plate"
     clock.sleep(5.0)
-    source = FaultyCamera(
-        world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE
-    )
+    source = FaultyCamera(world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE)
     assert [shown(frame) for frame in frames(source, 3)] == [1000] * 3
     assert (world.scene_time(), world.thermocouple_temperature(1)) == (0.0, 300.0)
     world.begin()

@@ -1,12 +1,17 @@
-"""The filter wheel: its places, its settings, and the emulated wheel in memory and on a line."""
+"""The filter wheel's driver: on the emulated wheel, byte for byte, and with faults of either."""
 
+import logging
+import struct
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from device_benches import FILTERS, WheelBench
+from dialogue import Dialogue, Pair
+from faulty_devices import MESSAGES
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._controller import BSC10X, BSC20X
 from dbthermal.instruments.emulated.apt import EmulatedApt
 from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
@@ -15,38 +20,60 @@ from dbthermal.instruments.filterwheel import (
     NoReplyError,
     NotHomedError,
     Settings,
+    StalledWheelError,
     WheelError,
+    WheelTimeoutError,
     WrongDeviceError,
 )
+from dbthermal.instruments.transport import Closing, TransportError
+
+SIXTHS = {
+    "BSC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
+    "SCC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
+    "BSC101": [0, 4267, 8533, 12_800, 17_067, 21_333],
+}
+"""Places of the slots [count], rounded each by itself."""
+
+# Speeds of 1 turn/s and 1 turn/s^2 in the numbers that thorlabs_apt_device has.
+TURNS = {"BSC201": (4506, 21_987_328), "SCC201": (4506, 21_987_328), "BSC101": (25_600, 25_600)}
 
 
-def test_places_are_sixths_of_a_turn() -> None:
-    """Slots are at sixths of a turn, rounded one by one, for both families of controllers."""
-    places = [BSC20X.target(position) for position in range(1, 7)]
-    assert places == [0, 68_267, 136_533, 204_800, 273_067, 341_333]
-    assert [BSC10X.target(k) for k in range(1, 7)] == [0, 4267, 8533, 12_800, 17_067, 21_333]
-    assert [BSC20X.position(place, 0.001) for place in places] == [1, 2, 3, 4, 5, 6]
-    assert BSC20X.position(409_600 + 68_267, 0.001) == 2
-    assert BSC20X.position(-68_267, 0.001) == 6
-    assert BSC20X.position(1000, 0.5) is None
-
-
-def test_speeds_are_those_of_others() -> None:
-    """1 turn/s and 1 turn/s^2 are the numbers that thorlabs_apt_device has."""
-    assert BSC20X.device_speeds(1.0, 1.0) == (21_987_328, 4506)
-    assert BSC10X.device_speeds(1.0, 1.0) == (25_600, 25_600)
-
-
-@pytest.mark.parametrize("model", ["BSC201", "SCC201", "BSC101"])
+@pytest.mark.parametrize("model", SIXTHS)
 def test_every_slot_turns_into_the_beam(model: str) -> None:
     """Rack or not, and whatever it calls itself: home, then every slot is where it should be."""
     bench = WheelBench(model)
     wheel = bench.homed()
-    for position in (6, 1, 2, 5, 3, 4):
+    slots = (6, 1, 2, 5, 3, 4)
+    for position in slots:
         wheel.move_to(position)
         assert (wheel.position(), bench.world.wheel_position) == (position, position)
     assert wheel.is_simulated
     assert wheel.identity()["model"] == model
+    assert wheel.identity()["addresses"] == ("0x50, 0x50" if model == "BSC101" else "0x11, 0x21")
+    moves = [struct.unpack("<Hi", data)[1] for data in bench.device.sent("MOT_MOVE_ABSOLUTE")]
+    assert moves == [SIXTHS[model][slot - 1] for slot in slots]
+    speeds = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
+    assert speeds == (1, 0, *TURNS[model])
+
+
+def test_no_other_messages() -> None:
+    """The driver sends these messages and no others, and enables the motor before it moves."""
+    bench = WheelBench()
+    bench.homed().move_to(3)
+    order = [message.id for message in bench.device.received]
+    assert {*order} <= MESSAGES
+    assert order.index(0x0210) < order.index(0x0443)  # the motor is enabled, then homed
+    assert order.index(0x0440) < order.index(0x0443)
+
+
+@pytest.mark.parametrize("turns", [-1, 1])
+def test_slots_of_any_turn(turns: int) -> None:
+    """A wheel that was turned on, by a whole turn and a sixth, has the next slot in the beam."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.move(turns * (409_600 + 68_267))
+    bench.clock.sleep(30.0)
+    assert wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
 
 
 def test_filters_are_called_by_their_band() -> None:
@@ -57,73 +84,25 @@ def test_filters_are_called_by_their_band() -> None:
     assert (wheel.band(), bench.world.filter_name) == ("9.5", "9.5")
     with pytest.raises(ValueError, match=r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]"):
         wheel.select("MW")
+    with pytest.raises(ValueError, match="Invalid filter position 0"):
+        wheel.move_to(0)
     wheel.move_to(2)
     with pytest.raises(WheelError, match="No filter in slot 2"):
         wheel.band()
+    wheel.move_to(5)
+    with FilterWheel(Line(bench.device, bench.clock), FILTERS) as later:
+        later.connect()  # a new program need not home the wheel again
+        assert later.band() == "LW"
 
 
-def test_no_other_messages() -> None:
-    """The driver sends these messages and no others, and enables the motor before it moves."""
-    bench = WheelBench()
-    bench.homed().move_to(3)
-    assert {message.id for message in bench.device.received} <= {*apt.Id}
-    order = [message.id for message in bench.device.received]
-    for before in (apt.Id.MOD_SET_CHANENABLESTATE, apt.Id.MOT_SET_HOMEPARAMS):
-        assert order.index(before) < order.index(apt.Id.MOT_MOVE_HOME)
-
-
-def test_the_beam_is_empty_while_the_wheel_turns() -> None:
-    """Until it has arrived, no filter is in the beam of the world."""
-    bench = WheelBench()
-    bench.homed()
-    bench.move(68_267)
-    assert bench.world.wheel_position is None
-    with pytest.raises(WheelError, match="still moving"):
-        bench.wheel.position()
-
-
-def test_offset_from_the_home_switch() -> None:
-    """An offset of slot 1 from the home switch is a setting; a wrong one is not detected."""
-    right, wrong = WheelBench(slot_offset=12.5, home_offset=12.5), WheelBench(slot_offset=12.5)
-    right.homed().move_to(2)
-    wrong.homed().move_to(2)
-    assert right.world.wheel_position == right.wheel.position() == 2
-    assert (wrong.world.wheel_position, wrong.wheel.position()) == (None, 2)
-
-
-def test_home_direction_is_a_setting() -> None:
-    """Home settings that are stated are sent, and the others stay as in the controller."""
-    bench = WheelBench(home_direction=1, home_limit_switch=4)
-    bench.homed().move_to(2)
-    parameters = apt.HomeParameters.parse(bench.sent(apt.Id.MOT_SET_HOMEPARAMS)[-1])
-    assert (parameters.direction, parameters.limit_switch, parameters.offset) == (1, 4, 0)
-    assert bench.world.wheel_position == 2
-
-
-def test_a_wheel_must_be_homed() -> None:
-    """Before it was homed, the driver does not turn the wheel."""
-    bench = WheelBench()
-    bench.wheel.connect()
-    for attempt in (bench.wheel.position, lambda: bench.wheel.move_to(1)):
-        with pytest.raises(NotHomedError, match="Must be homed"):
-            attempt()
-
-
-def test_a_controller_that_was_homed_before_is_taken_over() -> None:
-    """A new program need not home the wheel again if the controller kept its power."""
-    bench = WheelBench()
-    bench.homed().move_to(5)
-    loop = Line(bench.device, bench.clock)
-    with FilterWheel(loop, FILTERS) as wheel:
-        wheel.connect()
-        assert wheel.band() == "LW"
-
-
-def test_stop() -> None:
-    """A wheel stopped between two slots has no position, and can be moved again."""
+def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
+    """It has no position and no filter in the beam, and is moved again once it was stopped."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.move(200_000)
+    assert bench.world.wheel_position is None
+    with pytest.raises(WheelError, match="still moving"):
+        wheel.position()
     bench.clock.sleep(0.5)
     wheel.stop()
     with pytest.raises(WheelError, match=r"between two slots, at .* deg"):
@@ -132,24 +111,17 @@ def test_stop() -> None:
     assert wheel.position() == 2
 
 
-@pytest.mark.parametrize("model", ["BSC201", "BSC101"])
-def test_addresses_are_looked_for(model: str) -> None:
-    """A rack ignores what is sent to a unit, a unit what is sent to a rack: both are tried."""
-    bench = WheelBench(model)
-    bench.wheel.connect()
-    expected = "0x11, 0x21" if model == "BSC201" else "0x50, 0x50"
-    assert bench.wheel.identity()["addresses"] == expected
-    bench.device.faults.silent = True
-    with pytest.raises(NoReplyError, match=r"No APT controller answered at 0x11, 0x50. It must be"):
-        bench.wheel.connect()
-
-
-def test_wrong_devices() -> None:
-    """Another model or serial number raises an error that names it."""
-    with pytest.raises(WrongDeviceError, match="Wrong device 'KDC101', number 40000000"):
-        WheelBench("KDC101").wheel.connect()
-    with pytest.raises(WrongDeviceError, match=r"Wrong controller 40000000. Must be 7"):
-        WheelBench(serial_number=7).wheel.connect()
+def test_home_is_as_the_settings_say() -> None:
+    """Direction and switch are sent; an offset of slot 1 is undone, and not detected if wrong."""
+    bench = WheelBench(home_direction=1, home_limit_switch=4)
+    bench.homed().move_to(2)
+    assert struct.unpack("<HHHii", bench.device.sent("MOT_SET_HOMEPARAMS")[-1])[1:3] == (1, 4)
+    assert bench.world.wheel_position == 2
+    right, wrong = WheelBench(slot_offset=12.5, home_offset=12.5), WheelBench(slot_offset=12.5)
+    right.homed().move_to(2)
+    wrong.homed().move_to(2)
+    assert right.world.wheel_position == right.wheel.position() == 2
+    assert (wrong.world.wheel_position, wrong.wheel.position()) == (None, 2)
 
 
 @pytest.mark.parametrize(
@@ -162,36 +134,357 @@ def test_wrong_devices() -> None:
         ({"home_direction": 3}, r"home_direction\n.* 1 or 2 .*input_value=3"),
     ],
 )
-def test_settings_are_checked(options: dict[str, object], error: str) -> None:
-    """Invalid settings and slots raise a ValueError before the wheel moves."""
+def test_settings_are_checked(options: dict[str, Any], error: str) -> None:
+    """Invalid settings raise a ValueError before the wheel moves."""
     with pytest.raises(ValueError, match=error):
-        Settings(**options)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="Invalid filter position 0"):
-        WheelBench().homed().move_to(0)
+        Settings(**options)
 
 
 def test_by_name_of_an_emulator() -> None:
-    """A wheel in a world is opened by its name, and turns what the world's camera sees."""
+    """A wheel of a world is opened by its name, not homed, and asked from several threads."""
     world = World(filters=FILTERS, wheel_position=3)
     with FilterWheel.from_url("sim://apt/wheel", FILTERS, world=world) as wheel:
-        assert wheel.is_simulated
-        with pytest.raises(NotHomedError):
-            wheel.select("LW")
+        for attempt in (wheel.position, lambda: wheel.move_to(1), lambda: wheel.select("LW")):
+            with pytest.raises(NotHomedError, match="Must be homed"):
+                attempt()
+        with ThreadPoolExecutor(max_workers=4) as pool:
+            asked = [pool.submit(wheel.status) for _ in range(200)]
+            assert len({status.result().position for status in asked}) == 1
     with pytest.raises(ValueError, match="Invalid model 'X'"):
         EmulatedApt(world, model="X")
 
 
-def test_the_largest_number_of_a_controller() -> None:
-    """The largest serial number has room in the emulator's answer."""
-    device = EmulatedApt(World(), serial_number=2**32 - 1)
-    assert len(device.info.pack()) == 84
+SPEEDS = "01 00 00 00 00 00 9a 11 00 00 00 80 4f 01"
+HOMES = "01 00 02 00 01 00 00 00 00 00 00 00 00 00", "01 00 02 00 01 00 9a 19 43 00 00 00 00 00"
+GREETING = "18 00 00 00 {0} 01 12 00 00 00 {0} 01 05 00 00 00 {0} 01"
+INFO = "06 00 54 00 81 11 00 5a 62 02 42 53 43 32 30 31 00 00 2d 00 00 00 01 00"
+# Between a driver and a BSC201 until it is connected: what is written, and the answer.
+CONNECTION = [
+    (GREETING.format(11), f"{INFO} {'00' * 60} 01 00 00 00 01 00"),
+    (f"13 04 0e 00 a1 01 {SPEEDS} 14 04 01 00 21 01", f"15 04 0e 00 81 21 {SPEEDS}"),
+    ("41 04 01 00 21 01", f"42 04 0e 00 81 21 {HOMES[0]}"),
+    (f"40 04 0e 00 a1 01 {HOMES[1]} 41 04 01 00 21 01", f"42 04 0e 00 81 21 {HOMES[1]}"),
+    ("10 02 01 01 21 01 11 02 01 00 21 01", "12 02 01 01 01 21"),
+]
+PAIRS: list[Pair] = [(bytes.fromhex(sent), bytes.fromhex(answer)) for sent, answer in CONNECTION]
+ASK = bytes.fromhex("80 04 01 00 21 01")
 
 
-def test_several_threads_may_ask() -> None:
-    """A recorder that reads the status in its own thread takes no other thread's reply."""
-    with (
-        FilterWheel.from_url("sim://apt", FILTERS) as wheel,
-        ThreadPoolExecutor(max_workers=4) as pool,
-    ):
-        asked = [pool.submit(wheel.status) for _ in range(200)]
-        assert len({status.result().position for status in asked}) == 1
+def status(position: int, bits: int) -> bytes:
+    """Bytes of a status."""
+    data = struct.pack("<HiiI", 1, position, 0, bits)
+    return bytes.fromhex("81 04 0e 00 81 21") + data
+
+
+def test_dialogue_of_a_move() -> None:
+    """Every byte of a connection and a move, with the report of the end between two answers."""
+    move = bytes.fromhex("53 04 06 00 A1 01 01 00 AB 0A 01 00")
+    end = bytes.fromhex("64 04 01 00 01 21")
+    talk: list[Pair] = [
+        (ASK, status(0, 0x80000500)),
+        (move + ASK, status(30_000, 0x80000510)),
+        (ASK, [end[:2], end[2:] + status(68_267, 0x80000510)]),
+        (ASK, status(68_267, 0x80000500)),
+    ]
+    with Dialogue([*PAIRS, *talk]) as dialogue:
+        wheel = FilterWheel(dialogue, FILTERS)
+        assert wheel.connect().model == "BSC201"
+        wheel.move_to(2)
+
+
+def test_answers_of_others() -> None:
+    """Stale answers and those of other bays or channels are ignored."""
+    answer, old = status(3, 0), status(1, 0)
+    other_bay = status(2, 0)[:5] + b"\x22" + status(2, 0)[6:]
+    other_channel = answer[:6] + b"\x02" + answer[7:10] + b"\x01" + answer[11:]
+    enabled: Pair = (PAIRS[-1][0], [bytes.fromhex("12 02 01 01 01 21"), old])
+    talk: Pair = (ASK, [other_bay + other_channel, answer])
+    with Dialogue([*PAIRS[:-1], enabled, talk]) as dialogue:
+        wheel = FilterWheel(dialogue, FILTERS)
+        wheel.connect()
+        assert wheel.status().position == 3
+
+
+BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
+
+
+@pytest.mark.parametrize(
+    ("pairs", "error", "message"),
+    [
+        (
+            [
+                (bytes.fromhex(GREETING.format(11)), BANNER),
+                (bytes.fromhex(GREETING.format(50)), None),
+            ],
+            *(WrongDeviceError, "33 bytes came that are no APT messages"),
+        ),
+        *(
+            (
+                [*PAIRS[:-1], (PAIRS[-1][0], bytes.fromhex(f"12 02 01 {state} 01 21"))],
+                *(WheelError, r"Unknown state . of the motor"),
+            )
+            for state in ("00", "03")
+        ),
+    ],
+)
+def test_answers_that_are_none(pairs: list[Pair], error: type[WheelError], message: str) -> None:
+    """Text, and a motor that is neither enabled nor not, raise an error on connecting."""
+    with Dialogue(pairs) as dialogue, pytest.raises(error, match=message):
+        FilterWheel(dialogue, FILTERS).connect()
+
+
+class Babbler(Dialogue):
+    """A device that sends bytes whatever it is asked."""
+
+    def write(self, data: bytes) -> None:
+        """Take anything."""
+
+
+@settings(max_examples=60)
+@given(st.lists(st.binary(max_size=40), max_size=6))
+def test_arbitrary_answers(answers: list[bytes]) -> None:
+    """Connecting ends with a documented error for arbitrary answers."""
+    babbler = Babbler([(None, answers)] if answers else [])
+    with pytest.raises(WheelError):
+        FilterWheel(babbler, FILTERS).connect()
+
+
+def test_a_device_that_never_ends_is_another_one() -> None:
+    """An endless stream of bytes ends the wait with an error."""
+    line = Babbler([(None, [bytes(256)] * 513)])
+    with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
+        FilterWheel(line, {}).connect()
+
+
+Case = tuple[dict[str, Any], type[WheelError], str]
+REFUSED: list[Case] = [
+    ({"deaf_to": "MOT_SET_VELPARAMS"}, WheelError, "velocity 0. Must be 21987328"),
+    ({"deaf_to": "MOT_SET_HOMEPARAMS"}, WheelError, "home velocity 0. Must be 4397466"),
+    ({"deaf_to": "MOD_SET_CHANENABLESTATE"}, WheelError, "did not enable the motor"),
+    ({"weak": 0.98}, WheelError, r"The controller has velocity \d+\. Must be 21987328"),
+    ({"silent": True}, NoReplyError, "No APT controller answered at 0x11, 0x50. It must be"),
+    ({"model": "KDC101"}, WrongDeviceError, "Wrong device 'KDC101', number 40000000"),
+    ({"serial_number": 7}, WrongDeviceError, "Wrong controller 40000000. Must be 7"),
+]
+
+
+@pytest.mark.parametrize(("case", "error", "message"), REFUSED)
+def test_controllers_that_are_refused(
+    case: dict[str, Any], error: type[WheelError], message: str
+) -> None:
+    """A controller that would not turn the wheel as it should raises an error on connecting."""
+    bench = WheelBench(**{name: case[name] for name in {"model", "serial_number"} & {*case}})
+    vars(bench.device.faults).update(case)
+    with pytest.raises(error, match=message):
+        bench.wheel.connect()
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"single_bytes": True},
+        {"hold": True},
+        {"noise": b"\xff\x12\x04"},
+        {"stray_completed": True, "late": 0.4},
+        {"unreported": True},
+        {"long_reports": True},
+        {"late": 0.3},
+        {"drop": 1},
+        {"stuck": "JOGGING_FORWARD|JOGGING_REVERSE"},
+        {"slow": 1.5},
+    ],
+    ids=lambda faults: next(iter(faults)),
+)
+def test_harmless_faults(faults: dict[str, object]) -> None:
+    """Split, merged, late, missing, unasked and noisy answers: the wheel is where it should be."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    vars(bench.device.faults).update(faults)
+    for position in (3, 6, 2):
+        wheel.move_to(position)
+        assert bench.world.wheel_position == position == wheel.position()
+
+
+# Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
+STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
+    (
+        {"stands_after": 20.0},
+        StalledWheelError,
+        r"120.00 deg: .* at 20.00 deg for 2.0 s",
+        True,
+        True,
+    ),
+    # It still moves, however near to its target it is seen twice.
+    (
+        *({"stands_after": 119.95, "unreported": True}, StalledWheelError),
+        *("stood at 119.95 deg for 2.0 s", True, True),
+    ),
+    ({"stops_short": 1.5}, StalledWheelError, "stopped at 118.50 deg. Must arrive", False, True),
+    ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
+    ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
+    ({"slow": 30.0}, WheelTimeoutError, "deg after 20.0 s, and was stopped", True, False),
+    ({"silent": True}, NoReplyError, "must be on and in no other program's use", False, False),
+    ({"notice": "motor hot"}, WheelError, "error 1 of message 0x0480: motor hot", False, False),
+]
+
+
+@pytest.mark.parametrize(("faults", "error", "message", "stopped", "lost"), STALLS)
+def test_moves_that_fail(
+    faults: dict[str, Any], error: type[WheelError], message: str, stopped: bool, lost: bool
+) -> None:
+    """A move that fails is an error in bounded time; where steps may be lost, home comes first."""
+    bench = WheelBench()
+    wheel, healthy = bench.homed(), dict(vars(bench.device.faults))
+    vars(bench.device.faults).update(faults)
+    before = bench.clock.now
+    with pytest.raises(error, match=message):
+        wheel.move_to(3)
+    assert bench.clock.now - before < 30.0
+    assert bool(bench.device.sent("MOT_MOVE_STOP")) == stopped
+    vars(bench.device.faults).update(healthy)
+    if lost:
+        with pytest.raises(NotHomedError, match="lost steps"):
+            wheel.move_to(1)
+        wheel.home()
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+
+
+@pytest.mark.parametrize(
+    ("faults", "error", "message"),
+    [
+        ({"deaf_to": "MOT_MOVE_HOME"}, StalledWheelError, "Search for home: .* did not start"),
+        ({"slow": 30.0}, WheelTimeoutError, "Search for home: .* after 60.0 s"),
+    ],
+)
+def test_searches_for_home_that_fail(
+    faults: dict[str, Any], error: type[WheelError], message: str
+) -> None:
+    """Neither the state nor the report of an earlier search counts, and the position is lost."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    wheel.move_to(4)
+    bench.device.receive(bytes.fromhex("43 04 01 00 21 01"))  # a search that no driver follows
+    bench.clock.sleep(10.0)
+    wheel.status()
+    wheel.move_to(4)
+    vars(bench.device.faults).update(faults)
+    with pytest.raises(error, match=message):
+        wheel.home()
+    bench.device.faults.deaf_to = ""
+    wheel.stop()
+    with pytest.raises(NotHomedError, match="Must be homed"):
+        wheel.position()
+
+
+def test_moving_bits_that_stick() -> None:
+    """With stuck motion bits a move ends by its report, and the next move raises an error."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    stick = {"stuck": "MOVING_FORWARD"}
+    bench.clock.events.append(
+        (bench.clock.now + 0.3, lambda: vars(bench.device.faults).update(stick))
+    )
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+    with pytest.raises(WheelError, match="still moving"):
+        wheel.move_to(4)
+
+
+def test_lost_steps_are_seen_by_nobody() -> None:
+    """Without an encoder lost steps are not detected; homing restores the position."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.slips = 5.0
+    wheel.move_to(3)
+    assert (wheel.position(), bench.world.wheel_position) == (3, None)
+    bench.device.faults.slips = 0.0
+    wheel.home()
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+
+
+def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
+    """A controller need not know its greeting; what it says is logged. Later errors stop homing."""
+    bench = WheelBench()
+    bench.device.faults.notice = "unknown message"
+    with caplog.at_level(logging.WARNING):
+        bench.homed()
+    assert "unknown message" in caplog.text
+    bench.device.faults.notice = "motor cold"
+    with pytest.raises(WheelError, match="motor cold"):
+        bench.wheel.home()
+
+
+def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answers later than the limit may be those of an older question: never a wrong slot."""
+    bench, patient = WheelBench(), WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.late = patient.device.faults.late = 1.2
+    wheel.move_to(3)
+    assert bench.world.wheel_position == wheel.position() == 3
+    with pytest.raises(StalledWheelError, match="did not start"):
+        wheel.move_to(6)
+    monkeypatch.setattr("dbthermal.instruments._controller.REPLY_TIMEOUT", 1.5)
+    patient.homed().move_to(6)
+    assert patient.world.wheel_position == 6
+
+
+@settings(max_examples=60)
+@given(st.binary(max_size=12), st.integers(0, 3))
+def test_noise_on_the_line(noise: bytes, drop: int) -> None:
+    """With any bytes before every answer, and some missing: the right slot, or a known error."""
+    bench = WheelBench()
+    bench.device.faults.noise = noise
+    bench.device.faults.drop = drop
+    try:
+        bench.homed().move_to(2)
+    except WheelError:
+        assert bench.clock.now < 200.0
+    else:
+        assert bench.world.wheel_position == 2
+
+
+class Unplugged(Closing):
+    """A line that is gone after a number of reads and writes."""
+
+    is_simulated = True
+
+    def __init__(self, line: Line, steps: int) -> None:
+        self.line, self.steps, self.clock = line, steps, line.clock
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        self._step()
+        self.line.write(data)
+
+    def read(self, size: int, timeout: float) -> bytes:
+        """Receive."""
+        self._step()
+        return self.line.read(size, timeout)
+
+    def close(self) -> None:
+        """End."""
+        self.line.close()
+
+    def _step(self) -> None:
+        self.steps -= 1
+        if self.steps < 0:
+            raise TransportError("unplugged")
+
+
+@pytest.mark.parametrize("steps", [*range(0, 90, 3)])
+def test_unplugging_at_any_step(steps: int) -> None:
+    """Unplugging at any step raises the documented error, and closing still works, twice."""
+    bench = WheelBench()
+    wheel = FilterWheel(Unplugged(Line(bench.device, bench.clock), steps), FILTERS)
+
+    def use() -> None:
+        wheel.connect()
+        wheel.home()
+        wheel.select("9.5")
+
+    with pytest.raises(TransportError, match="unplugged"):
+        use()
+    for _ in range(2):
+        wheel.close()
