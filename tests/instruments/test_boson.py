@@ -1,19 +1,21 @@
-"""The Boson's driver: byte dialogues, and its errors for invalid replies."""
+"""The Boson's driver: byte for byte, with faults of camera and line, and for several threads."""
 
+import struct
+import threading
+import time
 from contextlib import suppress
 from typing import Any
 
 import pytest
-from device_benches import Clock
-from dialogue import Dialogue
-from faulty_boson import DEBUG_CHANNEL
+from device_benches import BosonBench
+from dialogue import Dialogue, Pair
+from faulty_devices import Fault, reply, request, text
 from hypothesis import given
 from hypothesis import strategies as st
-from test_fslp import ESCAPED_REPLY, SERIAL_REPLY, SERIAL_REQUEST
 
-from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments import boson
 from dbthermal.instruments.boson import (
-    MAXIMUM_RECEIVED,
+    REPLY_TIMEOUT,
     Boson,
     BosonError,
     BosonReplyError,
@@ -21,146 +23,397 @@ from dbthermal.instruments.boson import (
     BosonTimeoutError,
     commands,
 )
-from dbthermal.instruments.boson.commands import Setting
-from dbthermal.instruments.camera import GainMode
+from dbthermal.instruments.boson.commands import Reading, Setting
+from dbthermal.instruments.camera import FfcStatus, GainMode
+from dbthermal.instruments.clock import SYSTEM
+from dbthermal.instruments.emulated.world import FFC_DURATION
+from dbthermal.instruments.transport import Closing, TransportError
 
-SERIAL, FPA, SET_GAIN = 0x00050002, 0x00050030, 0x00050014
+# Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
+# the values from 0; the states of a correction; the error numbers.
+READINGS = {
+    "SERIAL_NUMBER": (0x00050002, ">I"),
+    "PART_NUMBER": (0x00050004, ">20s"),
+    "SENSOR_SERIAL_NUMBER": (0x00050006, ">I"),
+    "SOFTWARE_REVISION": (0x00050022, ">III"),
+    "FPA_TEMPERATURE": (0x00050030, ">h"),
+    "FFC_IN_PROGRESS": (0x0005000C, ">h"),
+    "FFC_STATUS": (0x00050054, ">i"),
+    "LAST_FFC_FRAME": (0x0005005D, ">I"),
+}
+SETTINGS = {
+    "FFC_MODE": (0x00050012, ["MANUAL", "AUTO", "EXTERNAL", "SHUTTER_TEST"]),
+    "GAIN_MODE": (0x00050014, ["HIGH", "LOW", "AUTO", "DUAL", "MANUAL"]),
+    "TELEMETRY": (0x00040001, ["OFF", "ON"]),
+    "TELEMETRY_LOCATION": (0x00040003, ["TOP", "BOTTOM"]),
+    "IR16_MODE": (0x000E000D, ["COUNTS_16", "COUNTS_14", "TLINEAR"]),
+}
+STATES = ["NONE_PERFORMED", "IMMINENT", "IN_PROGRESS", "COMPLETE"]
+STATUSES = [
+    *(0x161, 0x162, 0x17D, 0x17E, 0x17F, 0x180, 0x181, 0x1B0, 0x201, 0x202, 0x203, 0x204),
+    *(0x205, 0x206, 0x207, 0x208, 0x20B, 0x26D, 0x26E, 0x26F, 0x281, 0x283),
+    *range(0x6A4, 0x6AE),
+]
+SERIAL, PART, FPA, SET_GAIN, STATUS = 0x50002, 0x50004, 0x50030, 0x50014, 0x50054
+# Quoted in thurberdog/ghostCommand: serial number 93588.
+SERIAL_REQUEST = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 FF FF FF FF 01 0B AE")
+SERIAL_REPLY = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 00 00 00 00 00 01 6D 94 30 10 AE")
+# 43.1 °C, with an escaped checksum: LJMUAstroecology/flirpy, issue 21.
+ESCAPED_REPLY = bytes.fromhex("8E 00 00 00 00 00 00 05 00 30 00 00 00 00 01 AF 9E 91 99 AE")
 
 
-def reply(sequence: int, command: int, data: bytes = b"", status: int = 0) -> bytes:
-    """Bytes of a reply."""
-    return fslp.encode(sequence, command, data, status)
+@pytest.fixture
+def bench() -> BosonBench:
+    """An emulated camera in memory, on a clock of its own."""
+    return BosonBench()
 
 
-def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
+def camera_of(line: Closing, first_sequence: int = 1) -> Boson:
     """Driver that takes part in a dialogue."""
-    clock = Clock()
-    return Boson(line, first_sequence=first_sequence)
+    return Boson(line, first_sequence=first_sequence)  # type: ignore[arg-type]
 
 
-def test_the_public_serial_number_is_read() -> None:
-    """The public request is sent, and the public reply is serial number 93588."""
-    with Dialogue([(SERIAL_REQUEST, SERIAL_REPLY)]) as line:
-        assert camera_of(line).serial_number() == 93588
-
-
-def test_the_public_escaped_temperature_is_read() -> None:
-    """The public reply whose checksum is escaped is 43.1 °C, in any pieces."""
-    pieces = [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]]
-    with Dialogue([(fslp.encode(0, FPA), pieces)]) as line:
-        kelvin = camera_of(line, first_sequence=0).fpa_temperature()
-    assert kelvin == pytest.approx(43.1 + 273.15, abs=1e-9)
-
-
-def test_a_temperature_below_zero_celsius_has_a_sign() -> None:
-    """FF85 is -12.3 °C, which other software reads as 6541.3 °C."""
-    with Dialogue([(fslp.encode(1, FPA), reply(1, FPA, b"\xff\x85"))]) as line:
-        assert camera_of(line).fpa_temperature() == pytest.approx(260.85, abs=1e-9)
-
-
-def test_a_late_reply_is_not_taken_for_the_next() -> None:
-    """A late reply is discarded, and the request is sent again."""
-    both = reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")
-    with Dialogue([(fslp.encode(1, FPA), None), (fslp.encode(2, FPA), both)]) as line:
-        camera = camera_of(line)
-        assert camera.fpa_temperature() == pytest.approx(311.15, abs=1e-9)
-
-
-def test_frames_of_other_channels_and_echoes_are_discarded() -> None:
-    """Frames of the debug channel and echoes of the request are discarded."""
-    text = fslp.encode(1, SERIAL, b"text", 0, channel=DEBUG_CHANNEL)
-    with Dialogue([(SERIAL_REQUEST, text + SERIAL_REQUEST + SERIAL_REPLY)]) as line:
-        camera = camera_of(line)
-        assert camera.serial_number() == 93588
-
-
-def test_a_damaged_reply_is_asked_for_again() -> None:
-    """A reply with a wrong checksum is dropped, and requested again."""
-    spoilt = SERIAL_REPLY[:-2] + b"\x11\xae"
-    again = (fslp.encode(2, SERIAL), reply(2, SERIAL, b"\x00\x00\x00\x07"))
-    with Dialogue([(SERIAL_REQUEST, spoilt), again]) as line:
-        camera = camera_of(line)
-        assert camera.serial_number() == 7
-
-
-def test_a_mute_camera_is_asked_three_times() -> None:
-    """A reading is requested three times, and then raises a timeout error."""
-    line = Dialogue([(fslp.encode(n, SERIAL), None) for n in (1, 2, 3)])
-    with line, pytest.raises(BosonTimeoutError, match="No reply to 'serial number' within 1 s"):
-        camera_of(line).serial_number()
-
-
-def test_a_change_is_sent_once() -> None:
-    """A command that changes the camera is never sent twice."""
-    line = Dialogue([(fslp.encode(1, SET_GAIN, b"\x00\x00\x00\x01"), None)])
-    with line, pytest.raises(BosonTimeoutError, match="No reply to 'set gain mode'"):
-        camera_of(line).set(commands.GAIN_MODE, GainMode.LOW)
-
-
-@pytest.mark.parametrize(
-    ("status", "text"),
-    [(0x203, "value out of range"), (0x283, "camera busy"), (0x6A4, "flash"), (0x999, "unknown")],
-)
-def test_a_refusal_says_why(status: int, text: str) -> None:
-    """A status of failure is in the exception, and its meaning in the message."""
-    line = Dialogue([(SERIAL_REQUEST, reply(1, SERIAL, status=status))])
-    with line, pytest.raises(BosonStatusError, match=f"0x{status:X}, {text}") as refusal:
-        camera_of(line).serial_number()
-    assert refusal.value.status == status
-
-
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        (reply(1, FPA, b"\x01\x7c"), "of command 0x00050030. Must be of command 0x00050002"),
-        (reply(1, SERIAL, b"\x00\x01"), "Invalid serial number of 2 bytes. Must have 4"),
-        (reply(1, SERIAL, bytes(5)), "Invalid serial number of 5 bytes. Must have 4"),
-    ],
-)
-def test_a_reply_that_is_none_is_an_error(answer: bytes, message: str) -> None:
-    """A reply to another command, or of the wrong size, raises an error."""
-    line = Dialogue([(SERIAL_REQUEST, answer)])
-    with line, pytest.raises(BosonReplyError, match=message.replace(".", r"\.")):
-        camera_of(line).serial_number()
-
-
-def test_a_value_without_meaning_is_an_error() -> None:
-    """An unknown status and a part number that is not text raise an error."""
-    wrong = reply(1, 0x00050054, b"\x00\x00\x00\x09")
-    line = Dialogue([(fslp.encode(1, 0x00050054), wrong)])
-    with line, pytest.raises(BosonReplyError, match="9 is not a valid FfcStatus"):
-        camera_of(line).ffc_status()
-    wrong = reply(1, 0x00050004, b"\xff" * 20)
-    line = Dialogue([(fslp.encode(1, 0x00050004), wrong)])
-    with line, pytest.raises(BosonReplyError, match="Invalid reply to 'part number'"):
-        camera_of(line).read(commands.PART_NUMBER)
-
-
-def test_an_acknowledgement_with_data_is_an_error() -> None:
-    """A command that changes the camera is answered without data."""
-    line = Dialogue([(fslp.encode(1, SET_GAIN, bytes(4)), reply(1, SET_GAIN, b"\x00"))])
-    with line, pytest.raises(BosonReplyError, match="Invalid reply of 1 bytes to 'set gain mode'"):
-        camera_of(line).set(commands.GAIN_MODE, GainMode.HIGH)
-
-
-def test_a_line_that_never_ends_is_an_error() -> None:
-    """The wait for a reply ends after a maximum number of other bytes."""
-    line = Dialogue([(SERIAL_REQUEST, [bytes(4096)] * (MAXIMUM_RECEIVED // 4096 + 1))])
-    with line, pytest.raises(BosonReplyError, match="within 65536 bytes"):
-        camera_of(line).serial_number()
-
-
-@given(st.lists(st.binary(max_size=60), max_size=6))
-def test_any_answer_is_a_value_or_a_documented_error(answer: list[bytes]) -> None:
-    """Any bytes give a number or a documented error, in bounded time."""
-    camera = camera_of(Dialogue([(SERIAL_REQUEST, answer)]))
-    with suppress(BosonError):
-        assert 0 <= camera.read(commands.SERIAL_NUMBER, repeats=0) < 2**32
+def test_commands_are_the_published_ones() -> None:
+    """Readings, settings, states and errors have their published numbers, none of them twice."""
+    known = vars(commands).items()
+    readings = {name: value for name, value in known if isinstance(value, Reading)}
+    assert {name: (one.command, one.layout) for name, one in readings.items()} == READINGS
+    settings = {name: value for name, value in known if isinstance(value, Setting)}
+    for name, setting in settings.items():
+        members = [*setting.kind]
+        assert (setting.set_command, [member.name for member in members]) == SETTINGS[name]
+        assert [member.value for member in members] == [*range(len(members))]
+        assert (setting.reading.command, setting.reading.layout) == (setting.set_command + 1, ">i")
+    assert {*commands.SETTINGS} == {*settings.values()}
+    assert settings.keys() == SETTINGS.keys()
+    assert commands.RUN_FFC == 0x00050007
+    assert [(state.name, state.value) for state in FfcStatus] == [
+        *zip(STATES, range(4), strict=True)
+    ]
+    assert [*commands.STATUSES] == STATUSES
+    assert len({*commands.STATUSES.values()}) == len(STATUSES) - 9  # ten are of the flash memory
 
 
 @pytest.mark.parametrize("setting", commands.SETTINGS, ids=lambda setting: setting.name)
-def test_what_is_not_allowed_is_not_sent(setting: Setting[Any]) -> None:
-    """A value outside the range of a setting raises an error before a byte is sent."""
-    line = Dialogue([])
-    with line, pytest.raises(ValueError, match=r"Invalid .* -1\. Must be one of"):
-        camera_of(line).set(setting, -1)
+def test_every_setting_is_kept(bench: BosonBench, setting: Setting[Any]) -> None:
+    """Every value of a setting is read back as set; another is refused before a byte is sent."""
+    for value in setting.kind:
+        bench.camera.set(setting, value)
+        assert bench.camera.get(setting) == value
+    choices = f"0 .{setting.kind(0).name}., 1 .{setting.kind(1).name}."
+    with pytest.raises(ValueError, match=rf"Invalid {setting.name} -1\. Must be one of {choices}"):
+        camera_of(Dialogue([])).set(setting, -1)
+
+
+def test_every_reading_has_a_value(bench: BosonBench) -> None:
+    """All readings are answered, at values whose bytes need escapes too."""
+    bench.state.serial_number = 0x8E9EAE81
+    bench.state.fpa_temperature = bench.state.last_ffc_temperature = 0x0C9E / 10
+    readings = [one for one in vars(commands).values() if isinstance(one, Reading)]
+    values = {reading.name: bench.camera.read(reading) for reading in readings}
+    assert values["serial number"] == 0x8E9EAE81
+    assert values["FPA temperature [K]"] == pytest.approx(323.0, abs=0.05)
+    assert values["FFC status"] is FfcStatus.NONE_PERFORMED
+    assert values["part number"] == "EMULATED-BOSON-640"
+
+
+# Dialogues that end in a value: first sequence number, bytes, reading, value.
+TALKS: dict[str, tuple[int, list[Pair], Reading[Any], float]] = {
+    "public serial number": (1, [(SERIAL_REQUEST, SERIAL_REPLY)], commands.SERIAL_NUMBER, 93588),
+    "public temperature, escaped, in pieces": (
+        *(0, [(request(0, FPA), [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]])]),
+        *(commands.FPA_TEMPERATURE, 43.1 + 273.15),
+    ),
+    # Other software reads it as 6541.3 °C.
+    "temperature of -12.3 °C": (
+        *(1, [(request(1, FPA), reply(1, FPA, b"\xff\x85"))], commands.FPA_TEMPERATURE, 260.85),
+    ),
+    "late reply to the request before": (
+        1,
+        [
+            (request(1, FPA), None),
+            (request(2, FPA), reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")),
+        ],
+        *(commands.FPA_TEMPERATURE, 311.15),
+    ),
+    "text on another channel, and an echo": (
+        *(1, [(SERIAL_REQUEST, text(1, SERIAL) + SERIAL_REQUEST + SERIAL_REPLY)]),
+        *(commands.SERIAL_NUMBER, 93588),
+    ),
+    "damaged reply, which is asked for again": (
+        1,
+        [
+            (SERIAL_REQUEST, SERIAL_REPLY[:-2] + b"\x11\xae"),
+            (request(2, SERIAL), reply(2, SERIAL, b"\x00\x00\x00\x07")),
+        ],
+        *(commands.SERIAL_NUMBER, 7),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TALKS)
+def test_dialogues_that_give_a_value(name: str) -> None:
+    """Public bytes are sent and understood, and what is no reply to the request is discarded."""
+    first, pairs, reading, value = TALKS[name]
+    with Dialogue(pairs) as line:
+        assert camera_of(line, first).read(reading) == pytest.approx(value, abs=1e-9)
+
+
+MUTE: list[Pair] = [(request(n, SERIAL), None) for n in (1, 2, 3)]
+ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED // 4096 + 1))]
+
+
+@pytest.mark.parametrize(
+    ("reading", "answer", "error", "message"),
+    [
+        (SERIAL, MUTE, BosonTimeoutError, "No reply to 'serial number' within 1 s"),
+        (SERIAL, ENDLESS, BosonReplyError, "within 65536 bytes"),
+        (SERIAL, reply(1, FPA, b"\x01\x7c"), BosonReplyError, "Must be of command 0x00050002"),
+        (SERIAL, reply(1, SERIAL, b"\0\1"), BosonReplyError, "number of 2 bytes. Must have 4"),
+        (SERIAL, reply(1, SERIAL, bytes(5)), BosonReplyError, "number of 5 bytes. Must have 4"),
+        (SERIAL, reply(1, SERIAL, status=0x203), BosonStatusError, "0x203, value out of range"),
+        (SERIAL, reply(1, SERIAL, status=0x283), BosonStatusError, "0x283, camera busy"),
+        (SERIAL, reply(1, SERIAL, status=0x6A4), BosonStatusError, "0x6A4, flash"),
+        (SERIAL, reply(1, SERIAL, status=0x999), BosonStatusError, "0x999, unknown"),
+        (STATUS, reply(1, STATUS, b"\0\0\0\x09"), BosonReplyError, "9 is not a valid FfcStatus"),
+        (PART, reply(1, PART, b"\xff" * 20), BosonReplyError, "Invalid reply to 'part number'"),
+    ],
+)
+def test_readings_that_fail(
+    reading: int, answer: bytes | list[Pair], error: type[BosonError], message: str
+) -> None:
+    """A mute camera is asked three times; other replies are errors with what is wrong."""
+    (known,) = (r for r in vars(commands).values() if getattr(r, "command", None) == reading)
+    pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
+    with Dialogue(pairs) as line, pytest.raises(error, match=message):
+        camera_of(line).read(known)
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "message"),
+    [
+        (None, BosonTimeoutError, "No reply to 'set gain mode'"),
+        (reply(1, SET_GAIN, b"\0"), BosonReplyError, "reply of 1 bytes to 'set gain mode'"),
+    ],
+)
+def test_a_change_is_sent_once(answer: bytes | None, error: type[BosonError], message: str) -> None:
+    """A command that changes the camera is never sent twice, and answered without data."""
+    line = Dialogue([(request(1, SET_GAIN, b"\x00\x00\x00\x01"), answer)])
+    with line, pytest.raises(error, match=message):
+        camera_of(line).set(commands.GAIN_MODE, GainMode.LOW)
+
+
+blobs = st.lists(st.binary(max_size=60), max_size=6)
+
+
+@given(blobs)
+def test_any_answer_is_a_value_or_a_documented_error(pieces: list[bytes]) -> None:
+    """Any bytes give a number or a documented error; the emulator answers on after any bytes."""
+    camera = camera_of(Dialogue([(SERIAL_REQUEST, pieces)]))
+    with suppress(BosonError):
+        assert 0 <= camera.read(commands.SERIAL_NUMBER, repeats=0) < 2**32
+    bench = BosonBench()
+    for piece in pieces:
+        bench.exchange(piece)
+    assert bench.camera.serial_number() == 93588
+
+
+@pytest.mark.parametrize(
+    ("command", "data", "request_status", "status"),
+    [
+        (0x0000FFFF, b"", 0xFFFFFFFF, 0x161),
+        (SERIAL, b"", 0, 0x162),
+        (SET_GAIN, b"\x00", 0xFFFFFFFF, 0x17D),
+        (SERIAL, b"\x00", 0xFFFFFFFF, 0x17E),
+        (SET_GAIN, b"\x00\x00\x00\x05", 0xFFFFFFFF, 0x203),
+    ],
+)
+def test_the_emulator_refuses_as_a_camera_does(
+    bench: BosonBench, command: int, data: bytes, request_status: int, status: int
+) -> None:
+    """Unknown commands, wrong sizes and wrong values have their status, echo and no data."""
+    for sequence in (1, 0x8E9EAE00, 0x9E9E9E9E):
+        answer = bench.exchange(request(sequence, command, data, status=request_status))
+        assert answer == reply(sequence, command, status=status)
+
+
+@pytest.mark.parametrize("noise", [b"\0\x11", SERIAL_REQUEST[:9], SERIAL_REQUEST[:-2] + b"\0\xae"])
+def test_the_emulator_listens_on_after_noise(bench: BosonBench, noise: bytes) -> None:
+    """Noise, incomplete and damaged frames and text are not answered."""
+    assert bench.exchange(noise + text(5, SERIAL) + SERIAL_REQUEST) == SERIAL_REPLY
+
+
+LINE = [Fault.DROP, Fault.LATE, Fault.HOLD, Fault.BAD_CHECKSUM, Fault.ILLEGAL_ESCAPE, Fault.CUT]
+
+
+@pytest.mark.parametrize("fault", [*LINE, Fault.DEBUG_TEXT])
+@pytest.mark.parametrize("single_bytes", [False, True])
+def test_a_fault_of_the_line_is_overcome(
+    bench: BosonBench, fault: Fault, single_bytes: bool
+) -> None:
+    """A fault costs at most the wait for a reply; this and the next reading are right."""
+    bench.spoil(fault)
+    bench.device.faults.single_bytes = single_bytes
+    start, timeouts = bench.clock.now, int(fault in LINE)
+    assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
+    assert timeouts <= bench.clock.now - start < timeouts + 1.0  # [s]
+    assert bench.camera.serial_number() == 93588
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        (Fault.WRONG_COMMAND, BosonReplyError),
+        (Fault.SHORT, BosonReplyError),
+        (Fault.BUSY, BosonStatusError),
+    ],
+)
+def test_a_fault_of_the_camera_is_an_error(
+    bench: BosonBench, fault: Fault, error: type[BosonError]
+) -> None:
+    """A wrong or short reply and a refusal reach the user; the line goes on until unplugged."""
+    bench.spoil(fault)
+    with pytest.raises(error) as caught:
+        bench.camera.fpa_temperature()
+    assert getattr(caught.value, "status", 0x283) == 0x283
+    assert bench.camera.serial_number() == 93588
+    bench.state.plugged = False
+    with pytest.raises(TransportError, match="must stay connected"):
+        bench.camera.serial_number()
+
+
+def test_a_change_that_is_answered_late_is_done_once(bench: BosonBench) -> None:
+    """A late acknowledgement raises a timeout error, and the change is made once."""
+    bench.spoil(Fault.LATE)
+    with pytest.raises(BosonTimeoutError, match="set gain mode"):
+        bench.camera.set(commands.GAIN_MODE, GainMode.LOW)
+    assert bench.camera.get(commands.GAIN_MODE) is GainMode.LOW
+
+
+@pytest.mark.parametrize("stalls", [False, True])
+def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
+    """A correction is awaited for the shutter's time, also while the camera does not answer."""
+    bench.device.faults.ffc_stalls = stalls
+    for number in (1, 2):
+        start = bench.clock.now
+        frame = bench.camera.run_ffc()
+        assert FFC_DURATION <= bench.clock.now - start < FFC_DURATION + 0.2
+        assert (bench.state.ffc_count, bench.state.last_ffc_frame) == (number, frame)
+    assert bench.camera.ffc_status() is FfcStatus.COMPLETE
+    bench.state.has_frames, bench.state.frame_count = True, 41
+    assert bench.camera.run_ffc() == 41  # on the count of the frame source, if there is one
+
+
+def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
+    """The camera still says that the last correction is complete: not that of this one."""
+    complete = (commands.FFC_STATUS.command, struct.pack(">i", FfcStatus.COMPLETE))
+    last = commands.LAST_FFC_FRAME.command
+    asked = [(last, struct.pack(">I", 700)), complete, (commands.RUN_FFC, b"")]
+    for frame in (700, 700, 1234):
+        busy = (commands.FFC_IN_PROGRESS.command, b"\x00\x00")
+        asked += [busy, complete, (last, struct.pack(">I", frame))]
+    pairs: list[Pair] = [
+        (request(number, command), reply(number, command, data))
+        for number, (command, data) in enumerate(asked, start=1)
+    ]
+    with Dialogue(pairs) as line:
+        assert camera_of(line).run_ffc() == 1234
+
+
+def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonBench) -> None:
+    """Replies that a closed shutter delays past their time are not taken for later ones."""
+    bench.device.faults.ffc_stalls = True
+    bench.camera.timeout = 0.1
+    bench.world.start_ffc("boson")
+    assert bench.camera.read(commands.SERIAL_NUMBER, repeats=9) == 93588
+    assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
+
+
+@pytest.mark.parametrize("faults", [[], [None, None, None, *[Fault.DROP] * 99]])
+def test_a_correction_that_takes_too_long_is_an_error(
+    bench: BosonBench, faults: list[Fault | None]
+) -> None:
+    """A wait outlasts its limit, which the error gives, by the time of one reply at most."""
+    bench.camera.run_ffc()
+    bench.spoil(*faults)
+    start = bench.clock.now
+    with pytest.raises(BosonTimeoutError, match=r"No flat-field correction within 0\.2 s"):
+        bench.camera.run_ffc(timeout=0.2)
+    assert bench.clock.now - start <= 0.2 + REPLY_TIMEOUT + 0.2
+
+
+def test_each_program_begins_at_another_number() -> None:
+    """The first sequence number depends on the time of day, which identifies stale replies."""
+    sent = []
+    for seconds in (0.0, 0.1):
+        line = Dialogue([])
+        line.clock.sleep(seconds)
+        with pytest.raises(AssertionError, match=r"Unexpected 8e .* was written") as unexpected:
+            Boson(line).serial_number()
+        sent.append(str(unexpected.value))
+    assert sent[0] != sent[1]
+
+
+class Slow(Closing):
+    """
+    A camera that answers with a delay, and notes requests before its answer.
+
+    Attributes
+    ----------
+    overlaps : int
+        Requests that came before the last was answered, or after the line was closed.
+    """
+
+    is_simulated, clock = True, SYSTEM
+
+    def __init__(self) -> None:
+        self.overlaps = 0
+        self.reading = threading.Event()
+        self._answers: list[bytes] = []
+        self._closed = False
+
+    def write(self, data: bytes) -> None:
+        """Take one request."""
+        if self._closed:
+            raise TransportError("closed")
+        self.overlaps += bool(self._answers)
+        sequence, command = struct.unpack_from(">II", data, 2)  # none of these is escaped
+        self._answers.append(reply(sequence, command, bytes(4 if command == SERIAL else 2)))
+
+    def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - as a line has
+        """Answer."""
+        self.reading.set()
+        time.sleep(0.002)
+        self.overlaps += self._closed
+        return self._answers.pop(0)
+
+    def close(self) -> None:
+        """End."""
+        self._closed = True
+
+
+def test_threads_take_turns_until_the_end() -> None:
+    """Exchanges do not overlap, closing waits for one, and the next is a documented error."""
+    line = Slow()
+    camera = Boson(line)
+    errors: list[TransportError] = []
+
+    def ask() -> None:
+        try:
+            while True:
+                assert camera.serial_number() == 0
+                assert camera.fpa_temperature() == pytest.approx(273.15)
+        except TransportError as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for _ in range(20):
+        line.reading.clear()
+        assert line.reading.wait(60.0)
+    for _ in range(2):
+        camera.close()
+    for thread in threads:
+        thread.join()
+    assert (len(errors), line.overlaps) == (2, 0)
