@@ -3,7 +3,6 @@
 import ctypes
 import shutil
 import subprocess
-import sys
 from ctypes import c_int8, c_int16
 from pathlib import Path
 
