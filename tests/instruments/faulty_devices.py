@@ -47,6 +47,7 @@ class WheelFaults:
     deaf_to: str = ""  # name of the message that it ignores
     weak: float = 1.0  # factor of the speeds that it takes
     notice: str = ""  # error that it reports at the next message, once
+    polls: float = math.inf  # after which it is pulled out
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,8 @@ class FaultyApt(EmulatedApt):
 
     def poll(self) -> list[bytes]:
         """Messages that are due, split, merged or delayed by a fault."""
-        now = self.world.clock()
+        now, self.faults.polls = self.world.clock(), self.faults.polls - 1
+        self.plugged &= self.faults.polls > 0
         self._waiting += [(now + self.faults.late, piece) for piece in super().poll()]
         due = [data for time, data in self._waiting if time <= now]
         if not due or (self.faults.hold and len(due) < 2):

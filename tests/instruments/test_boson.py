@@ -68,9 +68,9 @@ def bench() -> BosonBench:
     return BosonBench()
 
 
-def camera_of(line: Closing, first_sequence: int = 1) -> Boson:
+def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
     """Driver that takes part in a dialogue."""
-    return Boson(line, first_sequence=first_sequence)  # type: ignore[arg-type]
+    return Boson(line, first_sequence=first_sequence)
 
 
 def test_commands_are_the_published_ones() -> None:
@@ -80,7 +80,8 @@ def test_commands_are_the_published_ones() -> None:
     assert {name: (one.command, one.layout) for name, one in readings.items()} == READINGS
     settings = {name: value for name, value in known if isinstance(value, Setting)}
     for name, setting in settings.items():
-        members = [*setting.kind]
+        kind: Any = setting.kind
+        members = [*kind]
         assert (setting.set_command, [member.name for member in members]) == SETTINGS[name]
         assert [member.value for member in members] == [*range(len(members))]
         assert (setting.reading.command, setting.reading.layout) == (setting.set_command + 1, ">i")
@@ -117,44 +118,31 @@ def test_every_reading_has_a_value(bench: BosonBench) -> None:
     assert values["part number"] == "EMULATED-BOSON-640"
 
 
-# Dialogues that end in a value: first sequence number, bytes, reading, value.
-TALKS: dict[str, tuple[int, list[Pair], Reading[Any], float]] = {
-    "public serial number": (1, [(SERIAL_REQUEST, SERIAL_REPLY)], commands.SERIAL_NUMBER, 93588),
-    "public temperature, escaped, in pieces": (
-        *(0, [(request(0, FPA), [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]])]),
-        *(commands.FPA_TEMPERATURE, 43.1 + 273.15),
+PIECES = [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]]
+LATE = reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")
+OTHERS = text(1, SERIAL) + SERIAL_REQUEST  # on another channel, and an echo
+DAMAGED = SERIAL_REPLY[:-2] + b"\x11\xae"
+# Dialogues that end in a value: reading, bytes, value. Other software reads FF85 as 6541.3 °C.
+TALKS: list[tuple[Reading[Any], list[Pair], float]] = [
+    (commands.SERIAL_NUMBER, [(SERIAL_REQUEST, SERIAL_REPLY)], 93588),
+    (commands.FPA_TEMPERATURE, [(request(0, FPA), PIECES)], 43.1 + 273.15),
+    (commands.FPA_TEMPERATURE, [(request(1, FPA), reply(1, FPA, b"\xff\x85"))], 260.85),
+    (commands.FPA_TEMPERATURE, [(request(1, FPA), None), (request(2, FPA), LATE)], 311.15),
+    (commands.SERIAL_NUMBER, [(SERIAL_REQUEST, OTHERS + SERIAL_REPLY)], 93588),
+    (
+        commands.SERIAL_NUMBER,
+        [(SERIAL_REQUEST, DAMAGED), (request(2, SERIAL), reply(2, SERIAL, b"\0\0\0\7"))],
+        7,
     ),
-    # Other software reads it as 6541.3 °C.
-    "temperature of -12.3 °C": (
-        *(1, [(request(1, FPA), reply(1, FPA, b"\xff\x85"))], commands.FPA_TEMPERATURE, 260.85),
-    ),
-    "late reply to the request before": (
-        1,
-        [
-            (request(1, FPA), None),
-            (request(2, FPA), reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")),
-        ],
-        *(commands.FPA_TEMPERATURE, 311.15),
-    ),
-    "text on another channel, and an echo": (
-        *(1, [(SERIAL_REQUEST, text(1, SERIAL) + SERIAL_REQUEST + SERIAL_REPLY)]),
-        *(commands.SERIAL_NUMBER, 93588),
-    ),
-    "damaged reply, which is asked for again": (
-        1,
-        [
-            (SERIAL_REQUEST, SERIAL_REPLY[:-2] + b"\x11\xae"),
-            (request(2, SERIAL), reply(2, SERIAL, b"\x00\x00\x00\x07")),
-        ],
-        *(commands.SERIAL_NUMBER, 7),
-    ),
-}
+]
 
 
-@pytest.mark.parametrize("name", TALKS)
-def test_dialogues_that_give_a_value(name: str) -> None:
+@pytest.mark.parametrize(("reading", "pairs", "value"), TALKS)
+def test_dialogues_that_give_a_value(
+    reading: Reading[Any], pairs: list[Pair], value: float
+) -> None:
     """Public bytes are sent and understood, and what is no reply to the request is discarded."""
-    first, pairs, reading, value = TALKS[name]
+    first = int(pairs[0][0] != request(0, FPA))
     with Dialogue(pairs) as line:
         assert camera_of(line, first).read(reading) == pytest.approx(value, abs=1e-9)
 
@@ -355,14 +343,7 @@ def test_each_program_begins_at_another_number() -> None:
 
 
 class Slow(Closing):
-    """
-    A camera that answers with a delay, and notes requests before its answer.
-
-    Attributes
-    ----------
-    overlaps : int
-        Requests that came before the last was answered, or after the line was closed.
-    """
+    """A camera that answers late, and counts requests before its answer or after its end."""
 
     is_simulated, clock = True, SYSTEM
 

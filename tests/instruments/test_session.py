@@ -80,6 +80,10 @@ name: plate => name: ../plate => Invalid name '../plate'. Must match pattern
 4: plate} => 4: ""} => Invalid thermocouples.4 ''. Must have at least 1 character
 velocity: 50.0, h => speed: 50.0, h => Unknown key 'wheel.speed'
 velocity: 50.0, h => velocity: "50", h => Invalid wheel.velocity '50'. Must be a valid number
+velocity: 50.0, h => velocity: 0.0, h => wheel.velocity 0.0. Must be greater than or equal to 0.1
+velocity: 50.0, h => velocity: 100.0, h => wheel.velocity 100.0. Must be less than or equal to 90
+wheel: {velocity => wheel: {home_offset: 400.0, velocity => home_offset 400.0. Must be less than 360
+wheel: {velocity => wheel: {home_direction: 3, velocity => wheel.home_direction 3. Must be 1 or 2
 wheel: {velocity => wheel: {filters: {1: a}, velocity => Unknown key 'wheel.filters'
   thermocouples: "tc =>   thermometer: "tc => devices.thermometer 'thermometer'. Must be
   filter_wheel: =>   # => Missing device 'filter_wheel' of {1: '9.5', 3: '11'}

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import math
 import os
 import pkgutil
 import pty
@@ -13,13 +12,12 @@ from collections.abc import Iterator
 
 import pytest
 import serial
+from device_benches import BosonBench
 from dialogue import Dialogue, Pair
 
 from dbthermal import instruments
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import KINDS
-from dbthermal.instruments.emulated.clock import EmulatedClock
-from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import SerialTransport, TransportError, open_serial
 
@@ -161,38 +159,19 @@ def test_every_module_is_on_the_map() -> None:
         _ = instruments.dialogue
 
 
-class Echo:
-    """A device that echoes its input."""
-
-    def __init__(self) -> None:
-        self.plugged = True
-        self.said: list[bytes] = []
-
-    def receive(self, data: bytes) -> None:
-        """Take in bytes."""
-        self.said.append(data)
-
-    def poll(self) -> list[bytes]:
-        """Give them back."""
-        said, self.said = self.said, []
-        return said
-
-    def next_due(self) -> float:
-        """Nothing comes by itself."""
-        return math.inf
-
-
 def test_a_line_in_memory() -> None:
-    """Bytes come back in order, silence takes no real time, and an end is an end."""
-    device, clock = Echo(), EmulatedClock()
-    line, closed = Line(device, clock), Line(Echo(), clock)
-    line.write(AWKWARD)
-    line.write(b"ab")
-    assert (line.read(10, 1.0) + line.read(4096, 1.0), line.read(2, 1.0)) == (AWKWARD, b"ab")
-    assert (line.read(2, 3600.0), clock()) == (b"", 3600.0)
+    """Bytes come in order and as many as asked for, silence takes no real time, an end is one."""
+    bench, closed = BosonBench(), BosonBench().loop
+    line, request = bench.loop, bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 FF FF FF FF 01 0B AE")
+    line.write(request[:5])
+    line.write(request[5:])
+    reply = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 00 00 00 00 00 01 6D 94 30 10 AE")
+    assert line.read(10, 1.0) + line.read(4096, 1.0) == reply
+    start = bench.clock.now
+    assert (line.read(2, 3600.0), bench.clock.now - start) == (b"", 3600.0)
     for _ in range(2):
         closed.close()
-    device.plugged = False
+    bench.state.plugged = False
     for end in (closed, line):
         with pytest.raises(TransportError, match="It must stay connected and open"):
             end.write(b"x")

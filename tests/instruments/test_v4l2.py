@@ -17,10 +17,19 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream
+from dbthermal.instruments.clock import Clock
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6
 GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
+
+
+class ExposureClock(Clock):
+    """A clock that stands at 12.5 s."""
+
+    def __call__(self) -> float:
+        """Time [s]."""
+        return 12.5
 
 
 class Memory(bytearray):
@@ -58,7 +67,7 @@ class Driver:
             ioctl=self._ioctl,
             map=self._map,
             select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
-            clock=lambda: 12.5,
+            clock=ExposureClock(),
         )
 
     def _open(self, path: str, flags: int) -> int:  # noqa: ARG002 - as os.open
