@@ -203,7 +203,8 @@ def test_any_bytes_are_accounted_for(stream: bytes, where: list[int]) -> None:
 @given(st.binary(min_size=84, max_size=84))
 def test_parsers_meet_arbitrary_data(content: bytes) -> None:
     """A parser returns its record of any data of each length that the decoder lets pass."""
-    for parser, identifier in {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}.items():
+    parsers: dict[type[apt.Record], Id] = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
+    for parser, identifier in parsers.items():
         for length in filter(None, LENGTHS[identifier]):
             message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
             assert isinstance(parser.parse(message), parser)

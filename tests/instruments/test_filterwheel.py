@@ -191,28 +191,21 @@ def test_answers_of_others() -> None:
 BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
 
 
+OTHERS: list[Pair] = [(bytes.fromhex(GREETING.format(unit)), None) for unit in (11, 50)]
+OTHERS[0] = (OTHERS[0][0], BANNER)
+STATES: list[Pair] = [(PAIRS[-1][0], bytes((0x12, 2, 1, state, 1, 0x21))) for state in (0, 3)]
+
+
 @pytest.mark.parametrize(
-    ("pairs", "error", "message"),
+    ("pairs", "message"),
     [
-        (
-            [
-                (bytes.fromhex(GREETING.format(11)), BANNER),
-                (bytes.fromhex(GREETING.format(50)), None),
-            ],
-            *(WrongDeviceError, "33 bytes came that are no APT messages"),
-        ),
-        *(
-            (
-                [*PAIRS[:-1], (PAIRS[-1][0], bytes.fromhex(f"12 02 01 {state} 01 21"))],
-                *(WheelError, r"Unknown state . of the motor"),
-            )
-            for state in ("00", "03")
-        ),
+        (OTHERS, "33 bytes came that are no APT messages"),
+        *(([*PAIRS[:-1], state], r"Unknown state . of the motor") for state in STATES),
     ],
 )
-def test_answers_that_are_none(pairs: list[Pair], error: type[WheelError], message: str) -> None:
+def test_answers_that_are_none(pairs: list[Pair], message: str) -> None:
     """Text, and a motor that is neither enabled nor not, raise an error on connecting."""
-    with Dialogue(pairs) as dialogue, pytest.raises(error, match=message):
+    with Dialogue(pairs) as dialogue, pytest.raises(WheelError, match=message):
         FilterWheel(dialogue, FILTERS).connect()
 
 
