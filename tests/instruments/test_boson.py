@@ -173,8 +173,10 @@ def test_readings_that_fail(
     """A mute camera is asked three times; other replies are errors with what is wrong."""
     (known,) = (r for r in vars(commands).values() if getattr(r, "command", None) == reading)
     pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
-    with Dialogue(pairs) as line, pytest.raises(error, match=message):
+    with Dialogue(pairs) as line, pytest.raises(error, match=message) as caught:
         camera_of(line).read(known)
+    status = getattr(caught.value, "status", 0)
+    assert f"0x{status:X}" in message or not status
 
 
 @pytest.mark.parametrize(
@@ -246,28 +248,6 @@ def test_a_fault_of_the_line_is_overcome(
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
     assert timeouts <= bench.clock.now - start < timeouts + 1.0  # [s]
     assert bench.camera.serial_number() == 93588
-
-
-@pytest.mark.parametrize(
-    ("fault", "error"),
-    [
-        (Fault.WRONG_COMMAND, BosonReplyError),
-        (Fault.SHORT, BosonReplyError),
-        (Fault.BUSY, BosonStatusError),
-    ],
-)
-def test_a_fault_of_the_camera_is_an_error(
-    bench: BosonBench, fault: Fault, error: type[BosonError]
-) -> None:
-    """A wrong or short reply and a refusal reach the user; the line goes on until unplugged."""
-    bench.spoil(fault)
-    with pytest.raises(error) as caught:
-        bench.camera.fpa_temperature()
-    assert getattr(caught.value, "status", 0x283) == 0x283
-    assert bench.camera.serial_number() == 93588
-    bench.state.plugged = False
-    with pytest.raises(TransportError, match="must stay connected"):
-        bench.camera.serial_number()
 
 
 def test_a_change_that_is_answered_late_is_done_once(bench: BosonBench) -> None:

@@ -193,13 +193,6 @@ def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:
         wrong.identities()
 
 
-def test_frames_are_counted_once(devices: Devices) -> None:
-    """With a frame source, the emulated camera's count is that of the frames that came."""
-    for _ in range(5):
-        frame = devices.sources["9.5"].read()
-    assert devices.cameras["9.5"].run_ffc() == frame.sequence >= 4
-
-
 def test_hardware_has_no_emulated_world() -> None:
     """A session of hardware with an emulated world raises an error."""
     real = from_yaml(replaced(("simulated: true", "simulated: false")))
