@@ -56,10 +56,7 @@ def test_ecostress_is_kirchhoff_over_increasing_metres(
     assert spectrum["emissivity"].attrs["units"] == "1"
 
 
-@given(
-    reflectance=st.lists(st.floats(-5, 120), min_size=2, max_size=30),
-    start=st.floats(0.3, 15),
-)
+@given(reflectance=st.lists(st.floats(-5, 120), min_size=2, max_size=30), start=st.floats(0.3, 15))
 def test_ecostress_round_trip(reflectance: list[float], start: float) -> None:
     """A written spectrum is read back to the four digits of the file."""
     wavelength = [start + 0.1 * step for step in range(len(reflectance))]

@@ -8,15 +8,7 @@ import xarray as xr
 from flir_files import Values, scene, sequence
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dbthermal import (
-    alignment,
-    calibration,
-    correction,
-    readers,
-    schema,
-    separation,
-    store,
-)
+from dbthermal import alignment, calibration, correction, readers, schema, separation, store
 from dbthermal import response as responses
 from dbthermal.figures import drawing
 
