@@ -21,13 +21,15 @@ from attack.stages import wrong
 from dbthermal import schema, store
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
-from reproduction import cache, manifest, paths
+from reproduction import cache, paths
+from reproduction import manifest as downloads
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
 main: Final[Callable[[list[str]], int]] = entry_points(group="console_scripts")["dbthermal"].load()
 """The command line, as a shell finds it."""
 LINES: Final = "x" * 40  # an attribute of some length
+STORES: Final = ("result.zarr", "recording.zarr")
 
 
 @once
@@ -48,16 +50,10 @@ def originals() -> Path:
     log = {n: schema.Variable(("log",), "float64", "1", n) for n in ("log_time", "log_value")}
     counts = schema.STAGES["capture"]["counts"]
     variables = {"counts": counts, "frame_flags": flags, "exposure_time": stamps, **log}
-    recording = store.Recording(
-        folder / "recording.zarr",
-        variables,
-        {"y": 16, "x": 20},
-        ["8-14", "9.5"],
-        chunk=10,
-        attrs={},
-    )
+    path, bands = folder / "recording.zarr", ["8-14", "9.5"]
+    recording = store.Recording(path, variables, {"y": 16, "x": 20}, bands, chunk=10, attrs={})
     for _ in range(4):
-        for place, band in enumerate(("8-14", "9.5")):
+        for place, band in enumerate(bands):
             first = recording.frames[band]
             block: dict[str, Any] = {
                 "counts": made.counts()[place, first : first + 10].astype(np.uint16),
@@ -111,18 +107,15 @@ def _same(path: Path, *, attributes: bool) -> Callable[[xr.Dataset], Verdict]:
     whole = store.open_dataset(originals() / path.name).load()
 
     def judge(opened: xr.Dataset) -> Verdict:
-        changed = sorted(
-            str(name)
-            for name in {*whole.variables} | {*opened.variables}
-            if name not in opened.variables
-            or name not in whole.variables
-            or not _alike(whole[name], opened[name])
-        )
         part = {str(dim): slice(0, size) for dim, size in opened.sizes.items()}
         kept = [n for n in opened.data_vars if n in whole]
         same = all(_alike(whole[n].isel(part, missing_dims="ignore"), opened[n]) for n in kept)
         if same and opened.attrs.get("complete") is False:
             return Verdict("flagged")
+        names = {*whole.variables} ^ {*opened.variables}
+        common = {*whole.variables} & {*opened.variables}
+        names |= {name for name in common if not _alike(whole[name], opened[name])}
+        changed = sorted(map(str, names))
         if not changed and attributes and whole.attrs != opened.attrs:
             changed = ["attributes"]
         return wrong(f"other {changed}", where=bool(changed))
@@ -137,27 +130,29 @@ def _alike(first: xr.DataArray, second: xr.DataArray) -> bool:
     return same and first.values.tobytes() == second.values.astype(first.dtype).tobytes()
 
 
+def _store_with(what: str, path: Path, file: Path, *, attributes: bool) -> Attack:
+    """A store with a damaged file."""
+    inside = file.relative_to(path)
+    names = (path.name, inside.parts[0] if len(inside.parts) > 1 else "")
+    judge = _same(path, attributes=attributes)
+    return Attack(f"{path.name}/{inside}: {what}", lambda: _open(path), judge, names)
+
+
 def bits(rng: Rng) -> Attack:
     """One bit flipped anywhere in a store."""
-    path = _copy(str(rng.choice(["result.zarr", "recording.zarr"])))
-    files = [file for file in _files(path) if file.stat().st_size]
+    path = _copy(str(rng.choice(STORES)))
     # As likely in one file as in another: else nearly all were in the counts.
-    file = files[int(rng.integers(len(files)))]
-    place, inside = flip(rng, file), file.relative_to(path)
-    return Attack(
-        f"bit of byte {place} of {path.name}/{inside} flipped",
-        lambda: _open(path),
-        _same(path, attributes=True),
-        (path.name, inside.parts[0] if len(inside.parts) > 1 else ""),
-    )
+    file = pick(rng, [file for file in _files(path) if file.stat().st_size])
+    return _store_with(f"bit of byte {flip(rng, file)} flipped", path, file, attributes=True)
 
 
 def chunks(rng: Rng) -> Attack:
     """A chunk of a store lost, emptied, cut, exchanged with another, or from another store."""
-    path = _copy(str(rng.choice(["result.zarr", "recording.zarr"])))
+    path = _copy(str(rng.choice(STORES)))
     files = [file for file in _files(path) if file.name != "zarr.json"]
-    file = files[int(rng.integers(len(files)))]
+    file = pick(rng, files)
     what = str(rng.choice(["lost", "lost", "emptied", "cut", "exchanged", "of noise", "a folder"]))
+    whole, size = file.read_bytes(), file.stat().st_size
     if what in ("lost", "a folder"):
         file.unlink()
     if what == "a folder":
@@ -165,61 +160,54 @@ def chunks(rng: Rng) -> Attack:
     if what == "emptied":
         file.write_bytes(b"")
     if what == "cut":
-        file.write_bytes(file.read_bytes()[: -int(rng.integers(1, file.stat().st_size))])
+        file.write_bytes(whole[: -int(rng.integers(1, size))])
     if what == "of noise":
-        file.write_bytes(rng.bytes(file.stat().st_size))
+        file.write_bytes(rng.bytes(size))
     if what == "exchanged":
-        same = [
-            f
-            for f in files
-            if f != file and f.relative_to(path).parts[0] == file.relative_to(path).parts[0]
-        ]
-        other = same[int(rng.integers(len(same)))] if same else file
-        kept = file.read_bytes()
+        array = file.relative_to(path).parts[0]
+        others = [f for f in files if f != file and f.relative_to(path).parts[0] == array]
+        other = pick(rng, others) if others else file
         file.write_bytes(other.read_bytes())
-        other.write_bytes(kept)
-    inside = file.relative_to(path).parts
-    names = (path.name, inside[0] if len(inside) > 1 else "")
-    what = f"chunk {file.relative_to(path)} of {path.name} {what}"
-    return Attack(what, lambda: _open(path), _same(path, attributes=False), names)
+        other.write_bytes(whole)
+    return _store_with(f"chunk {what}", path, file, attributes=False)
 
 
 def stores(rng: Rng) -> Attack:
     """Metadata of a store lost, emptied, edited or foreign; arrays renamed, lost or added."""
-    path = _copy(str(rng.choice(["result.zarr", "recording.zarr"])))
-    arrays = sorted(part.name for part in path.iterdir() if part.is_dir())
-    array = str(rng.choice(arrays))
+    path = _copy(str(rng.choice(STORES)))
+    array = str(rng.choice(sorted(part.name for part in path.iterdir() if part.is_dir())))
     what = str(rng.choice(list(_METADATA)))
     _METADATA[what](rng, path, array)
-    attributes = what != "a foreign file"
-    judge = _same(path, attributes=attributes)
+    judge = _same(path, attributes=what != "a foreign file")
     return Attack(f"{path.name}/{array}: {what}", lambda: _open(path), judge, (path.name,))
 
 
 def _edit(rng: Rng, path: Path, array: str) -> None:
     file = path / array / "zarr.json"
     content = json.loads(file.read_text(encoding="utf-8"))
-    key = str(
-        rng.choice(["shape", "data_type", "fill_value", "dimension_names", "codecs", "node_type"])
-    )
-    worse = {
-        "shape": [10**9 for _ in content["shape"]],
-        "data_type": "int8",
-        "fill_value": 7,
-        "dimension_names": ["a" for _ in content["shape"]],
-        "codecs": [],
-        "node_type": "group",
-    }
-    content[key] = worse[key]
-    file.write_text(json.dumps(content), encoding="utf-8")
+    sizes = [10**9 for _ in content["shape"]]
+    worse = {"shape": sizes, "dimension_names": ["a" for _ in sizes], "data_type": "int8"}
+    worse |= {"fill_value": 7, "codecs": [], "node_type": "group"}
+    key = str(rng.choice(list(worse)))
+    file.write_text(json.dumps({**content, key: worse[key]}), encoding="utf-8")
 
 
 def _attributes(rng: Rng, path: Path, _: str) -> None:
     file = path / "zarr.json"
     content = json.loads(file.read_text(encoding="utf-8"))
-    keys = sorted(content["attributes"])
-    content["attributes"][str(rng.choice(keys))] = pick(rng, [None, -1, 1e9, "text"])
+    key = str(rng.choice(sorted(content["attributes"])))
+    content["attributes"][key] = pick(rng, [None, -1, 1e9, "text"])
     file.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _described(change: Callable[[bytes], bytes]) -> Callable[[Rng, Path, str], Any]:
+    """Change of an array's metadata."""
+
+    def damage(_: Rng, path: Path, array: str) -> None:
+        file = path / array / "zarr.json"
+        file.write_bytes(change(file.read_bytes()))
+
+    return damage
 
 
 def _replaced(path: Path, content: bytes | None) -> None:
@@ -235,13 +223,9 @@ _METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
     "metadata of an array lost": lambda _, path, array: (path / array / "zarr.json").unlink(),
     "metadata lost": lambda _, path, __: (path / "zarr.json").unlink(),
     "metadata emptied": lambda _, path, __: (path / "zarr.json").write_bytes(b""),
-    "metadata of an array emptied": lambda _, path, a: (path / a / "zarr.json").write_bytes(b""),
-    "metadata cut": lambda _, path, a: (path / a / "zarr.json").write_bytes(
-        (path / a / "zarr.json").read_bytes()[:-20]
-    ),
-    "metadata of another text": lambda _, path, a: (path / a / "zarr.json").write_bytes(
-        b"[1, 2]\xff"
-    ),
+    "metadata of an array emptied": _described(lambda _: b""),
+    "metadata cut": _described(lambda content: content[:-20]),
+    "metadata of another text": _described(lambda _: b"[1, 2]\xff"),
     "an array lost": lambda _, path, array: shutil.rmtree(path / array),
     "an array renamed": lambda _, path, array: (path / array).rename(path / f"{array}2"),
     "metadata edited": _edit,
@@ -285,26 +269,15 @@ def numbers(rng: Rng) -> Attack:
     """Files of numbers cut, flipped, with other types, infinite, repeated or foreign."""
     path = _copy("numbers.json")
     text = path.read_text(encoding="utf-8")
-    worse = [
-        text[: int(rng.integers(len(text)))],
-        text.replace("0.21", "NaN"),
-        text.replace("0.21", "1e999"),
-        text.replace("0.21", "null"),
-        text.replace("0.21", "[1]"),
-        text.replace("0.21", '0.21, "rmse_K": 0.9'),
-        "[]",
-        "{}",
-        "\x00" * 30,
-        text.replace("rmse", "rm\udcffse"),
-        "[" * 100_000,
-    ]
+    values = ("NaN", "1e999", "null", "[1]", '0.21, "rmse_K": 0.9')
+    worse = [text[: int(rng.integers(len(text)))], *(text.replace("0.21", one) for one in values)]
+    worse += ["[]", "{}", "\x00" * 30, text.replace("rmse", "rm\udcffse"), "[" * 100_000]
     content = str(pick(rng, worse))
     path.write_bytes(content.encode("utf-8", "surrogateescape"))
     # A cut may fall behind the last bracket: nothing is lost then.
     judge = lambda got: wrong(f"{got}", where=got != {"rmse_K": 0.21, "name": "a"})  # noqa: E731
-    return Attack(
-        f"numbers {content[:60]!r}", lambda: store.read_numbers(path), judge, ("numbers.json",)
-    )
+    act = lambda: store.read_numbers(path)  # noqa: E731
+    return Attack(f"numbers {content[:60]!r}", act, judge, ("numbers.json",))
 
 
 SESSION: Final = """
@@ -345,33 +318,23 @@ def sessions(rng: Rng) -> Attack:
     path = workplace() / "session.yaml"
     content = yaml.safe_load(SESSION)
     what = str(rng.choice(["value", "value", "value", "value", "lost", "unknown", "twice", "text"]))
-    text, changed = SESSION, ""
-    places = [*_places(content)]
-    holder, key = places[int(rng.integers(len(places)))]
+    holder, key = pick(rng, [*_places(content)])
     if what == "value":
         holder[key] = _VALUES[int(rng.integers(len(_VALUES)))]
-        changed = f"{key}: {str(holder[key])[:30]!r}"
     elif what == "lost":
         del holder[key]
-        changed = f"{key}"
     elif what == "unknown":
-        key = f"{key}x"
-        (holder if isinstance(holder, dict) else content)[key] = 1
-        changed = key
-    if what in ("value", "lost", "unknown"):
-        text = yaml.safe_dump(content, allow_unicode=True)
-    elif what == "twice":
+        (holder if isinstance(holder, dict) else content)[key := f"{key}x"] = 1
+    text = yaml.safe_dump(content, allow_unicode=True)
+    if what == "twice":
         key = str(rng.choice(["name", "duration", "simulated", "protocol"]))
-        text, changed = f"{SESSION}{key}: 3\n", f"'{key}' a second time"
-    else:
-        text = _broken(rng, SESSION)
-        key, changed = path.name, repr(text[-30:])
+        text = f"{SESSION}{key}: 3\n"
+    elif what == "text":
+        text, key = _broken(rng, SESSION), path.name
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
-    return Attack(
-        f"session {what} {changed}",
-        lambda: _dry_run(path),
-        lambda found: _session_verdict(found, what, path, str(key)),
-    )
+    judge = lambda found: _session_verdict(found, what, path, str(key))  # noqa: E731
+    shown = str(holder[key])[:30] if what == "value" else text[-30:]
+    return Attack(f"session {what} {key}: {shown!r}", lambda: _dry_run(path), judge)
 
 
 def _places(content: Any) -> Any:
@@ -389,13 +352,10 @@ def _broken(rng: Rng, text: str) -> str:
     kind = int(rng.integers(3))
     if kind == 0:
         return text[:place]
-    if kind == 1:
-        bomb = "a: &a [x,x,x,x,x,x,x,x,x]\n"
-        levels = [
-            f"{c}: &{c} [{','.join(['*' + b] * 9)}]"
-            for b, c in zip("abcdefgh", "bcdefghi", strict=True)
-        ]
-        return bomb + "\n".join(levels) + text
+    if kind == 1:  # nine times as much a line
+        pairs = zip("abcdefgh", "bcdefghi", strict=True)
+        levels = [f"{c}: &{c} [{','.join(['*' + b] * 9)}]" for b, c in pairs]
+        return "\n".join(["a: &a [x,x,x,x,x,x,x,x,x]", *levels]) + text
     return text[:place] + str(pick(rng, worse)) + text[place:]
 
 
@@ -423,86 +383,66 @@ def _session_verdict(found: tuple[int, str, str], what: str, path: Path, key: st
     return Verdict("traceback", f"status {status}, names not '{key}': {err[:300]}")
 
 
+def _file_of(name: str, path: Path, text: str, act: Callable[[], Any]) -> Callable[[], Any]:
+    """A call that finds a file of the checkout with another text."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+
+    def call() -> Any:
+        kept = getattr(paths, name)
+        setattr(paths, name, lambda *_: path)
+        try:
+            return act()
+        finally:
+            setattr(paths, name, kept)
+
+    return call
+
+
 def parameters(rng: Rng) -> Attack:
     """``params/<notebook>.yaml`` with repeated or broken text, as the notebooks' Run reads it."""
     from reproduction import run  # noqa: PLC0415 - imports what the notebooks need
 
-    stems = sorted(path.stem for path in (REPOSITORY / "params").glob("0[1-6]*.yaml"))
-    stem = str(rng.choice(stems))
+    stem = str(rng.choice(sorted(p.stem for p in (REPOSITORY / "params").glob("0[1-6]*.yaml"))))
     text = (REPOSITORY / "params" / f"{stem}.yaml").read_text(encoding="utf-8")
-    what = str(rng.choice(["twice", "broken", "list", "empty", "lost"]))
     good = {**yaml.safe_load(text), "results": "full"}
-    spoilt = {
-        "twice": text + "\nseed: 3\nseed: 4\n",
-        "broken": _broken(rng, text),
-        "list": "[1, 2]",
-        "empty": "",
-        "lost": text + "\nno_such_parameter: 1\n",
-    }[what]
-    folder = workplace() / "params"
-    folder.mkdir(exist_ok=True)
-    file = folder / f"{stem}.yaml"
-    file.write_bytes(spoilt.encode("utf-8", "surrogateescape"))
+    spoilt = {"twice": f"{text}\nseed: 3\nseed: 4\n", "broken": _broken(rng, text)}
+    spoilt |= {"list": "[1, 2]", "empty": "", "lost": f"{text}\nno_such_parameter: 1\n"}
+    what = str(rng.choice(list(spoilt)))
 
-    def act() -> Any:
-        kept = paths.params
-        paths.params = lambda stem: folder / f"{stem}.yaml"
-        try:
-            return run.Run(stem, good).provenance["parameters"]
-        finally:
-            paths.params = kept
+    def judge(got: Any) -> Verdict:
+        return wrong(f"accepted {got}"[:200], where=what == "twice" or not set(got) <= set(good))
 
-    return Attack(
-        f"parameters of {stem}: {what}",
-        act,
-        lambda got: wrong(
-            f"accepted {got}"[:200], where=what == "twice" or not set(got) <= set(good)
-        ),
-        (f"{stem}|no_such_parameter",),
-    )
+    act = lambda: run.Run(stem, good).provenance["parameters"]  # noqa: E731
+    call = _file_of("params", workplace() / "params" / f"{stem}.yaml", spoilt[what], act)
+    return Attack(f"parameters of {stem}: {what}", call, judge, (f"{stem}|no_such_parameter",))
 
 
-def manifests(rng: Rng) -> Attack:
+def manifest(rng: Rng) -> Attack:
     """``data_manifest.yaml`` with names that leave the folder, other sizes, broken text."""
     entry = {"name": "a.txt", "sha256": "0" * 64, "bytes": 3}
-    collection: dict[str, Any] = {
-        "title": "t", "origin": "https://localhost/", "citation": ["c"], "terms": "t",
-        "used_by": ["u"], "note": "n", "files": [entry],
-    }  # fmt: skip
-    content: dict[str, Any] = {"collections": {"spectra": collection}}
+    collection: dict[str, Any] = {"title": "t", "origin": "https://localhost/", "citation": ["c"]}
+    collection |= {"terms": "t", "used_by": ["u"], "note": "n", "files": [entry]}
     what = str(
         rng.choice(["file", "collection", "origin", "sha256", "bytes", "twice", "broken", "key"])
     )
     name = str(pick(rng, ["../a", "/etc/passwd", "..", ".", "", "a/b", "a\x00"]))
-    if what == "file":
-        entry["name"] = name
-    elif what == "collection":
-        content["collections"] = {name: collection}
-    elif what == "origin":
+    if what == "origin":
         collection["origin"] = pick(rng, ["file:///etc/", "", "/etc/"])
-    elif what in ("sha256", "bytes"):
-        entry[what] = pick(rng, [-1, 0, 1.5]) if what == "bytes" else "z" * 64
-    elif what == "key":
+    if what == "key":
         collection["keyx"] = 1
-    text = yaml.safe_dump(content)
+    entry |= {"file": {"name": name}, "sha256": {"sha256": "z" * 64}}.get(what, {})
+    entry |= {"bytes": pick(rng, [-1, 0, 1.5])} if what == "bytes" else {}
+    kind = name if what == "collection" else "spectra"
+    text = yaml.safe_dump({"collections": {kind: collection}})
     text = text + text if what == "twice" else _broken(rng, text) if what == "broken" else text
-    path = workplace() / "data_manifest.yaml"
-    path.write_bytes(text.encode("utf-8", "surrogateescape"))
 
-    def act() -> Any:
-        kept = paths.manifest
-        paths.manifest = lambda: path
-        try:
-            return manifest.load()
-        finally:
-            paths.manifest = kept
+    def judge(got: Any) -> Verdict:
+        return wrong(f"accepted {got}"[:300], where=what != "broken" or not got.collections)
 
-    return Attack(
-        f"manifest: {what} {name!r}",
-        act,
-        lambda got: wrong(f"accepted {got}"[:300], where=what != "broken" or not got.collections),
-        ("data_manifest|spectra|name|bytes|origin|sha256|collection",),
-    )
+    call = _file_of("manifest", workplace() / "data_manifest.yaml", text, downloads.load)
+    names = ("data_manifest|spectra|name|bytes|origin|sha256|collection",)
+    return Attack(f"manifest: {what} {name!r}", call, judge, names)
 
 
 def leave() -> None:

@@ -22,18 +22,9 @@ Rng = np.random.Generator
 
 _OPERATIONS: Final = (
     "open",
-    "os.mkdir",
-    "os.rename",
-    "os.remove",
-    "os.rmdir",
-    "os.truncate",
-    "os.link",
+    *(f"os.{n}" for n in ("mkdir", "rename", "remove", "rmdir", "truncate", "link")),
 )
-_SCENE: Final = (
-    SESSION.split("filters:", maxsplit=1)[0]
-    .replace("protocol: response", "protocol: scene")
-    .replace("duration: 0.15", "duration: 0.5")
-)
+_SCENE: Final = SESSION.split("filters:", maxsplit=1)[0].replace(": response", ": scene")
 _FRAMES: Final = 40  # fewer than the 50 of such a recording on a busy machine
 _DEADLINE: Final = 600  # longest life of a process, on a busy machine too [s]
 
@@ -47,11 +38,9 @@ def kills(rng: Rng) -> Attack:
         return _saved(rng, folder)
     what = str(rng.choice(["SIGKILL", "SIGTERM", "SIGHUP", "rename", "rename parent"]))
     place = int(np.exp(rng.uniform(0, np.log(900))))
-    return Attack(
-        f"recording, {what} at file operation {place}",
-        lambda: _end(_record, folder, place, what),
-        lambda status: _recorded(folder, what, status),
-    )
+    act = lambda: _end(_record, folder, place, what)  # noqa: E731
+    judge = lambda status: _recorded(folder, what, status)  # noqa: E731
+    return Attack(f"recording, {what} at file operation {place}", act, judge)
 
 
 def _saved(rng: Rng, folder: Path) -> Attack:
@@ -79,11 +68,8 @@ def _saved(rng: Rng, folder: Path) -> Attack:
         whole = np.array_equal(counts, before["counts"]) or np.array_equal(counts, _later())
         return wrong("neither the earlier nor the later result", where=not whole)
 
-    return Attack(
-        f"saving {kind} over another, SIGKILL at file operation {place}",
-        lambda: _end(_save, target, place, "SIGKILL"),
-        judge,
-    )
+    what = f"saving {kind} over another, SIGKILL at file operation {place}"
+    return Attack(what, lambda: _end(_save, target, place, "SIGKILL"), judge)
 
 
 @cache
@@ -101,7 +87,7 @@ def _save(path: Path) -> int:
 
 
 def _record(folder: Path) -> int:
-    (folder / "session.yaml").write_text(_SCENE, encoding="utf-8")
+    (folder / "session.yaml").write_text(_SCENE.replace("0.15", "0.5"), encoding="utf-8")
     return main(["record", str(folder / "session.yaml"), str(folder / "recordings")])
 
 

@@ -1,16 +1,19 @@
-"""Hostile spectra and videos: look-alikes of the public files, or these themselves, damaged."""
+"""Hostile spectra, videos and recordings: made here, or the public files themselves, damaged."""
 
+import operator
 import os
+import shutil
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
 import hostile_files as hostile
 import numpy as np
+import xarray as xr
 
 from attack.files import flip, workplace
-from attack.oracle import Attack, Verdict
+from attack.oracle import LIMIT, Attack, Verdict
 from attack.scenes import pick
 from attack.stages import RIGHT, wrong
 from dbthermal import readers
@@ -42,19 +45,17 @@ def spectra(rng: Rng) -> Attack:
 
     def judge(found: Any) -> Verdict:
         values = _values(found)
-        same = len(values) == len(truth) and all(
-            a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-12)
-            for a, b in zip(values, truth, strict=True)
-        )
-        return wrong(
-            f"{what} accepted: {len(values)} arrays, sizes {[v.size for v in values][:4]}",
-            where=not same,
-        )
+        sizes = [v.shape for v in values]
+        same = sizes == [v.shape for v in truth] and all(map(_near, values, truth))
+        return wrong(f"{what} accepted: {len(sizes)} arrays, {sizes[:4]}", where=not same)
 
     # The public file of this library may end at 3.3 or 3.7 um, and does not say so.
     endless = "cut" in what and kind == "ucsb"
     limit = "no number of rows in the file" if endless else ""
     return Attack(f"{kind}: {what}", lambda: read(path), judge, (path.name,), limit=limit)
+
+
+_near: Final = partial(np.allclose, rtol=0, atol=1e-12)
 
 
 def _values(found: Any) -> list[np.ndarray]:
@@ -104,10 +105,10 @@ _TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
     "bad UTF-8": lambda rng, whole: _line(rng, whole, _put(b"\xff\xfe")),
     "a value of 10^9": lambda rng, whole: _line(rng, whole, _put(b"1e9")),
     "rows swapped": lambda rng, whole: _line(rng, whole, _swap),
-    "a row short": lambda rng, whole: _line(
-        rng, whole, lambda lines, n: lines.__setitem__(n, b"8.1")
+    "a row short": lambda rng, one: _line(
+        rng, one, lambda rows, n: operator.setitem(rows, n, b"8")
     ),
-    "a row twice": lambda rng, whole: _line(rng, whole, lambda lines, n: lines.insert(n, lines[n])),
+    "a row twice": lambda rng, whole: _line(rng, whole, lambda rows, n: rows.insert(n, rows[n])),
     "no header": lambda _, whole: whole.split(b"\n\n" if b"\n\n" in whole else b"\n", 1)[1],
     "another library": lambda _, whole: _whole("slum" if b"Name" in whole else "ecostress")[0],
     "semicolons": lambda _, whole: whole.replace(b",", b";").replace(b"Name:", b"Title"),
@@ -115,9 +116,10 @@ _TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
 
 
 @cache
-def _film() -> bytes:
-    """A small video of a wave drawn in plasma."""
-    return hostile.video(workplace() / "whole.mp4").read_bytes()
+def _film() -> tuple[bytes, np.ndarray]:
+    """A small video of a wave drawn in plasma, and its positions."""
+    path = hostile.video(workplace() / "whole.mp4")
+    return path.read_bytes(), palettes.palette_video(path).values
 
 
 @cache
@@ -127,30 +129,25 @@ def _large() -> bytes:
     return hostile.video(workplace() / "whole.mp4", plain, preset="ultrafast").read_bytes()
 
 
+_LIST: Final = b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
+
+
 def _spoil(rng: Rng, content: bytes, what: str) -> bytes:
     """Video with its bytes damaged."""
     place = int(rng.integers(len(content) - 100))
     if what == "noise":
         first = content.index(b"mdat") + 4 + int(rng.integers(50, 1500))
         return content[:first] + rng.bytes(20) + content[first + 20 :]
-    if what == "cut":
-        return content[:place]
     if what == "size":
         return hostile.falsely_sized(content)
-    if what == "text":
-        return b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
-    if what == "zeros":
-        return content[:place] + bytes(100) + content[place + 100 :]
-    return content
+    zeros = content[:place] + bytes(100) + content[place + 100 :]
+    return {"cut": content[:place], "text": _LIST, "zeros": zeros}.get(what, content)
 
 
 def videos(rng: Rng) -> Attack:
     """Videos cut, flipped, emptied, of a false size, no files, addresses and playlists."""
-    whole, folder = _film(), workplace() / "video"
-    folder.mkdir(exist_ok=True)
-    path = folder / "film.mp4"
-    path.write_bytes(whole)
-    truth = palettes.palette_video(path).values
+    (whole, truth), path = _film(), workplace() / "video" / "film.mp4"
+    path.parent.mkdir(exist_ok=True)
     what = str(rng.choice(["flipped"] * 4 + ["noise", "cut", "size", "address", "text", "zeros"]))
     large = rng.random() < 0.05
     what, given = "large" if large else what, str(path)
@@ -179,3 +176,41 @@ _ADDRESSES: Final = (
     *("file://{}", "concat:{0}|{0}", "subfile,,start,0,end,900,,:{}", "lavfi:testsrc film"),
     *("data:video/mp4;base64,AAAA film", "pipe:0 film", "cache:{}", "http://localhost:9/film.mp4"),
 )
+
+
+@cache
+def _recording(form: str) -> Path:
+    """Recording of a form, undamaged."""
+    return hostile.write(workplace() / f"whole.{form}", form)
+
+
+def recordings(rng: Rng) -> Attack:
+    """Recordings of every form with a bit flipped, cut, zeroed, a huge number, pieces exchanged."""
+    form = str(rng.choice([*hostile.FILES, *hostile.STORES]))
+    whole, path = _recording(form), workplace() / f"recording.{form}"
+    shutil.rmtree(path, ignore_errors=True)
+    (shutil.copytree if whole.is_dir() else shutil.copy)(whole, path)
+    every = [one for one in path.rglob("*") if one.is_file()] or [path]
+    parts = sorted(one for one in every if one.stat().st_size > 64)
+    part = parts[int(rng.integers(len(parts)))]
+    before = part.read_bytes()
+    what, after = hostile.damaged(before, int(rng.integers(2**31)))
+    part.write_bytes(after)
+
+    def judge(found: xr.Dataset) -> Verdict:
+        fate = hostile.fate(form, before, after, found)
+        if fate == "marked":
+            return Verdict("flagged", "frames are marked")
+        if fate == "pixels":
+            return Verdict(LIMIT, "pixels without a checksum are what the file says")
+        return RIGHT if fate == "same" else wrong(f"{form} {what} in {part.name}: {fate}")
+
+    limit = "JPEG-LS has no checksum" if form == "csq" else ""
+    if form in hostile.STORES and "zar" not in part.name:
+        limit = "chunks without a checksum"
+    if form in {"seq", "fff"} and what == "cut":
+        limit = "a cut between two frames ends a recording"
+    if form in hostile.TIFF and what == "zero":
+        limit = "zeros may end the chain of pages"
+    act = lambda: hostile.read(path, form)  # noqa: E731
+    return Attack(f"recording {form}: {what} in {part.name}", act, judge, (path.name,), limit=limit)

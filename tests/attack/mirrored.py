@@ -125,38 +125,23 @@ def fields(rng: Rng) -> Attack:
         return wrong(f"{share:.0%} of the known pixels off", where=bool(share > 0.02))
 
     names = ("counts|band|image|pixel|frame|response|reflect|shift|chang|noise|time|texture",)
-    good = what == "nothing"
-    return Attack(
-        f"reflection_shift of {size} pixels: {what}",
-        lambda: alignment.reflection_shift(capture, response),
-        check,
-        names,
-        good,
-    )
+    act = lambda: alignment.reflection_shift(capture, response)  # noqa: E731
+    what, good = f"reflection_shift of {size} pixels: {what}", what == "nothing"
+    return Attack(what, act, check, names, good)
 
 
 def _frames_lost(rng: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[int(rng.integers(2)), rng.random(counts.shape[1]) < 0.2] = np.nan
-    return made.with_counts(counts).capture
-
-
-def _still_band(_: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[1] = counts[1].mean(axis=0)
-    return made.with_counts(counts).capture
+    return made.put((int(rng.integers(2)), rng.random(made.time.size) < 0.2), np.nan)
 
 
 def _noise_alone(rng: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[...] = rng.normal(15_000, 30, counts.shape)
-    return made.with_counts(counts).capture
+    return made.put(..., rng.normal(15_000, 30, made.counts().shape))
 
 
 _CAPTURES: Final[Mapping[str, Callable[[Rng, Scene], Any]]] = {
     "nothing": lambda _, made: made.capture,
     "frames lost": _frames_lost,
-    "a band still": _still_band,
+    "a band still": lambda _, made: made.put(1, lambda counts: counts[1].mean(axis=0)),
     "cut": lambda rng, made: made.capture.isel(x=slice(0, int(rng.integers(1, 30)))),
     "few frames": lambda rng, made: made.capture.isel(time=slice(0, int(rng.integers(1, 12)))),
     "one band": lambda _, made: made.capture.isel(band=[0]),
@@ -233,13 +218,6 @@ def completions(rng: Rng) -> Attack:
         share = off.sum() / max((marked & has).sum(), 1)
         return wrong(f"{share:.0%} of what is completed off", where=bool(share > 0.01))
 
-    names = (
-        "prior|material|label|pool|surroundings|result|counts|response|band|status|dims|'x'|'y'",
-    )
-    return Attack(
-        f"complete: {what}",
-        lambda: separation.complete(**arguments),
-        check,
-        names,
-        what in ("nothing", "no prior"),
-    )
+    names = "prior|material|label|pool|surroundings|result|counts|response|band|status|dims|'x'|'y'"
+    act, good = lambda: separation.complete(**arguments), what in ("nothing", "no prior")
+    return Attack(f"complete: {what}", act, check, (names,), good)
