@@ -45,20 +45,15 @@ def table(**rows: list[float]) -> xr.Dataset:
     )
 
 
-def library(mirror: Path) -> dict[str, xr.Dataset]:
-    """Every spectrum of the mirror, by the name that the embedded table gives as its source."""
+@pytest.fixture(scope="module")
+def spectra(mirror: Path) -> dict[str, xr.Dataset]:
+    """Every spectrum of the three libraries, by the embedded table's name."""
     paths = sorted((mirror / "ecostress").glob("*.spectrum.txt"))
     spectra = {path.name: readers.ecostress(path) for path in paths}
     slum = readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv")
     spectra |= {f"LUMA_SLUM_IR.csv:{code}": sample for code, sample in slum.items()}
     others = sorted({*(mirror / "ucsb").glob("*.csv")} - {mirror / "ucsb" / "MANIFEST.csv"})
     return spectra | {path.name: readers.ucsb(path) for path in others}
-
-
-@pytest.fixture(scope="module")
-def spectra(mirror: Path) -> dict[str, xr.Dataset]:
-    """Every spectrum of the three libraries."""
-    return library(mirror)
 
 
 @given(st.floats(0.01, 1.05), st.floats(150.0, 1000.0))
@@ -100,14 +95,6 @@ def test_weight_moves_with_temperature() -> None:
         assert float(result[0, 0]) == pytest.approx(float(upper / whole), abs=1e-8)
 
 
-@pytest.mark.parametrize("bands", [FILTERS, FILTERS.values(), list(FILTERS), tuple(FILTERS)])
-def test_bands_by_name_or_as_such(bands: list[str]) -> None:
-    """Bands are given as a mapping, as objects or by name."""
-    made = emissivity.band_table({"gray": spectrum([8, 14], [0.5, 0.5])}, bands)
-    assert made["band"].values.tolist() == list(FILTERS)
-    assert schema.check(made, "emissivity_table") is made
-
-
 def test_short_spectrum_is_averaged_if_asked() -> None:
     """On request the average runs over the covered part, and the result states its share."""
     short = {"metal": spectrum([8, 12.5], [0.1, 0.4]), "whole": spectrum([8, 14], [0.1, 0.5])}
@@ -118,13 +105,6 @@ def test_short_spectrum_is_averaged_if_asked() -> None:
     assert float(made["emissivity"][0, 0]) == pytest.approx(covered, abs=1e-12)
     assert float(made["coverage"][0, 0]) == pytest.approx(radiances[0] / radiances[1], abs=1e-12)
     np.testing.assert_array_equal(made["coverage"].sel(material="whole"), 1.0)
-
-
-def test_wrong_spectrum_is_named() -> None:
-    """The stage's own error carries the material's name."""
-    with pytest.raises(ValueError, match="Unordered 'wavelength'") as caught:
-        emissivity.band_table({"turned": spectrum([14, 8], [1, 1])}, FILTERS)
-    assert caught.value.__notes__ == ["In the spectrum of 'turned'."]
 
 
 SHORT, METAL = spectrum([8, 11], [1, 1]), spectrum([0.3, 12.5], [0.1, 0.1])
@@ -146,6 +126,7 @@ BAD: list[tuple[dict[str, object], str]] = [
         "0.0000 of band '12.1'",
     ),
     ({"spectra": {"holed": spectrum([8, 9, 14], [1, np.nan, 1])}}, "nan of 'holed' at 9e-06 m"),
+    ({"spectra": {"turned": spectrum([14, 8], [1, 1])}}, "Unordered 'wavelength'"),
     ({"temperature": 27.0}, "Invalid temperature [K] in band '8-14' 27.0"),
     ({"minimum_coverage": 0.0}, "Invalid minimum_coverage 0.0"),
     ({"minimum_coverage": 1.1}, "Invalid minimum_coverage 1.1"),

@@ -1,35 +1,27 @@
-"""Hostile files: stores, numbers, sessions, parameters, manifests, spectra and videos, damaged."""
+"""Stores of which a bit is flipped, and processes that are killed while they save."""
 
-import json
+import multiprocessing
+import os
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import redirect_stderr, redirect_stdout
+import signal
+import sys
+from collections.abc import Callable
 from functools import cache as once
-from importlib.metadata import entry_points
-from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-import yaml
 
 from attack.oracle import Attack, Verdict
 from attack.scenes import pick, scene
 from attack.stages import wrong
 from dbthermal import schema, store
 from dbthermal.instruments.recording import open_capture
-from dbthermal.instruments.session import Session
-from reproduction import cache, paths
-from reproduction import manifest as downloads
 
 Rng = np.random.Generator
-REPOSITORY: Final = Path(__file__).parents[2]
-main: Final[Callable[[list[str]], int]] = entry_points(group="console_scripts")["dbthermal"].load()
-"""The command line, as a shell finds it."""
 LINES: Final = "x" * 40  # an attribute of some length
-STORES: Final = ("result.zarr", "recording.zarr")
 
 
 @once
@@ -81,10 +73,6 @@ def _copy(name: str) -> Path:
     return target
 
 
-def _files(path: Path) -> list[Path]:
-    return sorted(file for file in path.rglob("*") if file.is_file())
-
-
 def flip(rng: Rng, path: Path) -> int:
     """Flip one bit of a file, or of another one if it is empty; its place."""
     content = bytearray(path.read_bytes())
@@ -102,7 +90,7 @@ def _open(path: Path) -> xr.Dataset:
     return opened
 
 
-def _same(path: Path, *, attributes: bool) -> Callable[[xr.Dataset], Verdict]:
+def _same(path: Path) -> Callable[[xr.Dataset], Verdict]:
     """Judge: what opens is what was written."""
     whole = store.open_dataset(originals() / path.name).load()
 
@@ -116,7 +104,7 @@ def _same(path: Path, *, attributes: bool) -> Callable[[xr.Dataset], Verdict]:
         common = {*whole.variables} & {*opened.variables}
         names |= {name for name in common if not _alike(whole[name], opened[name])}
         changed = sorted(map(str, names))
-        if not changed and attributes and whole.attrs != opened.attrs:
+        if not changed and whole.attrs != opened.attrs:
             changed = ["attributes"]
         return wrong(f"other {changed}", where=bool(changed))
 
@@ -130,319 +118,95 @@ def _alike(first: xr.DataArray, second: xr.DataArray) -> bool:
     return same and first.values.tobytes() == second.values.astype(first.dtype).tobytes()
 
 
-def _store_with(what: str, path: Path, file: Path, *, attributes: bool) -> Attack:
-    """A store with a damaged file."""
-    inside = file.relative_to(path)
-    names = (path.name, inside.parts[0] if len(inside.parts) > 1 else "")
-    judge = _same(path, attributes=attributes)
-    return Attack(f"{path.name}/{inside}: {what}", lambda: _open(path), judge, names)
-
-
 def bits(rng: Rng) -> Attack:
     """One bit flipped anywhere in a store."""
-    path = _copy(str(rng.choice(STORES)))
+    path = _copy(str(rng.choice(["result.zarr", "recording.zarr"])))
     # As likely in one file as in another: else nearly all were in the counts.
-    file = pick(rng, [file for file in _files(path) if file.stat().st_size])
-    return _store_with(f"bit of byte {flip(rng, file)} flipped", path, file, attributes=True)
-
-
-def chunks(rng: Rng) -> Attack:
-    """A chunk of a store lost, emptied, cut, exchanged with another, or from another store."""
-    path = _copy(str(rng.choice(STORES)))
-    files = [file for file in _files(path) if file.name != "zarr.json"]
-    file = pick(rng, files)
-    what = str(rng.choice(["lost", "lost", "emptied", "cut", "exchanged", "of noise", "a folder"]))
-    whole, size = file.read_bytes(), file.stat().st_size
-    if what in ("lost", "a folder"):
-        file.unlink()
-    if what == "a folder":
-        file.mkdir()
-    if what == "emptied":
-        file.write_bytes(b"")
-    if what == "cut":
-        file.write_bytes(whole[: -int(rng.integers(1, size))])
-    if what == "of noise":
-        file.write_bytes(rng.bytes(size))
-    if what == "exchanged":
-        array = file.relative_to(path).parts[0]
-        others = [f for f in files if f != file and f.relative_to(path).parts[0] == array]
-        other = pick(rng, others) if others else file
-        file.write_bytes(other.read_bytes())
-        other.write_bytes(whole)
-    return _store_with(f"chunk {what}", path, file, attributes=False)
-
-
-def stores(rng: Rng) -> Attack:
-    """Metadata of a store lost, emptied, edited or foreign; arrays renamed, lost or added."""
-    path = _copy(str(rng.choice(STORES)))
-    array = str(rng.choice(sorted(part.name for part in path.iterdir() if part.is_dir())))
-    what = str(rng.choice(list(_METADATA)))
-    _METADATA[what](rng, path, array)
-    judge = _same(path, attributes=what != "a foreign file")
-    return Attack(f"{path.name}/{array}: {what}", lambda: _open(path), judge, (path.name,))
-
-
-def _edit(rng: Rng, path: Path, array: str) -> None:
-    file = path / array / "zarr.json"
-    content = json.loads(file.read_text(encoding="utf-8"))
-    sizes = [10**9 for _ in content["shape"]]
-    worse = {"shape": sizes, "dimension_names": ["a" for _ in sizes], "data_type": "int8"}
-    worse |= {"fill_value": 7, "codecs": [], "node_type": "group"}
-    key = str(rng.choice(list(worse)))
-    file.write_text(json.dumps({**content, key: worse[key]}), encoding="utf-8")
-
-
-def _attributes(rng: Rng, path: Path, _: str) -> None:
-    file = path / "zarr.json"
-    content = json.loads(file.read_text(encoding="utf-8"))
-    key = str(rng.choice(sorted(content["attributes"])))
-    content["attributes"][key] = pick(rng, [None, -1, 1e9, "text"])
-    file.write_text(json.dumps(content), encoding="utf-8")
-
-
-def _described(change: Callable[[bytes], bytes]) -> Callable[[Rng, Path, str], Any]:
-    """Change of an array's metadata."""
-
-    def damage(_: Rng, path: Path, array: str) -> None:
-        file = path / array / "zarr.json"
-        file.write_bytes(change(file.read_bytes()))
-
-    return damage
-
-
-def _replaced(path: Path, content: bytes | None) -> None:
-    """An empty folder, or a file, in place of the store."""
-    shutil.rmtree(path)
-    if content is None:
-        path.mkdir()
-    else:
-        path.write_bytes(content)
-
-
-_METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
-    "metadata of an array lost": lambda _, path, array: (path / array / "zarr.json").unlink(),
-    "metadata lost": lambda _, path, __: (path / "zarr.json").unlink(),
-    "metadata emptied": lambda _, path, __: (path / "zarr.json").write_bytes(b""),
-    "metadata of an array emptied": _described(lambda _: b""),
-    "metadata cut": _described(lambda content: content[:-20]),
-    "metadata of another text": _described(lambda _: b"[1, 2]\xff"),
-    "an array lost": lambda _, path, array: shutil.rmtree(path / array),
-    "an array renamed": lambda _, path, array: (path / array).rename(path / f"{array}2"),
-    "metadata edited": _edit,
-    "attributes edited": _attributes,
-    "a foreign file": lambda _, path, __: (path / "notes.txt").write_text("x", encoding="ascii"),
-    "emptied": lambda _, path, __: _replaced(path, None),
-    "a file": lambda _, path, __: _replaced(path, b"PK"),
-    "gone": lambda _, path, __: shutil.rmtree(path),
-}
-
-
-def cell(value: float, seed: int) -> xr.Dataset:
-    """Something to be cached."""
-    return xr.Dataset({"drawn": ("n", value + np.random.default_rng(seed).random(300))})
-
-
-def cells(rng: Rng) -> Attack:
-    """A cached result whose file is flipped, cut, emptied, lost or foreign: computed anew."""
-    folder = workplace() / "cells"
-    shutil.rmtree(folder, ignore_errors=True)
-    cache.kept(cell, folder)(1.0, 1)
-    file = pick(rng, [file for file in _files(folder) if file.stat().st_size])
-    what = pick(rng, ["flipped", "flipped", "cut", "emptied", "lost", "of noise"])
-    content = file.read_bytes()
-    if what == "flipped":
-        flip(rng, file)
-    elif what == "lost":
-        file.unlink()
-    else:
-        kept = {"cut": content[: int(rng.integers(len(content)))], "emptied": b""}
-        file.write_bytes(kept.get(what, rng.bytes(len(content))))
-
-    def judge(found: xr.Dataset) -> Verdict:
-        return wrong("other values", where=not found.identical(cell(1.0, 1)))
-
-    act = lambda: cache.kept(cell, folder)(1.0, 1)  # noqa: E731
-    return Attack(f"cached {file.name} {what}", act, judge, (file.name,))
-
-
-def numbers(rng: Rng) -> Attack:
-    """Files of numbers cut, flipped, with other types, infinite, repeated or foreign."""
-    path = _copy("numbers.json")
-    text = path.read_text(encoding="utf-8")
-    values = ("NaN", "1e999", "null", "[1]", '0.21, "rmse_K": 0.9')
-    worse = [text[: int(rng.integers(len(text)))], *(text.replace("0.21", one) for one in values)]
-    worse += ["[]", "{}", "\x00" * 30, text.replace("rmse", "rm\udcffse"), "[" * 100_000]
-    content = str(pick(rng, worse))
-    path.write_bytes(content.encode("utf-8", "surrogateescape"))
-    # A cut may fall behind the last bracket: nothing is lost then.
-    judge = lambda got: wrong(f"{got}", where=got != {"rmse_K": 0.21, "name": "a"})  # noqa: E731
-    act = lambda: store.read_numbers(path)  # noqa: E731
-    return Attack(f"numbers {content[:60]!r}", act, judge, ("numbers.json",))
-
-
-SESSION: Final = """
-name: plate
-simulated: true
-protocol: response
-duration: 0.15
-frame_rate: 100
-shape: [4, 80]
-telemetry_rows: 2
-cameras:
-  "8-14":
-    video: "v4l2:///dev/video0"
-    control: "serial:///dev/ttyACM0"
-  "9.5":
-    video: "v4l2:///dev/video2"
-    control: "serial:///dev/ttyACM1"
-devices:
-  filter_wheel: "serial:///dev/ttyUSB0"
-  thermocouples: "tc08:"
-filters: {1: "9.5", 3: "11"}
-wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0}
-sweep: ["9.5", "11"]
-thermocouples: {1: blackbody, 4: plate}
-blackbody: {temperatures: [300.0, 290.0], stability: 0.1, window: 3, timeout: 20}
-"""
-
-_VALUES: Final[tuple[Any, ...]] = (
-    *(None, True, -1, 0, 1e400, float("nan"), 10**30, "text", "", [], {}, [0, 0], [4], [-4, 80]),
-    *([4.5, 80], [10**9, 10**9], {"a": 1}, "v4l2:///etc/passwd", "sim://", "sim://boson/"),
-    *("serial://", "tc08:/tmp/x.so", "file:///etc/passwd", "\x00", "a/b", "../../x", "sim://y16/w"),
-    *("http://localhost", [[17, 33]], [["a"]], "1" * 5000, -273.15, 20.0, "2001-01-01"),
-)
-
-
-def sessions(rng: Rng) -> Attack:
-    """Session files with values of other kinds, keys that repeat, are unknown or lost, cut text."""
-    path = workplace() / "session.yaml"
-    content = yaml.safe_load(SESSION)
-    what = str(rng.choice(["value", "value", "value", "value", "lost", "unknown", "twice", "text"]))
-    holder, key = pick(rng, [*_places(content)])
-    if what == "value":
-        holder[key] = _VALUES[int(rng.integers(len(_VALUES)))]
-    elif what == "lost":
-        del holder[key]
-    elif what == "unknown":
-        (holder if isinstance(holder, dict) else content)[key := f"{key}x"] = 1
-    text = yaml.safe_dump(content, allow_unicode=True)
-    if what == "twice":
-        key = str(rng.choice(["name", "duration", "simulated", "protocol"]))
-        text = f"{SESSION}{key}: 3\n"
-    elif what == "text":
-        text, key = _broken(rng, SESSION), path.name
-    path.write_bytes(text.encode("utf-8", "surrogateescape"))
-    judge = lambda found: _session_verdict(found, what, path, str(key))  # noqa: E731
-    shown = str(holder[key])[:30] if what == "value" else text[-30:]
-    return Attack(f"session {what} {key}: {shown!r}", lambda: _dry_run(path), judge)
-
-
-def _places(content: Any) -> Any:
-    """Holders and keys of all values."""
-    pairs = content.items() if isinstance(content, dict) else enumerate(content)
-    for key, value in list(pairs):
-        yield content, key
-        if isinstance(value, (dict, list)):
-            yield from _places(value)
-
-
-def _broken(rng: Rng, text: str) -> str:
-    place = int(rng.integers(len(text)))
-    worse = ["\t", "]", "{", "\udcff", ": :", "&a *b", "!!python/object/apply:os.system ['true']"]
-    kind = int(rng.integers(3))
-    if kind == 0:
-        return text[:place]
-    if kind == 1:  # nine times as much a line
-        pairs = zip("abcdefgh", "bcdefghi", strict=True)
-        levels = [f"{c}: &{c} [{','.join(['*' + b] * 9)}]" for b, c in pairs]
-        return "\n".join(["a: &a [x,x,x,x,x,x,x,x,x]", *levels]) + text
-    return text[:place] + str(pick(rng, worse)) + text[place:]
-
-
-def _dry_run(path: Path) -> tuple[int, str, str]:
-    """Exit status, output and error of ``dbthermal record --simulate --dry-run``."""
-    out, err = StringIO(), StringIO()
-    with redirect_stdout(out), redirect_stderr(err):
-        folder = str(workplace() / "recordings")
-        status = main(["record", str(path), folder, "--simulate", "--dry-run"])
-    return status, out.getvalue(), err.getvalue()
-
-
-def _session_verdict(found: tuple[int, str, str], what: str, path: Path, key: str) -> Verdict:
-    """Status 2 and an error that names the key, or a session that is really as described."""
-    status, _, err = found
-    if status == 0:
-        if what in ("twice", "unknown"):
-            return wrong(f"{what} key '{key}' is accepted")
-        session = Session.load(path)
-        sane = 0 < session.shape[0] * session.shape[1] < 1e8 and 0 < session.duration < 1e7
-        return wrong(f"accepted: {session}", where=not sane)
-    named = key in err or path.name in err
-    if named and "Traceback" not in err:
-        return Verdict("refused", err[:200])
-    return Verdict("traceback", f"status {status}, names not '{key}': {err[:300]}")
-
-
-def _file_of(name: str, path: Path, text: str, act: Callable[[], Any]) -> Callable[[], Any]:
-    """A call that finds a file of the checkout with another text."""
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(text.encode("utf-8", "surrogateescape"))
-
-    def call() -> Any:
-        kept = getattr(paths, name)
-        setattr(paths, name, lambda *_: path)
-        try:
-            return act()
-        finally:
-            setattr(paths, name, kept)
-
-    return call
-
-
-def parameters(rng: Rng) -> Attack:
-    """``params/<notebook>.yaml`` with repeated or broken text, as the notebooks' Run reads it."""
-    from reproduction import run  # noqa: PLC0415 - imports what the notebooks need
-
-    stem = str(rng.choice(sorted(p.stem for p in (REPOSITORY / "params").glob("0[1-6]*.yaml"))))
-    text = (REPOSITORY / "params" / f"{stem}.yaml").read_text(encoding="utf-8")
-    good = {**yaml.safe_load(text), "results": "full"}
-    spoilt = {"twice": f"{text}\nseed: 3\nseed: 4\n", "broken": _broken(rng, text)}
-    spoilt |= {"list": "[1, 2]", "empty": "", "lost": f"{text}\nno_such_parameter: 1\n"}
-    what = str(rng.choice(list(spoilt)))
-
-    def judge(got: Any) -> Verdict:
-        return wrong(f"accepted {got}"[:200], where=what == "twice" or not set(got) <= set(good))
-
-    act = lambda: run.Run(stem, good).provenance["parameters"]  # noqa: E731
-    call = _file_of("params", workplace() / "params" / f"{stem}.yaml", spoilt[what], act)
-    return Attack(f"parameters of {stem}: {what}", call, judge, (f"{stem}|no_such_parameter",))
-
-
-def manifest(rng: Rng) -> Attack:
-    """``data_manifest.yaml`` with names that leave the folder, other sizes, broken text."""
-    entry = {"name": "a.txt", "sha256": "0" * 64, "bytes": 3}
-    collection: dict[str, Any] = {"title": "t", "origin": "https://localhost/", "citation": ["c"]}
-    collection |= {"terms": "t", "used_by": ["u"], "note": "n", "files": [entry]}
-    what = str(
-        rng.choice(["file", "collection", "origin", "sha256", "bytes", "twice", "broken", "key"])
+    file = pick(
+        rng, [one for one in sorted(path.rglob("*")) if one.is_file() and one.stat().st_size]
     )
-    name = str(pick(rng, ["../a", "/etc/passwd", "..", ".", "", "a/b", "a\x00"]))
-    if what == "origin":
-        collection["origin"] = pick(rng, ["file:///etc/", "", "/etc/"])
-    if what == "key":
-        collection["keyx"] = 1
-    entry |= {"file": {"name": name}, "sha256": {"sha256": "z" * 64}}.get(what, {})
-    entry |= {"bytes": pick(rng, [-1, 0, 1.5])} if what == "bytes" else {}
-    kind = name if what == "collection" else "spectra"
-    text = yaml.safe_dump({"collections": {kind: collection}})
-    text = text + text if what == "twice" else _broken(rng, text) if what == "broken" else text
+    place, inside = flip(rng, file), file.relative_to(path)
+    names = (path.name, inside.parts[0] if len(inside.parts) > 1 else "")
+    what = f"bit of byte {place} of {path.name}/{inside} flipped"
+    return Attack(what, lambda: _open(path), _same(path), names)
 
-    def judge(got: Any) -> Verdict:
-        return wrong(f"accepted {got}"[:300], where=what != "broken" or not got.collections)
 
-    call = _file_of("manifest", workplace() / "data_manifest.yaml", text, downloads.load)
-    names = ("data_manifest|spectra|name|bytes|origin|sha256|collection",)
-    return Attack(f"manifest: {what} {name!r}", call, judge, names)
+_OPERATIONS: Final = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")
+_DEADLINE: Final = 600  # longest life of a process, on a busy machine too [s]
+
+
+def kills(rng: Rng) -> Attack:
+    """A kill while a result or numbers are saved over an earlier one: one is there, whole."""
+    folder = workplace() / "ended"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    kind = str(rng.choice(["result.zarr", "numbers.json"]))
+    place = int(rng.integers(1, 150 if kind == "result.zarr" else 12))
+    source, target = originals() / kind, folder / kind
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copy(source, target)
+
+    def judge(_: Any) -> Verdict:
+        if not target.exists():
+            return Verdict("refused")
+        if kind == "numbers.json":
+            value = store.read_numbers(target)["rmse_K"]
+            return wrong(f"{value}", where=value not in (0.21, 0.42))
+        try:
+            opened = store.open_dataset(target).load()
+        except ValueError as error:
+            return Verdict("rejected", f"the result does not open: {error}")
+        before = store.open_dataset(source).load()
+        counts = opened["counts"].values
+        whole = np.array_equal(counts, before["counts"]) or np.array_equal(counts, _later())
+        return wrong("neither the earlier nor the later result", where=not whole)
+
+    what = f"saving {kind} over another, SIGKILL at file operation {place}"
+    return Attack(what, lambda: _end(target, place), judge)
+
+
+@once
+def _later() -> Any:
+    return scene(np.random.default_rng(2), shape=(16, 20)).counts()
+
+
+def _save(path: Path) -> None:
+    if path.suffix == ".json":
+        store.save_numbers({"rmse_K": 0.42}, path, {})
+    else:
+        later = scene(np.random.default_rng(2), shape=(16, 20))
+        store.save(later.capture, path, store.provenance({}))
+
+
+def _end(path: Path, place: int) -> None:
+    """Run a process that saves until its n-th file operation, and kill it so."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    process = context.Process(target=_run, args=(path, place))
+    process.start()
+    process.join(_DEADLINE)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
+        raise TimeoutError(f"Still running {_DEADLINE} s after a kill at file operation {place}")
+
+
+def _run(path: Path, place: int) -> None:
+    """Count the file operations in a folder, and kill this process at one of them."""
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    seen = 0
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        nonlocal seen
+        seen += event in _OPERATIONS and str(path) in str(arguments[0])
+        if seen == place:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(hook)
+    _save(path)
 
 
 def leave() -> None:

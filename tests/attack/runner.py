@@ -11,19 +11,17 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, kills, media, mirrored, stages, steps
+from attack import arrays, files, mirrored, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
 
 _SHARES: Final = {
     arrays: "clean 6 gray 10 dtypes 4 samples 12 clocks 10 shapes 4 responses 4 windows 5",
-    mirrored: "shifts 6 fields 2 completions 6",
-    stages: "offset 6 align 6 register 3 correct_capture 5 pixels 5 fit_response 8",
+    mirrored: "shifts 6 completions 6",
+    stages: "offset 6 align 6 register 3 correct_capture 5 fit_response 8",
     steps: "steps 17",
-    files: "bits 8 chunks 5 stores 5 cells 1 numbers 3 sessions 10 parameters 3 manifest 3",
-    media: "spectra 8 videos 8 recordings 8",
-    kills: "kills 4",
+    files: "bits 8 kills 4",
 }
 CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     name: (getattr(module, name), int(share))

@@ -249,36 +249,6 @@ _CORRECTIONS: Final[Mapping[str, Callable[[Rng, Scene, xr.Dataset], Pair]]] = {
 }
 
 
-def pixels(rng: Rng) -> Attack:
-    """`mark_bad` and `find_shutter` of captures with scattered NaN, and with events to be found."""
-    made = scene(rng, shape=(12, 16), time=clock(200))
-    counts, blinking = made.counts(), (int(rng.integers(2, 10)), int(rng.integers(2, 14)))
-    share, late = float(rng.choice([0, 0.01, 0.1, 0.3, 0.6])), int(rng.integers(90, 150))
-    blinks = rng.random() < 0.5
-    if blinks:
-        steps = rng.choice([0, 40], (200, 1)) * made.noise[0] * rng.choice([-1, 1], (200, 1))
-        counts[0, :, blinking[0], blinking[1]] += steps[:, 0]
-    else:
-        length = int(rng.integers(3, 12))
-        counts[1, late : late + length] = counts[1, late - 1]
-    if share or blinks:
-        counts[rng.random(counts.shape) < share] = np.nan
-    spoilt = made.with_counts(counts).capture
-
-    def marked(found: xr.Dataset) -> Verdict:
-        return wrong("a pixel that jumps is not marked", where=not int(found["status"][blinking]))
-
-    def seen(events: xr.Dataset) -> Verdict:
-        if share:  # copies that NaN breaks are no copies, and marked as missing
-            return RIGHT
-        found = (events["first_frame"].values.tolist(), events["frames"].values.tolist())
-        return wrong(f"events {found}", where=found != ([late], [length]))
-
-    step, judge = (correction.mark_bad, marked) if blinks else (correction.find_shutter, seen)
-    what = f"{step.__name__} with {share:.0%} scattered NaN"
-    return Attack(what, lambda: step(spoilt), judge, ("counts|frame|pixel|NaN|band",))
-
-
 def fit_response(rng: Rng) -> Attack:
     """`fit_response` of counts that saturate, are swapped, of another unit, or follow no curve."""
     bands, number = ("8-14", "9.5"), int(rng.choice([5, 8, 12]))

@@ -158,13 +158,17 @@ def test_maker_formula(mirror: Path, name: str) -> None:
     assert 240 < expected.min() < expected.max() < 400
 
 
+def constants(f: float = 1.0) -> dict[str, Any]:
+    """Attributes of a camera by its maker."""
+    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": f, "O": -6000}
+    attrs = {f"file_planck_{key}": value for key, value in values.items()}
+    return attrs | {"file_range_min": 233.15, "file_range_max": 423.15}
+
+
 @pytest.mark.parametrize("f", [0.5, 1.0, 1.5, 2.0])
 def test_maker_form(f: float) -> None:
     """For any F the Sakuma-Hattori form is within 0.2 K of the maker's, over the whole range."""
-    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": f, "O": -6000}
-    attrs = {f"file_planck_{key}": value for key, value in values.items()}
-    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
-    made = calibration.maker_response({"8-14": attrs})
+    made = calibration.maker_response({"8-14": constants(f)})
     temperature = np.linspace(233.15, 423.15, 500)
     counts = 16000.0 / (0.0125 * (np.exp(1430.0 / temperature) - f)) + 6000
     error = responses.curve(made, "8-14").inverse(counts) - temperature
@@ -187,13 +191,8 @@ def test_maker_form(f: float) -> None:
 )
 def test_maker_constants_are_checked(key: str, value: float | None, message: str) -> None:
     """A constant that is missing or impossible is named with its band."""
-    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": 1.0, "O": -6000}
-    attrs = {f"file_planck_{name}": number for name, number in values.items()}
-    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
-    if value is None:
-        del attrs[f"file_{key}"]
-    else:
-        attrs[f"file_{key}"] = value
+    attrs = {**constants(), f"file_{key}": value}
+    attrs = {name: number for name, number in attrs.items() if number is not None}
     with pytest.raises(ValueError, match=message):
         calibration.maker_response({"8-14": attrs})
     for kind, files in {"float": attrs, "list": [attrs]}.items():

@@ -199,6 +199,8 @@ def test_declared_frames_are_counted(tmp_path: Path) -> None:
     """What a table or the container declares is compared with the frames in the file."""
     path = hostile.video(tmp_path / "a.mp4")
     whole = path.read_bytes()
+    path.write_bytes(hostile.falsely_sized(whole))
+    assert palettes.palette_video(path).shape == (12, 48, 64)  # as its stream says
     table, play, index = whole.index(b"stsz"), whole.index(b"elst") + 12, whole.index(b"moov") - 4
     millions = (1).to_bytes(4) + (10_000_000).to_bytes(4)
     for changed, message in (
