@@ -419,13 +419,9 @@ calibrate --at 25,0C a.tif b.tif -o a.zarr -> temperature '25,0C'. Must be a num
 """.replace("\n -", " -").strip()
 UNUSED = f"""
 import scene.zarr --unit K -o x.zarr -> unit a store
-import scene.zarr --clock=99 -o x.zarr -> clock a store
 import scene.zarr --offset 5 -o x.zarr --dry-run -> offset a store
-import scene.zarr --bands a b -o x.zarr -> bands a store
 {ONE} --shape 3 3 -o x.zarr -> shape TIFF
-{ONE} --header 0 -o x.zarr -> header TIFF
 {ONE} --byte-order big -o x.zarr -> byte-order TIFF
-{ONE} --variable q -o x.zarr -> variable TIFF
 import a.seq b.seq --bands a b --unit count -o x.zarr -> unit FLIR
 import a.seq + b.npy --shape 9 9 -o x.zarr --variable q --header 3 ->
 info scene.zarr --clock 10 -> clock a store
@@ -440,7 +436,6 @@ align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
 separate aligned.zarr response.zarr --method naive --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
-export result.zarr --region 0 1 0 1 -o x.nc -> region .nc
 export result.zarr --variable emissivity -o x.nc -> variable .nc
 """.strip()
 
@@ -483,21 +478,6 @@ def test_options_without_effect_are_refused(results: Path, row: str) -> None:
     line = refused(results, *arguments.split())
     rule = rf"Unused option --{option}\. Must be left out with(out)? {re.escape(why)}"
     assert re.search(rule, line) if option else "Unused" not in line
-
-
-def test_compiling_is_noticed_once(tmp_path: Path) -> None:
-    """What is compiled anew, however much, is one line on the standard error."""
-    code = """if True:
-    from dbthermal._cli.steps import tell_of_compiling
-    from numba import njit
-    tell_of_compiling()
-    for power in (1, 2):
-        assert njit(lambda x: x**power)(3) == 3**power
-    """
-    found = run(tmp_path, "data", before=f"exec({code!r}); ")
-    told, took = found.stderr.splitlines()
-    assert told == "Compiling the separation, once after an installation: about a minute."
-    assert took.startswith("data: ")
 
 
 def test_the_explorer_says_what_it_lacks(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:

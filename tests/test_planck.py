@@ -1,6 +1,7 @@
 """Planck's law against closed forms and constants that it must contain."""
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -118,11 +119,12 @@ def test_what_is_no_number_is_refused(value: object) -> None:
 def test_stated_units_must_agree() -> None:
     """A DataArray whose units are not those in the name raises a ValueError."""
     celsius, micrometres = (xr.DataArray([10.0], attrs={"units": u}) for u in ("degC", "um"))
-    for call, name in (
+    calls: list[tuple[Callable[[], object], str]] = [
         (lambda: planck.spectral_radiance(micrometres, 300.0), "'um' of wavelength [m]"),
         (lambda: planck.spectral_radiance(1e-5, celsius), "'degC' of temperature [K]"),
         (lambda: get("9.5").slope(celsius), "'degC' of temperature [K]"),
-    ):
+    ]
+    for call, name in calls:
         with pytest.raises(ValueError, match=re.escape(f"Invalid units {name}")):
             call()
     radiance = xr.DataArray([1e7], attrs={"units": "W m-2 sr-1 m-1"})

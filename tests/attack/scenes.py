@@ -156,9 +156,9 @@ def scene(
         share = emissivity[place]
         counts[place] = share * counts_of(band, x) + (1 - share) * counts_of(band, y)
         counts[place] += rng.normal(0, noise[place], x.shape)
-    films = (film.reshape(-1, *shape) for film in (warm, cold))
+    warm, cold = (film.reshape(-1, *shape) for film in (warm, cold))
     maps = np.broadcast_to(emissivity[:, None, None], (bands, *shape)).copy()
-    made = Scene(names, time, *films, maps, noise, delay)
+    made = Scene(names, time, warm, cold, maps, noise, delay)
     values = counts.reshape(bands, -1, *shape).astype(np.float32)
     made.capture = xr.Dataset(
         {"counts": (("band", "time", "y", "x"), values, {"units": "count"})},

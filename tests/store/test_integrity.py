@@ -180,7 +180,7 @@ FAULTS: dict[str, Callable[[Path], Path]] = {
     "other attributes": spoilt(
         "zarr.json", lambda c: c.replace(b'"attributes": {', b'"attributes": {"x": 1,')
     ),
-    "an array renamed": lambda path: (path / "band").rename(path / "band2") and path / "band",
+    "an array renamed": lambda path: (path / "band").rename(path / "band2").with_name("band"),
     "no array": no_array,
     "an array of an earlier state": spoilt(
         "band/zarr.json", lambda content: content.replace(b'"shape"', b'"shape" ')
