@@ -212,10 +212,7 @@ def test_what_papermill_injects_is_checked() -> None:
 
 
 def test_parameters_are_refused_before_the_notebook_runs(
-    folder: Path,
-    project: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    folder: Path, project: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The command says what is wrong, fails, and leaves what is there."""
     (project / "a.yaml").write_text("frmaes: 3")

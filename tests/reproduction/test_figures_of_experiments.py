@@ -164,10 +164,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
         {"median error of the object temperature [K]"},
     ),
     "error_over_bound": (draw_over_bound, {RATIO, OBJECT, "error / bound [1]", NOISE}),
-    "error_over_bands": (
-        draw_over_bands,
-        {OBJECT, "error / bound [1]", "bands [\N{MICRO SIGN}m]"},
-    ),
+    "error_over_bands": (draw_over_bands, {OBJECT, "error / bound [1]", "bands [\N{MICRO SIGN}m]"}),
     "pooling": (draw_pooling, {RATIO, OBJECT, "pixels of one material [1]"}),
     "pooled_materials": (draw_pooled, {"reflection ratio [1]"}),
     "validity": (
@@ -176,12 +173,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     ),
     "offsets": (
         draw_offsets,
-        {
-            "error of the offset [frame]",
-            RMSE,
-            "flagged [%]",
-            "offset of the second band [frame]",
-        },
+        {"error of the offset [frame]", RMSE, "flagged [%]", "offset of the second band [frame]"},
     ),
     "disturbances": (lambda **attrs: figures.disturbances(treated("nuisance", **attrs)), {RMSE}),
     "parallax": (

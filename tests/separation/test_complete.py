@@ -179,19 +179,13 @@ def test_frames_that_no_pixel_has(half: Case) -> None:
         ({"prior": emissivity_of(1.2, 0.9)}, r"Invalid emissivities \[1.2, 0.9\] of the prior"),
         ({"prior": "glas"}, "Unknown prior 'glas'"),
         ({"surroundings": 22.0}, r"Invalid surroundings \[K\] 22.0.* not in degrees Celsius"),
-        (
-            {"surroundings": 2e4},
-            r"Invalid surroundings \[K\] 20000.0. Must lie in",
-        ),
+        ({"surroundings": 2e4}, r"Invalid surroundings \[K\] 20000.0. Must lie in"),
         ({"workers": 0}, "Invalid number of workers 0. Must be a whole number, at least 1"),
         (
             {"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})},
             "Invalid units 'degC' of surroundings",
         ),
-        (
-            {"surroundings": 295.0, "surroundings_std": 0.0},
-            r"Invalid surroundings_std \[K\] 0.0",
-        ),
+        ({"surroundings": 295.0, "surroundings_std": 0.0}, r"Invalid surroundings_std \[K\] 0.0"),
         (
             {"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))},
             "Invalid size 3 of 'y' of the pool",

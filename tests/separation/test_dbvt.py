@@ -185,8 +185,7 @@ def test_exact_response_is_taken_out() -> None:
     """Taking out the bend of the exact response at least halves the emissivity's error."""
     scene, capture, response = glass(QUIET, 40)
     bent = errors(
-        scene,
-        separation.solve(capture, response, "dbvt", settings=DbvtSettings(bend_updates=0)),
+        scene, separation.solve(capture, response, "dbvt", settings=DbvtSettings(bend_updates=0))
     )
     straight = errors(scene, separation.solve(capture, response, "dbvt"))
     print(f"linear identities {bent}, bend taken out {straight}")

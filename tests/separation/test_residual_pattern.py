@@ -75,10 +75,7 @@ def cover(seed: int) -> dict[str, float]:
     raw = simulation.capture(simulation.observe(scene, response, rng), detector)
     corrected = correction.correct_capture(raw, fitted)
     shares = {}
-    for name, capture in {
-        "with": corrected,
-        "without": corrected.drop_vars("pattern_std"),
-    }.items():
+    for name, capture in {"with": corrected, "without": corrected.drop_vars("pattern_std")}.items():
         result = separation.solve(capture, response)
         good = result["status"] == 0
         error = result["object_temperature"] - scene["object_temperature"]

@@ -15,9 +15,7 @@ TIME = np.arange(350) / 10.0
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
-def test_order_of_bands_and_tiles_does_not_matter(
-    glass: Glass,
-) -> None:
+def test_order_of_bands_and_tiles_does_not_matter(glass: Glass) -> None:
     """The same pixels give the same values with the bands exchanged, and one by one."""
     _, capture, response = glass
     whole = separation.solve(capture, response)
