@@ -58,16 +58,6 @@ def test_sweep_names_its_cases() -> None:
     xr.testing.assert_equal(swept.sel(case="quiet", drop=True)[list(alone)], alone)
 
 
-def test_kind_of_response_of_a_case() -> None:
-    """A straight line is no response of 60 degrees."""
-    kinds = [
-        experiments.run_case(GLASS | {"response_kind": kind}, Rig(), TIME, 60, 1)
-        for kind in ("exact", "linear")
-    ]
-    exact, linear = (float(experiments.score(*one)["object_temperature_rmse"]) for one in kinds)
-    assert linear > 1.5 > exact + 1.0  # K
-
-
 def drawn(**changes: Any) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
     """Scene, capture and response of a case of glass with changes."""
     return simulate(GLASS | changes, Rig(), TIME, 20, seed=4)

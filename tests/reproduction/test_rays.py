@@ -102,15 +102,6 @@ def test_sphere_mirrors_as_the_law_says() -> None:
     assert np.degrees(np.arccos(cosines.min())) < 0.2
 
 
-def test_mirror_law() -> None:
-    """The angle to the normal is kept, and mirroring twice is the identity."""
-    directions, normals = unit(np.random.default_rng(2).normal(size=(2, 50, 3)))
-    mirrored = mirror(directions, normals)
-    sums = np.sum((directions + mirrored) * normals, axis=1)
-    np.testing.assert_allclose(sums, 0.0, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(mirror(mirrored, normals), directions, rtol=0, atol=1e-14)
-
-
 def test_sphere_covers_its_solid_angle() -> None:
     """The pixels on a sphere, weighted by their solid angle, add up to that of its cone."""
     forward = DIRECTIONS @ FRONT.axes[2]

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from reproduction.twins import solids, surfaces
-from reproduction.twins.rays import vertex_normals
 
 SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "plate": lambda: surfaces.plate(0.3, 0.2, 0.01),
@@ -99,13 +98,6 @@ def test_capsule_lies_between_its_ends(end: tuple[float, float, float]) -> None:
     along = np.clip(capsule.vertices @ axis / (axis @ axis), 0.0, 1.0)
     distance = np.linalg.norm(capsule.vertices - along[:, None] * axis, axis=1)
     np.testing.assert_allclose(distance, 0.02, rtol=0, atol=2e-6)
-
-
-def test_normals_of_a_sphere() -> None:
-    """The vertex normals of a sphere point along its radii, within half a degree."""
-    ball = surfaces.ellipsoid((0.1, 0.1, 0.1), (0, 0, 0), 0.01)
-    cosine = np.einsum("vi,vi->v", vertex_normals(ball), ball.vertices / 0.1)
-    assert cosine.min() > np.cos(np.deg2rad(0.5))
 
 
 @pytest.mark.parametrize(
