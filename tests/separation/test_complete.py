@@ -21,12 +21,6 @@ TIME = np.arange(200) / 10.0
 SMALL = Picture(shape=(20, 24))
 NOBODY = replace(SMALL, walkers=1, warmer=(0.0, 0.0))
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
-COMPLETED = (
-    Status.COMPLETED_FROM_MATERIAL
-    | Status.COMPLETED_FROM_PRIOR
-    | Status.COMPLETED_FROM_SURROUNDINGS
-    | Status.COMPLETED_FRAMES
-)
 
 
 def draw(picture: Picture, seed: int, *emissivity: float) -> Case:
@@ -97,14 +91,8 @@ def test_known_material_and_surroundings_narrow_the_bars() -> None:
     """The table's glass and a room stated within 0.3 K leave a fraction of the library's bar."""
     scene, capture, alone = draw(NOBODY, 3, 0.86, 0.72)
     wide = separation.complete(alone, capture, RESPONSE)
-    narrow = separation.complete(
-        alone,
-        capture,
-        RESPONSE,
-        surroundings=ROOM,
-        surroundings_std=0.3,
-        prior="plate window glass",
-    )
+    room = {"surroundings": ROOM, "surroundings_std": 0.3}
+    narrow = separation.complete(alone, capture, RESPONSE, **room, prior="plate window glass")
     name = "object_temperature"
     error = abs(narrow[name] - scene[name])
     assert float(narrow[f"{name}_std"].mean()) < 0.6 * float(wide[f"{name}_std"].mean())
@@ -159,20 +147,6 @@ def test_gaps_of_single_pixels(half: Case) -> None:
     assert within > 0.9
 
 
-def test_frames_that_no_pixel_has(half: Case) -> None:
-    """Frames without data of a camera stay empty, are counted, and leave no flag at a pixel."""
-    _, capture, _ = half
-    frames = [0, 50, 51, 52, 53, 54, 55, 120, 199]
-    lost = capture.copy(deep=True)
-    lost["counts"].values[1, frames] = np.nan
-    alone = separation.solve(lost, RESPONSE)
-    whole = separation.complete(alone, lost, RESPONSE)
-    empty = whole["object_temperature"].isnull()
-    np.testing.assert_array_equal(np.flatnonzero(empty.all(("y", "x"))), frames)
-    assert int(empty.any(("y", "x")).sum()) == whole.attrs["frames_missing"] == len(frames)
-    assert bool((whole["status"].where(alone["status"] == 0, 0) == 0).all())
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -181,15 +155,9 @@ def test_frames_that_no_pixel_has(half: Case) -> None:
         ({"surroundings": 22.0}, r"Invalid surroundings \[K\] 22.0.* not in degrees Celsius"),
         ({"surroundings": 2e4}, r"Invalid surroundings \[K\] 20000.0. Must lie in"),
         ({"workers": 0}, "Invalid number of workers 0. Must be a whole number, at least 1"),
-        (
-            {"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})},
-            "Invalid units 'degC' of surroundings",
-        ),
+        ({"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})}, "Invalid units 'degC' of"),
         ({"surroundings": 295.0, "surroundings_std": 0.0}, r"Invalid surroundings_std \[K\] 0.0"),
-        (
-            {"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))},
-            "Invalid size 3 of 'y' of the pool",
-        ),
+        ({"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))}, "Invalid size 3 of"),
     ],
 )
 def test_wrong_knowledge_is_named(half: Case, changes: dict[str, Any], message: str) -> None:
@@ -220,11 +188,7 @@ def test_bands_of_no_library_are_refused_before_the_work() -> None:
 
 @pytest.mark.long
 def test_unknown_materials_hold() -> None:
-    """Nobody walks before materials of the libraries: intervals hold over these, of each or none.
-
-    What completes the pixels of one material, of which nothing is measured, is one prior: its error
-    is that of all of them.
-    """
+    """Nobody walks before materials of the libraries: one prior completes all pixels of each."""
     mixture, rng = emissivity_module.library_mixture(list(RIG.bands)), np.random.default_rng(31)
     parts = mixture["weight"].values, mixture["mean"].values, mixture["covariance"].values
     covers, errors = list[float](), list[list[float]]()
@@ -236,20 +200,14 @@ def test_unknown_materials_hold() -> None:
         scene, capture, alone = draw(replace(NOBODY, shape=(4, 6)), len(covers), *material)
         whole = separation.complete(alone, capture, RESPONSE)
         reading = separation.solve(capture, RESPONSE, "apparent")
-        off = [
-            abs(one["object_temperature"] - scene["object_temperature"]) for one in (whole, reading)
-        ]
+        truth = scene["object_temperature"]
+        off = [abs(one["object_temperature"] - truth) for one in (whole, reading)]
         assert bool(off[0].notnull().all())
         covers.append(float((off[0] < 1.96 * whole["object_temperature_std"]).mean()))
         errors.append([float(one.median()) for one in off])
     worse = np.array([completed > read for completed, read in errors])
     median = np.median(errors, axis=0)
-    more = max(completed / read for completed, read in errors)
-    print(
-        f"{len(covers)} materials: intervals hold {np.mean(covers):.3f}; {median[0]:.3f} K, "
-        f"reading {median[1]:.3f} K; farther off than that in {worse.mean():.3f}, "
-        f"at most {more:.2f} times"
-    )
+    print(f"intervals hold {np.mean(covers):.3f}; {median} K; worse in {worse.mean():.3f}")
     assert 0.9 <= np.mean(covers) <= 0.99
     # A prior is wrong of one material in twenty.
     assert worse.mean() <= 0.1

@@ -184,6 +184,19 @@ def test_cameras_apart_are_as_good_as_at_one_place(shelf: Shelf) -> None:
     assert not unpaired[:, SHAPE[1] // 2 :].any()
 
 
+def test_shutter_events_that_nobody_marks_are_flagged(shelf: Shelf) -> None:
+    """Without the numbers of the segments hardly a pixel is wrong and has no flag."""
+    scene = shelf.scene("shutter events")
+    result = separation.solve(scene.capture.drop_vars("segment"), scene.response)
+    good = result["status"] == 0
+    error = result["object_temperature"] - scene.truth["object_temperature"]
+    off = (error**2).mean("time") ** 0.5
+    print(
+        f"without a flag {float(good.mean()):.3f}, right {float((good & (off < 0.5)).mean()):.3f}"
+    )
+    assert float(good.mean()) < 0.3
+
+
 def test_a_thermostat_is_no_constant_object(shelf: Shelf) -> None:
     """What changes before a room at rest is not what the plate mirrors."""
     status = shelf.outcome("thermostat").result["status"].values
