@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,12 +35,6 @@ OBJECT, BACKGROUND = "object_temperature", "background_temperature"
 def rng(seed: int = 1) -> np.random.Generator:
     """Seeded random numbers."""
     return np.random.default_rng(seed)
-
-
-@pytest.fixture
-def scan(mirror: Path) -> trimesh.Trimesh:
-    """The Stanford bunny."""
-    return trimesh.load_mesh(mirror / "meshes" / "stanford-bunny.obj", process=False)
 
 
 @pytest.mark.parametrize("name", TWINS)
@@ -109,16 +102,6 @@ def test_a_scan_is_stood_on_the_table() -> None:
     np.testing.assert_allclose(stood.vertices[:, 2].min(), 0.0, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(np.ptp(stood.vertices[:, 2]), 0.15, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
-
-
-@pytest.mark.data
-def test_the_whole_scan_is_seen(scan: trimesh.Trimesh) -> None:
-    """All of the scanned bunny is seen, its head in the left half, and nothing comes before it."""
-    stage = solids.bunny(LONG, rng(), scan=scan)
-    assert inside(stage)
-    head = stage.mesh.vertices[:, 2] > 0.11
-    assert stage.mesh.vertices[head, 0].mean() < -0.01  # m
-    assert not obstructed(stage, LONG.time[::2])
 
 
 VESSELS = ["wineglass", pytest.param("coffee_pot", marks=pytest.mark.slow)]
