@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from scenes import held
 
 from dbthermal import schema, separation, simulation
 from dbthermal.simulation import Background, Rig
@@ -45,20 +46,9 @@ def test_subspace_reaches_the_design(
     assert limit is None or rmse <= limit
     assert np.all(errors <= of_emissivity)
     assert float(score["with_temperature"]) > 0.99
-    error = abs(result["object_temperature"] - scene["object_temperature"])
-    within = (error < 1.96 * result["object_temperature_std"]).where(result["status"] == 0)
-    print(f"intervals {float(within.mean()):.3f}, flagged {float((result['status'] != 0).mean())}")
-    assert 0.92 <= float(within.mean()) <= 0.98
+    assert 0.92 <= held(result, scene, where=result["status"] == 0) <= 0.98
     if pair == (0.86, 0.72):
         assert float((result["status"] != 0).mean()) < 0.02
-
-
-def test_ratio_scatters_as_the_bound_allows() -> None:
-    """The reflection ratio's scatter is the Cramer-Rao bound's within 10 %."""
-    scene, result = experiments.run_case(glass_case(), RIG, TIME, 1000, seed=3)
-    efficiency = experiments.efficiency(scene, result, (0.03, 0.35), order=5)
-    print(f"scatter of the ratio over its bound: {efficiency:.3f}")
-    assert efficiency == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("pair", [(0.95, 0.85), (0.86, 0.72), (0.3, 0.5)], ids=str)
@@ -105,15 +95,10 @@ def test_fast_object_is_as_true_as_a_slow_one() -> None:
         parts = (TIME, emissivity_of(0.86, 0.72), Background(), 300, rng)
         scene = simulation.independent_pixels(*parts, **ends, time_constant=constant)
         result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
-        error = abs(result["object_temperature"] - scene["object_temperature"])
         good = result["status"] == 0
-        within = (error < 1.96 * result["object_temperature_std"]).where(good)
-        start = float(within.isel(time=slice(0, 10)).mean())
-        share = float(good.mean())
-        print(f"{constant} s: good {share:.3f}, {float(within.mean()):.3f}, start {start:.3f}")
-        assert share > 0.95
-        assert 0.92 <= within.mean() <= 0.98
-        assert start > 0.9
+        assert float(good.mean()) > 0.95
+        assert 0.92 <= held(result, scene, where=good) <= 0.98
+        assert held(result.isel(time=slice(0, 10)), scene, where=good) > 0.9
 
 
 def test_linear_response_costs_kelvins() -> None:
