@@ -59,14 +59,13 @@ def draw_procedures(**attrs: object) -> Figure:
     return figures.emissivity_procedures(xr.Dataset(parts, attrs=attrs), published, "8-14")
 
 
-def draw_thermocouples(lost: str = "", **attrs: object) -> Figure:
+def draw_thermocouples(**attrs: object) -> Figure:
     """Draw the reading and two methods in two scenes."""
     parts = {"reading": array("scene time", 2, 2)}
     parts["temperature"] = array("scene variant time", 2, 2, 2)
     parts["relative_error"] = array("scene variant", 2, 2) - 300
     scores = xr.Dataset(parts, {"scene": ["pot", "glass"], "variant": ["a", "b"]}, attrs)
-    kept = scores["relative_error"].where(scores["variant"] != lost)
-    return figures.thermocouples(scores.assign(relative_error=kept))
+    return figures.thermocouples(scores)
 
 
 def draw_error_maps(**attrs: object) -> Figure:
@@ -152,23 +151,6 @@ def test_errors_are_in_units_of_their_bound() -> None:
     assert [line.get_label() for line in above.lines] == ["known, bound", "free, bound", "measured"]
     assert len(below.lines) == 3
     np.testing.assert_allclose(np.asarray(below.lines[0].get_ydata()), 1.2, rtol=1e-12)
-
-
-def test_bars_say_what_is_flagged() -> None:
-    """Each treatment of each nuisance has its error and its share as text."""
-    (axis,) = figures.disturbances(treated("nuisance")).axes
-    values = treated("nuisance").transpose("treatment", "nuisance")["flagged"].values.flat
-    expected = [f"{value:.2f} K\n{100 * value:.0f} % flagged" for value in values]
-    assert [text.get_text() for text in axis.texts] == expected
-
-
-def test_a_method_without_a_value_says_so() -> None:
-    """In the legend, in place of its error."""
-    legend = draw_thermocouples(lost="b").axes[0].get_legend()
-    assert legend is not None
-    first, second = (text.get_text() for text in legend.get_texts()[:2])
-    assert second == "b, no value"
-    assert first.endswith(" %")
 
 
 DRAWN: dict[str, Callable[..., Figure]] = {
