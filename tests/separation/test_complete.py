@@ -62,6 +62,7 @@ def test_background_behind_a_measured_object_changes_as_it_does(temperature: flo
     assert held(whole, scene, "background_temperature", constant) > 0.9
 
 
+@pytest.mark.slow
 def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
     """Two cameras see two backgrounds there: what one band shows of its own is no emission."""
     picture = Picture(shape=(24, 64), walkers=2, warmer=(10.0, 12.0))

@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dbthermal import schema, separation
 from dbthermal.simulation import Rig
@@ -145,38 +143,6 @@ def test_bad_masks_and_segments(case: Case, what: str) -> None:
     _, capture, response = case
     with pytest.raises(error, match=message):
         separation.solve(capture.assign(new), response, mask=mask)
-
-
-@settings(max_examples=20)
-@given(
-    seed=st.integers(0, 10_000),
-    frames=st.integers(32, 120),
-    share=st.floats(0.0, 0.7),
-    common=st.booleans(),
-    events=st.integers(0, 3),
-    materials=st.integers(0, 4),
-)
-def test_nothing_missing_raises(
-    seed: int, frames: int, share: float, common: bool, events: int, materials: int
-) -> None:
-    """Random gaps, events and labels raise no error; good pixels are finite at valid samples."""
-    rng = np.random.default_rng(seed)
-    _, capture, response = experiments.simulate(GLASS, RIG, TIME[:frames], 12, seed)
-    there = rng.random((frames, 1, 1 if common else 12)) >= share
-    there = np.broadcast_to(there, (frames, 1, 12))
-    segment = np.searchsorted(np.sort(rng.integers(1, frames, events)), np.arange(frames), "right")
-    labels = xr.DataArray(rng.integers(-1, max(materials, 1), (1, 12)), dims=("y", "x"))
-    result = separation.solve(
-        without(capture, there).assign(segment=("time", segment)),
-        response,
-        pool=labels if materials else None,
-    )
-    good = result["status"].values == 0
-    for name in schema.STAGES["separated"]:
-        known = good & there if name.startswith(FRAMES) else good
-        values = result[name].values
-        assert np.all(np.isfinite(values[np.broadcast_to(known, values.shape)]))
-    assert np.all(np.isnan(result["object_temperature"].values[~there]))
 
 
 def test_unequal_gaps_need_a_known_noise(case: Case) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from attack.scenes import SLOPE, Array, counts_of
+from scenes import held
 
 from dbthermal import calibration, separation
 
@@ -111,14 +112,8 @@ def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Data
     noise[1] *= louder
     counts = counts + noise[:, None, None, None] * rng.standard_normal((count, *warm.shape))
     dims = ("time", "y", "x")
-    truth = xr.Dataset(
-        {
-            "object_temperature": (dims, warm),
-            "background_temperature": (dims, cold),
-            "emissivity": (("band", "y", "x"), pair),
-        },
-        {"band": bands},
-    )
+    values = {"object_temperature": (dims, warm), "background_temperature": (dims, cold)}
+    truth = xr.Dataset(values | {"emissivity": (("band", "y", "x"), pair)}, {"band": bands})
     coordinates = {"band": bands, "time": ("time", time, {"units": "s"})}
     capture = xr.Dataset(
         {"counts": (("band", *dims), counts.astype(np.float32), {"units": "count"})}, coordinates
@@ -149,8 +144,8 @@ def test_outside_scenes_hold(name: str, seeds: tuple[int, ...]) -> None:
         for quantity, reference in truth.data_vars.items():
             error = abs(result[quantity] - reference).where(good)
             std = result[f"{quantity}_std"]
-            held = (error < 1.96 * std).where(error.notnull())
-            within.setdefault(str(quantity), []).append(float(held.mean()))
+            share = held(result, truth, str(quantity), good)
+            within.setdefault(str(quantity), []).append(share)
             over = "band" if quantity == "emissivity" else "time"
             wrong |= np.sqrt((error**2).mean(over)) > 5.0 * np.sqrt((std**2).mean(over))
         far.append(float((wrong & good).sum() / max(int(good.sum()), 1)))
@@ -169,7 +164,6 @@ def test_pooled_intervals_hold_with_the_noise_of_the_capture(louder: float) -> N
         truth, capture, response = draw("heats", seed, louder)
         labels = xr.DataArray((X < 0.5).astype(int), dims=("y", "x"))
         result = separation.solve(capture, response.drop_vars("noise"), pool=labels)
-        error = abs(result["object_temperature"] - truth["object_temperature"])
-        shares.append(float((error < 1.96 * result["object_temperature_std"]).mean()))
+        shares.append(held(result, truth))
         print(louder, result["noise"].values / response["noise"].values, shares[-1])
     assert np.mean(shares) > 0.85
