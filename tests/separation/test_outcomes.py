@@ -182,7 +182,7 @@ def test_cameras_apart_are_as_good_as_at_one_place(shelf: Shelf) -> None:
 
 
 def test_shutter_events_that_nobody_marks_are_flagged(shelf: Shelf) -> None:
-    """Without the numbers of the segments hardly a pixel is wrong and has no flag."""
+    """Without the numbers of the segments fewer than three pixels in ten have no flag."""
     scene = shelf.scene("shutter events")
     result = separation.solve(scene.capture.drop_vars("segment"), scene.response)
     good = result["status"] == 0

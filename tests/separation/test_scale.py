@@ -1,6 +1,5 @@
 """Scale of a picture's frames, undone from still surroundings: simulated, with known scales."""
 
-
 import numpy as np
 import pytest
 import xarray as xr

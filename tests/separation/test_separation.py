@@ -36,7 +36,7 @@ def test_subspace_reaches_the_design(
     the object hold in 92 to 98 % of the samples.
     """
     case = glass_case(emissivity=list(pair), stop=stop, noise_known=noise_known)
-    scene, result = experiments.run_case(case, RIG, TIME, 1000, seed=7)
+    scene, result = experiments.run_case(case, RIG, TIME, 1600, seed=7)
     score = experiments.score(scene, result)
     to_45, to_60, *of_emissivity = PROTOTYPE[pair]
     rmse = float(score["object_temperature_rmse"])
@@ -46,7 +46,9 @@ def test_subspace_reaches_the_design(
     assert limit is None or rmse <= limit
     assert np.all(errors <= of_emissivity)
     assert float(score["with_temperature"]) > 0.99
-    assert 0.92 <= held(result, scene, where=result["status"] == 0) <= 0.98
+    # Low emissivities are also those of an object and a background that are exchanged.
+    good = (result["status"] & ~np.uint32(schema.Status.ROLES_MAY_BE_SWAPPED)) == 0
+    assert 0.92 <= held(result, scene, where=good) <= 0.98
     if pair == (0.86, 0.72):
         assert float((result["status"] != 0).mean()) < 0.02
 
