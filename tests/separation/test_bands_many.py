@@ -117,8 +117,8 @@ def test_a_gray_third_band_harms_nothing() -> None:
     for bands in (2, 3):
         value = xr.DataArray([0.86, 0.72, 0.86], dims="band", coords={"band": list(BANDS[:3])})
         rng = np.random.default_rng(7)
-        parts, ends = (TIME, value, Background(), 200, rng), {"start": 293.15, "stop": 333.15}
-        scene = simulation.independent_pixels(*parts, **ends)
+        parts = (TIME, value, Background(), 200, rng)
+        scene = simulation.independent_pixels(*parts, start=293.15, stop=333.15)
         capture = simulation.observe(scene, rig.response(), rng).isel(band=slice(0, bands))
         result = separation.solve(capture, rig.response())
         errors.append(pooled(result["object_temperature"] - scene["object_temperature"]))

@@ -86,7 +86,7 @@ def test_known_material_and_surroundings_narrow_the_bars() -> None:
     """The table's glass and a room stated within 0.3 K leave a fraction of the library's bar."""
     scene, capture, alone = draw(NOBODY, 3, 0.86, 0.72)
     wide = separation.complete(alone, capture, RESPONSE)
-    room = {"surroundings": ROOM, "surroundings_std": 0.3}
+    room: dict[str, Any] = {"surroundings": ROOM, "surroundings_std": 0.3}
     narrow = separation.complete(alone, capture, RESPONSE, **room, prior="plate window glass")
     stds = [float(one["object_temperature_std"].mean()) for one in (narrow, wide)]
     assert stds[0] < 0.6 * stds[1]

@@ -1,5 +1,7 @@
 """Gray and nearly gray bodies: what cannot be separated has a flag, or an honest error bar."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -82,7 +84,7 @@ def simulated(noise: tuple[float, ...], emissivity: Floats, seed: int, frames: i
     rig, rng = Rig(bands=BANDS[: len(noise)], noise=noise), np.random.default_rng(seed)
     value = xr.DataArray(emissivity[:, 0], dims="band", coords={"band": list(rig.bands)})
     time, pixels = np.arange(frames) * 35.0 / frames, emissivity.shape[1]
-    ends = {"start": 293.15, "stop": 333.15}
+    ends: dict[str, Any] = {"start": 293.15, "stop": 333.15}
     scene = simulation.independent_pixels(time, value, Background(), pixels, rng, **ends)
     return scene, simulation.observe(scene, rig.response(), rng), rig.response()
 

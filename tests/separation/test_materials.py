@@ -133,7 +133,7 @@ def test_bad_input_is_a_clear_error(small: Inputs) -> None:
     """Each error names the thing, the value and the rule."""
     result, capture, response = small
     turned = capture.transpose("time", "band", "y", "x")
-    wrong: list[tuple[xr.Dataset, xr.Dataset, dict[str, float], str]] = [
+    wrong: list[tuple[xr.Dataset, xr.Dataset, dict[str, Any], str]] = [
         (result, capture, {"error_rate": 0.0}, r"Invalid error_rate 0\.0\. Must lie in"),
         (result, capture, {"resolution": 1.5}, r"Invalid resolution 1\.5\. Must"),
         (result.drop_vars("reflection_ratio"), capture, {}, "Missing 'reflection_ratio' in the"),

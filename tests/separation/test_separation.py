@@ -1,5 +1,7 @@
 """Separation of simulated captures: accuracy at the bound, and calibrated uncertainty."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -93,9 +95,10 @@ def test_still_background_is_flagged() -> None:
 def test_fast_object_is_as_true_as_a_slow_one() -> None:
     """An object that heats within 0.2-0.4 s or 8-20 s has no flag, and true 95 % intervals."""
     for constant in ((0.2, 0.4), (8.0, 20.0)):
-        rng, ends = np.random.default_rng(2), {"start": 293.15, "stop": 333.15}
+        rng = np.random.default_rng(2)
+        ends: dict[str, Any] = {"start": 293.15, "stop": 333.15, "time_constant": constant}
         parts = (TIME, emissivity_of(0.86, 0.72), Background(), 300, rng)
-        scene = simulation.independent_pixels(*parts, **ends, time_constant=constant)
+        scene = simulation.independent_pixels(*parts, **ends)
         result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
         good = result["status"] == 0
         assert float(good.mean()) > 0.95
