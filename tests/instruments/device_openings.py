@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from device_benches import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
 from device_stubs import StubCamera, StubController, StubLibrary
+from faulty_camera import two_cameras
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.camera import EmulatedCamera
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
@@ -40,8 +39,7 @@ class Opened(NamedTuple):
 
 def stub_camera(_: ExitStack) -> Opened:
     """A Boson's driver on a table of answers."""
-    clock = Clock()
-    return Opened(Boson(StubCamera(clock)), True)
+    return Opened(Boson(StubCamera(Clock())), True)
 
 
 def loop_camera(_: ExitStack) -> Opened:
@@ -50,7 +48,7 @@ def loop_camera(_: ExitStack) -> Opened:
 
 
 def named_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on the emulator, by its address and in real time."""
+    """A Boson's driver on the emulator, by its address."""
     return Opened(Boson.from_url("sim://boson/wide"), True)
 
 
@@ -69,13 +67,12 @@ def stub_wheel(_: ExitStack) -> Opened:
 
 def loop_wheel(_: ExitStack) -> Opened:
     """A wheel's driver on the emulator, in memory."""
-    bench = WheelBench()
-    bench.wheel.connect()
-    return Opened(bench.wheel, True)
+    (wheel := WheelBench().wheel).connect()
+    return Opened(wheel, True)
 
 
 def named_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, by its address, in real time, but a fast wheel."""
+    """A wheel's driver on the emulator, by its address, but a fast wheel."""
     return Opened(FilterWheel.from_url("sim://apt/wheel", FILTERS, QUICK), True)
 
 
@@ -112,22 +109,15 @@ def stub_video(_: ExitStack) -> Opened:
 
 
 def emulated_video(_: ExitStack) -> Opened:
-    """An emulated camera on a clock without real waiting."""
-    clock = Clock()
-    world = World(clock=clock)
-    world.add_camera("wide", 1)
+    """An emulated camera."""
     picture = np.ones((4, 6), dtype=np.uint16)
-    pictures = {"8-14": lambda _: picture}
-    camera = EmulatedCamera(world, "wide", pictures, "8-14", (4, 6), 60.0)
-    return Opened(camera, True)
+    return Opened(two_cameras(lambda _: picture, (4, 6), 60.0)["9.5"], True)
 
 
 def y16_video(stack: ExitStack) -> Opened:
     """The emulated Y16 camera of a session, as `open_devices` opens it."""
-    session = Session.load(
-        Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml",
-        {"shape": [4, 6], "frame_rate": 60},
-    )
+    file = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
+    session = Session.load(file, {"shape": [4, 6], "frame_rate": 60})
     return Opened(stack.enter_context(open_devices(session)).sources["8-14"], True)
 
 

@@ -14,6 +14,7 @@ from dbthermal.instruments.transport import Closing, TransportError
 Numbers = MutableSequence[Any]
 
 SERIAL, FFC_MODE, RUN_FFC, FRAME_COUNT, LAST_FFC = 0x50002, 0x50013, 0x50007, 0x20002, 0x5005D
+NUMBERS = {SERIAL: 0x8E9EAE, 0x50006: 7, LAST_FFC: 0, FFC_MODE: 1, 0x50054: 3, 0x50015: 0}
 HELLO, HELLO_BACK, MOVE, MOVE_HOME, HOMED = 0x005, 0x006, 0x453, 0x443, 0x444
 STATUS, ENABLED, SETTERS = 0x480, 0x211, (0x413, 0x440)
 HANDLE, JUNCTION, TIP = 7, 293.15, 298.15  # the last two in kelvin
@@ -48,25 +49,18 @@ class StubCamera(_Stub):
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
         self._values = {
-            SERIAL: struct.pack(">I", 0x8E9EAE),
+            **{code: struct.pack(">i", value) for code, value in NUMBERS.items()},
             0x50004: b"EMULATED-STUB".ljust(20, b"\0"),
-            0x50006: struct.pack(">I", 7),
             0x50022: struct.pack(">III", 1, 2, 3),
             0x50030: struct.pack(">h", -123),
             0x50031: struct.pack(">H", 2609),
             0x5000C: struct.pack(">h", 0),
-            0x50054: struct.pack(">i", 3),
-            LAST_FFC: struct.pack(">I", 0),
-            FFC_MODE: struct.pack(">i", 1),
-            0x50015: struct.pack(">i", 0),
         }
 
     def write(self, data: bytes) -> None:
         """Take one request, and answer."""
         self._must_be_open()
-        body = re.sub(
-            rb"\x9e(.)", lambda pair: bytes([pair[1][0] + 13]), data[1:-1], flags=re.DOTALL
-        )
+        body = re.sub(rb"(?s)\x9e(.)", lambda pair: bytes([pair[1][0] + 13]), data[1:-1])
         _, sequence, command, _ = struct.unpack_from(">BIII", body)
         self._values[FRAME_COUNT] = struct.pack(">I", int(60 * self.clock()))
         if command == RUN_FFC:

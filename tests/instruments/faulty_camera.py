@@ -7,8 +7,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.camera import FRAME_TIMEOUT, Counts, Frame, FrameFlag, FrameSource
-from dbthermal.instruments.camera import NoFrameError
+from dbthermal.instruments.camera import (
+    FRAME_TIMEOUT,
+    Counts,
+    Frame,
+    FrameFlag,
+    FrameSource,
+    NoFrameError,
+)
 from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Camera, Session

@@ -71,11 +71,11 @@ STANDS = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS | FrameFlag.IMAGE_REP
 OTHER = IMAGE.copy()
 OTHER[-1, -1] += 1
 FOREIGN = FrameFlag.FOREIGN_CLOCK
+RESTARTED = [shot(n, device_time=t, host_time=t + 0.01) for n, t in enumerate((0.04, 0.05))]
 FRAMES: dict[str, tuple[list[Frame], list[int], list[float]]] = {
     # A repeated number or time is flagged, and a restart of the numbers is no loss.
     "numbers that stand": (
-        [shot(0), shot(1), shot(1), shot(2, device_time=0.005), shot(3)]
-        + [shot(0, device_time=0.04, host_time=0.05), shot(1, device_time=0.05, host_time=0.06)],
+        [shot(0), shot(1), shot(1), shot(2, device_time=0.005), shot(3), *RESTARTED],
         [0, 0, STANDS, FrameFlag.TIME_STANDS, 0, FrameFlag.SEQUENCE_STANDS, 0],
         [0, 0.01, math.nan, math.nan, 0.03, math.nan, 0.05],
     ),

@@ -182,7 +182,8 @@ def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
     """A wheel that turns during a recording raises an error, then and when the sweep is opened."""
     with rig(from_yaml(ONE)) as devices:
         devices.prepare()
-        assert (wheel := devices.wheel) is not None
+        wheel = devices.wheel
+        assert wheel is not None
         for _ in range(2):
             with pytest.raises(ValueError, match=r"Invalid slots .* of filter '9\.5' throughout"):
                 swept(devices, tmp_path, preview=lambda _: wheel.move_to(2))
