@@ -1,4 +1,4 @@
-"""Ways to open each device of the rig for tests: on a stub, on its emulator, on hardware."""
+"""Ways to open each device of the rig for tests: an emulator, hardware; for frames also a stub."""
 
 import os
 from collections.abc import Callable
@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from device_benches import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
-from device_stubs import StubCamera, StubController, StubLibrary
+from device_benches import FILTERS, QUICK, BosonBench, LoggerBench, WheelBench
 from faulty_camera import two_cameras
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
@@ -37,11 +36,6 @@ class Opened(NamedTuple):
     again: Callable[[], object] | None = None
 
 
-def stub_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on a table of answers."""
-    return Opened(Boson(StubCamera(Clock())), True)
-
-
 def loop_camera(_: ExitStack) -> Opened:
     """A Boson's driver on the emulator, in memory."""
     return Opened(BosonBench().camera, True)
@@ -56,13 +50,6 @@ def real_camera(_: ExitStack) -> Opened:
     """A Boson."""
     url = address("DBTHERMAL_BOSON")
     return Opened(Boson.from_url(url), False, lambda: Boson.from_url(url))
-
-
-def stub_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on a controller that takes no time."""
-    wheel = FilterWheel(StubController(Clock()), FILTERS, QUICK)
-    wheel.connect()
-    return Opened(wheel, True)
 
 
 def loop_wheel(_: ExitStack) -> Opened:
@@ -81,12 +68,6 @@ def real_wheel(_: ExitStack) -> Opened:
     url = address("DBTHERMAL_WHEEL")
     opened = FilterWheel.from_url(url, FILTERS)
     return Opened(opened, False, lambda: FilterWheel.from_url(url, FILTERS))
-
-
-def stub_logger(_: ExitStack) -> Opened:
-    """A TC-08's driver on an object of a few functions."""
-    library = StubLibrary()
-    return Opened(TC08(library).open(), True, lambda: TC08(library).open())
 
 
 def emulated_logger(_: ExitStack) -> Opened:
@@ -133,7 +114,7 @@ def real_video(stack: ExitStack) -> Opened:
 
 Opening = Callable[[ExitStack], Opened]
 
-CAMERAS: list[Opening] = [stub_camera, loop_camera, named_camera, real_camera]
-WHEELS: list[Opening] = [stub_wheel, loop_wheel, named_wheel, real_wheel]
-LOGGERS: list[Opening] = [stub_logger, emulated_logger, real_logger]
+CAMERAS: list[Opening] = [loop_camera, named_camera, real_camera]
+WHEELS: list[Opening] = [loop_wheel, named_wheel, real_wheel]
+LOGGERS: list[Opening] = [emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]
