@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -155,4 +156,5 @@ def two_cameras(
 def two_bands(duration: float, shape: tuple[int, int], rate: float, rows: int = 0) -> Session:
     """Session of two emulated cameras that records a scene for a duration [s]."""
     cameras = {band: Camera(f"v4l2:///dev/video{place}") for place, band in enumerate(BANDS)}
-    return Session("test", True, "scene", duration, cameras, rate, shape, rows)
+    telemetry_rows: Literal[0, 2] = 2 if rows else 0
+    return Session("test", True, "scene", duration, cameras, rate, shape, telemetry_rows)
