@@ -89,9 +89,10 @@ def test_a_clock_that_is_set(band: int, step: float) -> None:
     """A camera's clock that is set, either way, is refused by band and time, with any offset."""
     wrong, real = np.stack([EVEN, EVEN]), np.stack([EVEN, EVEN])
     wrong[band, 140:] += step
-    what = "13.9 s is followed" if step < 0 else r"a step of [0-9.]* s after 13.9 s"
+    what = r"'counts'|band '9.5'" if step < 0 else f"times of band '{RIG.bands[band]}'"
+    how = "13.9 s is followed" if step < 0 else r"a step of [0-9.]* s after 13.9 s"
     for options in ({}, {"offset": 0.0}):
-        with pytest.raises(ValueError, match=rf"times of band '{RIG.bands[band]}': {what}"):
+        with pytest.raises(ValueError, match=rf"({what}).*: {how}"):
             alignment.align(filmed(wrong, real), **options)
 
 

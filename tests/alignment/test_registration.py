@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 
-from dbthermal import alignment, schema, separation, simulation
+from dbthermal import alignment, schema, simulation
 from dbthermal.correction import correct_capture
 from dbthermal.simulation import Rig
 from reproduction.experiments import whole
@@ -188,21 +188,6 @@ def test_views_that_do_not_match(second: Any, model: Any, message: str) -> None:
         alignment.register(capture, model=model)
 
 
-def parallax(pixels: float, rng: np.random.Generator) -> tuple[xr.Dataset, xr.Dataset]:
-    """Glass in which walkers are reflected so many pixels apart in the two bands, and a capture."""
-    time, margin, width = np.arange(350) / 10.0, 6, 40
-    size = 24, width + 2 * margin
-    wide = simulation.walkers(time, size, emissivity_of(0.86, 0.72), np.random.default_rng(2))
-    seen = [
-        wide["background_temperature"].interp(x=np.arange(width) + margin + moved).values
-        for moved in (0.0, pixels)
-    ]
-    scene = wide.isel(x=slice(margin, margin + width)).drop_vars("background_temperature")
-    both = (("band", "time", "y", "x"), np.stack(seen), {"units": "K"})
-    apart = scene.assign(background_temperature=both)
-    return scene, simulation.observe(apart, RIG.response(), rng)
-
-
 def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The edges of two views correlate by chance: what keeps only these is no transform."""
     apart = np.eye(3)
@@ -210,23 +195,6 @@ def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("dbthermal.alignment._registration._start", lambda *_: (0.99, apart))
     with pytest.raises(ValueError, match=r"band '9\.5': it shares 40% of the image"):
         alignment.register(views(np.eye(3)))
-
-
-def test_what_parallax_costs() -> None:
-    """A reflection half a pixel apart costs about as much noise again; a pixel or two, a kelvin."""
-    found = {}
-    for pixels in (0.0, 0.25, 0.5, 1.0, 2.0, 4.0):
-        scene, capture = parallax(pixels, np.random.default_rng(1))
-        result = separation.solve(capture, RIG.response())
-        error = result["object_temperature"] - scene["object_temperature"]
-        found[pixels] = float(((error**2).mean("time", skipna=False) ** 0.5).median())
-        flagged = float((result["status"].where(error.notnull().all("time")) > 0).mean())
-        print(f"reflection {pixels} pixels apart: {found[pixels]:.3f} K, flagged {flagged:.2f}")
-    assert np.all(np.diff(list(found.values())) > 0)
-    assert found[0.25] < 1.5 * found[0.0]
-    assert found[0.5] < 3 * found[0.0]
-    assert 0.2 < found[1.0] < 0.5  # [K]
-    assert found[2.0] > 0.5  # [K]
 
 
 def test_the_offset_is_that_of_registered_views() -> None:

@@ -26,8 +26,10 @@ def test_common_drift_is_undone() -> None:
     capture = still(count=350)
     curve = 60.0 * (1.0 - np.exp(-np.arange(350) / 150.0))
     drifting = capture.assign(counts=capture["counts"] + xr.DataArray(curve, dims="time"))
-    drifting = drifting.astype(np.float32)
+    before = drifting.astype(np.float32).copy(deep=True)
+    drifting = before.copy(deep=True)
     undone = undo_drift(drifting, patch())
+    xr.testing.assert_identical(drifting, before)
     error = (undone["counts"] - capture["counts"]).values
     print(f"largest error of the drift {np.abs(error).max():.2f} count of 60")
     assert np.abs(error).max() < 0.4
@@ -136,17 +138,10 @@ def test_lag_of_marked_frames() -> None:
     """The frame after a missing one is lost, too; at 10 Hz the others hardly change."""
     capture = still()
     capture["counts"].values[0, 30] = np.nan
+    before = capture.copy(deep=True)
     undone = undo_lag(capture, 0.010)["counts"]
+    xr.testing.assert_identical(capture, before)
     gone = [np.flatnonzero(np.isnan(part).all(("y", "x"))).tolist() for part in undone]
     assert gone == [[0, 30, 31], [0]]
     assert float(abs(undone - capture["counts"]).max()) < 0.01  # count
     assert undone.dtype == np.float32
-
-
-def test_undoing_leaves_its_input() -> None:
-    """A new dataset comes out of each correction, and the old one is as it was."""
-    capture = still()
-    before = capture.copy(deep=True)
-    assert undo_lag(capture, 0.01) is not capture
-    assert undo_drift(capture, patch()) is not capture
-    xr.testing.assert_identical(capture, before)
