@@ -253,44 +253,38 @@ def test_emissivity_s_error_bar_is_true(two_bands: xr.Dataset) -> None:
 
 
 def warmer(name: str, by: float = 0.0, units: str = "K") -> Callable[[xr.Dataset], xr.Dataset]:
-    """Change of a temperature, in place of which that of the object may be taken."""
+    """Change of a temperature by some kelvins, or of its units."""
     return lambda it: it.assign({name: (it[name] + by).assign_attrs(units=units)})
+
+
+def equal(it: xr.Dataset) -> xr.Dataset:
+    """The background as warm as the object within 0.3 K."""
+    return it.assign(background_temperature=it["object_temperature"] + 0.3)
+
+
+CASES: list[tuple[Callable[[xr.Dataset], Any], str]] = [
+    (lambda it: it.transpose(), "Invalid dims ('measurement', 'band')"),
+    (lambda it: it.drop_vars("counts"), "Missing variable 'counts' in the contact"),
+    (lambda it: it.isel(measurement=[0]), "Invalid number of measurements 1"),
+    (lambda it: it.assign(counts=it["counts"] * np.nan), "Invalid counts: NaN or infinite"),
+    (warmer("object_temperature", units="C"), "Invalid units 'C' of 'object_temperature'"),
+    (warmer("object_temperature", 50), "K in band '8-14'. Must lie in the response's range"),
+    (warmer("background_temperature", -50), "Invalid background temperature 2"),
+    (equal, "three standard deviations of the difference"),
+    (lambda it: it.assign_coords(band=["8-14", "10.6"]), "Missing band '10.6' in the resp"),
+    # Bands with exchanged names give no emissivity, but an error that says what may be wrong.
+    (lambda it: it.assign_coords(band=["9.5", "8-14"]), "names or files exchanged"),
+]
+DEVIATIONS: list[Any] = [(0.0, 0.05), (0.1, -0.05), (np.nan, 0.05), 0.1]
 
 
 @pytest.mark.parametrize(
     ("change", "stds", "message"),
-    [
-        (lambda it: it.transpose(), STDS, "Invalid dims ('measurement', 'band')"),
-        (lambda it: it.drop_vars("counts"), STDS, "Missing variable 'counts' in the contact"),
-        (lambda it: it.isel(measurement=[0]), STDS, "Invalid number of measurements 1"),
-        (lambda it: it.assign(counts=it["counts"] * np.nan), STDS, "counts: NaN or infinite"),
-        (warmer("object_temperature", units="C"), STDS, "units 'C' of 'object_temperature'"),
-        (warmer("object_temperature", 50), STDS, "'8-14'. Must lie in the response's range"),
-        (warmer("background_temperature", -50), STDS, "Invalid background temperature 2"),
-        (
-            lambda it: it.assign(background_temperature=it["object_temperature"] + 0.3),
-            STDS,
-            "three standard deviations of the difference",
-        ),
-        (
-            lambda it: it.assign_coords(band=["8-14", "10.6"]),
-            STDS,
-            "Missing band '10.6' in the resp",
-        ),
-        # Bands with exchanged names give no emissivity, but an error that says what may be wrong.
-        (lambda it: it.assign_coords(band=["9.5", "8-14"]), STDS, "names or files exchanged"),
-        (lambda it: it, (0.0, 0.05), "Invalid reading_std [K]"),
-        (lambda it: it, (0.1, -0.05), "Invalid reading_std [K]"),
-        (lambda it: it, (np.nan, 0.05), "Invalid reading_std [K]"),
-        (lambda it: it, 0.1, "Invalid reading_std [K] 0.1 of shape"),
-    ],
+    [(change, STDS, message) for change, message in CASES]
+    + [(xr.Dataset.copy, stds, "Invalid reading_std [K]") for stds in DEVIATIONS],
 )
 def test_bad_measurements(
-    two_bands: xr.Dataset,
-    measured: xr.Dataset,
-    change: Callable[[xr.Dataset], xr.Dataset],
-    stds: Any,
-    message: str,
+    two_bands: xr.Dataset, measured: xr.Dataset, change: Any, stds: Any, message: str
 ) -> None:
     """Measurements that do not determine an emissivity, and no deviations, raise a ValueError."""
     with pytest.raises(ValueError, match=re.escape(message)):

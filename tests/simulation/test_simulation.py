@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import bands, response, schema, simulation
-from dbthermal.simulation import Background, Rig, heating
+from dbthermal.simulation import Background, Rig, capture, heating, observe
 
 TIME = np.arange(120) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
@@ -32,7 +32,7 @@ class Made:
 
     def seen(self, **changes: Any) -> xr.Dataset:
         """Counts of the plate."""
-        return simulation.observe(self.twin.assign(changes), KNOWN, self.rng)
+        return observe(self.twin.assign(changes), KNOWN, self.rng)
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ QUIET = KNOWN.assign(noise=1e-9 * KNOWN["noise"])
 
 def test_observed_counts(made: Made) -> None:
     """Without noise the counts are e U(x) + (1 - e) U(y), whatever the order of the bands."""
-    seen = simulation.observe(made.twin.isel(band=[1, 0]), QUIET, made.rng, dtype="float64")
+    seen = observe(made.twin.isel(band=[1, 0]), QUIET, made.rng, dtype="float64")
     names = ("object_temperature", "background_temperature")
     emitted, reflected = (response.counts(KNOWN, made.twin[name]) for name in names)
     expected = GLASS * emitted + (1 - GLASS) * reflected
@@ -180,14 +180,14 @@ def test_observed_counts(made: Made) -> None:
 
 def test_counts_say_of_what_they_are_a_twin(made: Made) -> None:
     """Observed and raw counts keep the name of their twin; other scenes have none."""
-    seen = simulation.observe(made.twin.assign_attrs(twin="bulb"), KNOWN, made.rng)
-    assert seen.attrs["twin"] == simulation.capture(seen, made.detector).attrs["twin"] == "bulb"
+    seen = observe(made.twin.assign_attrs(twin="bulb"), KNOWN, made.rng)
+    assert seen.attrs["twin"] == capture(seen, made.detector).attrs["twin"] == "bulb"
     assert "twin" not in made.seen().attrs
 
 
 def test_noise_of_observed_counts(made: Made) -> None:
     """The noise has the response's deviation within 2 %, no mean, and no autocorrelation."""
-    noise = (made.seen() - simulation.observe(made.twin, QUIET, made.rng))["counts"]
+    noise = (made.seen() - observe(made.twin, QUIET, made.rng))["counts"]
     pixels = ("time", "y", "x")
     np.testing.assert_allclose(noise.std(pixels) / KNOWN["noise"], 1.0, rtol=0, atol=0.02)
     np.testing.assert_allclose(noise.mean(pixels), 0.0, rtol=0, atol=0.1)  # count
@@ -211,7 +211,7 @@ def test_pattern() -> None:
 def test_capture(made: Made) -> None:
     """Raw counts are gain times signal and offset, rounded, and 0 where a pixel is dead."""
     seen, detector = made.seen(), made.detector
-    raw = simulation.capture(seen, detector.isel(band=[1, 0]))  # by name, not by place
+    raw = capture(seen, detector.isel(band=[1, 0]))  # by name, not by place
     assert raw["counts"].dtype == np.uint16
     assert (raw["counts"].where(detector["dead"], 0) == 0).all()
     exact = detector["gain"] * seen["counts"] + detector["offset"]
@@ -221,7 +221,7 @@ def test_capture(made: Made) -> None:
 
 
 RANGE = r"band '8-14'. Must lie in \[0, 65535\]"
-HOT = Rig(offset=60000.0)
+HOT, ENDS = Rig(offset=60000.0), np.array([290.0, 330.0])
 
 
 def one_dead(detector: xr.Dataset) -> xr.Dataset:
@@ -229,44 +229,26 @@ def one_dead(detector: xr.Dataset) -> xr.Dataset:
     return detector.drop_vars("dead").assign(dead=detector["dead"].isel(band=slice(0, 1)))
 
 
+def warmer(made: Made) -> xr.Dataset:
+    """Counts of the plate when it is 30 K warmer."""
+    return made.seen(object_temperature=made.twin["object_temperature"] + 30)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda m: m.seen(object_temperature=m.twin["object_temperature"] + 30),
-            "response's range",
-        ),
+        (warmer, "the response's range"),
         (lambda m: m.seen(emissivity=100 * m.twin["emissivity"]), "emissivity of the scene 86"),
-        (
-            lambda m: simulation.observe(m.twin.isel(band=[0]), KNOWN, m.rng),
-            "band '9.5' in the scene",
-        ),
-        (
-            lambda m: simulation.observe(m.twin[["emissivity"]], KNOWN, m.rng),
-            "'object_temperature'",
-        ),
-        (lambda m: simulation.observe(m.twin, KELVIN, m.rng), "Invalid units 'K' of 'noise'"),
-        (lambda m: simulation.capture(m.seen() + 50000.0, m.detector), RANGE),
-        (lambda m: simulation.capture(m.seen() - 40000.0, m.detector), RANGE),
-        (lambda m: simulation.capture(m.seen().where(m.twin["time"] > 1), m.detector), RANGE),
-        (
-            lambda m: simulation.capture(m.seen().rename(band="b"), m.detector),
-            "'counts' of the corrected",
-        ),
-        (
-            lambda m: simulation.capture(m.seen(), m.detector.isel(band=[0])),
-            "'9.5' in the detector",
-        ),
-        (
-            lambda m: simulation.capture(m.seen(), one_dead(m.detector)),
-            "'dead' of the detector. Must be",
-        ),
-        (
-            lambda m: simulation.blackbody_movies(
-                HOT, np.array([290.0, 330.0]), 2, m.detector, m.rng
-            ),
-            RANGE,
-        ),
+        (lambda m: observe(m.twin.isel(band=[0]), KNOWN, m.rng), "Missing band '9.5' in the scene"),
+        (lambda m: observe(m.twin[["emissivity"]], KNOWN, m.rng), "'object_temperature'"),
+        (lambda m: observe(m.twin, KELVIN, m.rng), "Invalid units 'K' of 'noise'"),
+        (lambda m: capture(m.seen() + 50000.0, m.detector), RANGE),
+        (lambda m: capture(m.seen() - 40000.0, m.detector), RANGE),
+        (lambda m: capture(m.seen().where(m.twin["time"] > 1), m.detector), RANGE),
+        (lambda m: capture(m.seen().rename(band="b"), m.detector), "'counts' of the corrected"),
+        (lambda m: capture(m.seen(), m.detector.isel(band=[0])), "band '9.5' in the detector"),
+        (lambda m: capture(m.seen(), one_dead(m.detector)), "'dead' of the detector. Must be bool"),
+        (lambda m: simulation.blackbody_movies(HOT, ENDS, 2, m.detector, m.rng), RANGE),
     ],
 )
 def test_what_is_not_recorded(made: Made, call: Any, message: str) -> None:
@@ -285,7 +267,7 @@ def test_same_seed_same_data() -> None:
         rng = np.random.default_rng(seed)
         detector = simulation.pattern(RIG, SHAPE, rng)
         scene = simulation.walkers(TIME, SHAPE, GLASS, rng)
-        return simulation.capture(simulation.observe(scene, KNOWN, rng), detector)
+        return capture(observe(scene, KNOWN, rng), detector)
 
     xr.testing.assert_identical(record(1), record(1))
     assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9
