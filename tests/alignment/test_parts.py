@@ -1,36 +1,133 @@
 """Parts of the alignment, each against a closed form or a behaviour that is known."""
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.interpolate import CubicSpline
 
+from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment import align
+from dbthermal.alignment import _joint as joint
+from dbthermal.alignment._reflections import Scale
 from dbthermal.correction import correct_capture
 from reproduction.experiments import whole
+from reproduction.experiments.pictures import smooth_shift
+
+FRAME = 0.1  # [s]
+
+
+def clocks_tried(
+    monkeypatch: pytest.MonkeyPatch, start: list[float], seen: Callable[[float], tuple[float, int]]
+) -> tuple[list[float], list[float], float]:
+    """Offsets found, from those that what moves one way tells; those tried; their uncertainty.
+
+    All in frames. By an offset of the other bands a camera is seen late, and one is the reference.
+    """
+    bands, tried = ["8-14", "9.5", "more"][: len(start)], list[float]()
+    together = xr.DataArray(np.zeros(len(bands)), {"band": bands}, "band")
+    counts = ("band", "time", "y", "x"), np.zeros((len(bands), 40, 1, 1), np.float32)
+    small = xr.Dataset({"counts": counts}, {"band": bands, "time": FRAME * np.arange(40)})
+
+    def resample(_: xr.Dataset, offset: xr.DataArray | None = None, **__: Any) -> xr.Dataset:
+        own = FRAME * np.array(start) if offset is None else offset.values
+        return xr.Dataset(attrs={"time_offset": own.tolist()})
+
+    def shift(aligned: xr.Dataset, _: object) -> xr.Dataset:
+        tried.append(float(np.mean(aligned.attrs["time_offset"][1:])) / FRAME)
+        late, reference = seen(tried[-1])
+        told = {"delay": late * FRAME, "delay_std": 0.0}
+        return xr.Dataset(attrs={"reference_band": bands[reference], **told})
+
+    monkeypatch.setattr(joint, "_shift", shift)
+    scale = Scale(np.ones(len(bands)), None)
+    offset, _, left = joint._clocked(small, scale, together, resample)
+    return (offset.values / FRAME).tolist(), tried, left / FRAME
+
+
+@pytest.mark.parametrize("start", [-3.6, 0.3, 0.549])
+@pytest.mark.parametrize("slope", [0.3, 0.8, 3.0])
+def test_clocks_are_found_from_a_poor_start(
+    monkeypatch: pytest.MonkeyPatch, start: float, slope: float
+) -> None:
+    """A delay seen too short or too long, with an error, leads to the clock by which it is none.
+
+    No delay is seen at clocks that are set together, for which these have no reason to be.
+    """
+
+    def seen(clock: float) -> tuple[float, int]:
+        error = 0.02 * math.sin(5.0 * clock)
+        return (0.0 if clock == 0.0 else slope * (0.55 - clock) + error), 0
+
+    (_, found), _, left = clocks_tried(monkeypatch, [0.0, start], seen)
+    assert abs(found - 0.55) < 0.02 / slope + 0.02
+    assert left < 0.1
+
+
+def test_clocks_of_three_bands_and_of_either_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other bands move together; the band that is interpolated may be the quietest then."""
+    found, *_ = clocks_tried(monkeypatch, [0.0, 0.9, -1.0], lambda clock: (0.2 - clock, 0))
+    np.testing.assert_allclose(found, [0.0, 1.15, -0.75], atol=0.02)
+
+    def seen(clock: float) -> tuple[float, int]:
+        return (0.45 - clock, 0) if abs(clock - round(clock)) > 0.15 else (clock - 0.45, 1)
+
+    (_, late), *_ = clocks_tried(monkeypatch, [0.0, -0.3], seen)
+    assert abs(late - 0.45) < 0.02
 
 
 @pytest.mark.slow
 def test_a_large_image_is_aligned_by_means(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clocks and the shift of means over squares are those of all pixels, where some lack."""
+    """The clocks and the shift of means over squares are those of all pixels."""
     rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (0, 0), "late": 1, "shutter": (0.4,)}
-    options = rig | {"lost": (0.03, 0.005), "steps": 6, "frames": 16}
-    recording = whole.record((48, 72), (200, 10.0), 1, **options)
+    recording = whole.record(
+        (64, 96), (300, 10.0), 1, **rig, lost=(0.03, 0.005), steps=6, frames=16
+    )
     corrected = correct_capture(recording.capture, whole.calibrate(recording.movies)[0])
-    # A pixel that lacks samples does not step the mean of its square, of another level.
-    corrected["counts"][:, :, ::2, ::2] += 500.0
-    corrected["counts"][1, 60:90, ::2, ::2] = np.nan
-    corrected["counts"][0, :, 0:4, 4:8] = np.nan  # a square that one band does not see
     found = []
-    for pixels in (48 * 72, 48 * 72 // 4):
-        monkeypatch.setattr("dbthermal.alignment._joint._PIXELS", pixels)
-        aligned = align(corrected)
-        found.append((aligned.attrs["time_offset"][1], aligned.attrs["time_offset_std"]))
-    print(f"clocks and deviations {found} s, true 0.05")
-    np.testing.assert_allclose([one for one, _ in found], 0.05, atol=0.005)  # 0.05 of a frame
-    assert found[1][1] < 1.5 * found[0][1]
+    for pixels in (64 * 96, 64 * 96 // 4):
+        monkeypatch.setattr(joint, "_PIXELS", pixels)
+        found.append(joint.compare(corrected))
+    times = [one.offset.values[1] for one in found]
+    fields = [one.field for one in found if one.field is not None]
+    known = np.all([field["known"].values for field in fields], axis=0)
+    true = smooth_shift((64, 96), *rig["shift"])[1]
+    rms = [float(np.std((field["shift"].values[1] - true)[known])) for field in fields]
+    print(f"clocks {times} s, true 0.05; shifts off by {rms} pixels, {known.mean():.2f} known")
+    np.testing.assert_allclose(times, 0.05, atol=0.005)  # 0.05 of a frame
+    assert known.mean() > 0.9
+    assert rms[1] < 1.5 * rms[0]
+
+
+def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pixel that lacks samples does not step the mean; a bad one and a missing frame count."""
+    rng, level = np.random.default_rng(2), np.array([20000.0, 21000.0])[:, None, None, None]
+    pattern, change = rng.normal(0.0, 500.0, (2, 1, 6, 9)), rng.normal(0.0, 50.0, (2, 40, 1, 1))
+    counts = (level + pattern + change).astype(np.float32)
+    counts[1, 10:20, 0, 0] = np.nan  # single samples
+    counts[0, 30] = np.nan  # a frame
+    counts[0, :, 0:3, 3:6] = np.nan  # a square that one band does not see
+    status = np.zeros((6, 9), np.uint32)
+    status[4, 4], counts[:, :, 4, 4] = schema.Status.DEAD_PIXEL, 7.0
+    corrected = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts), "status": (("y", "x"), status)},
+        {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
+    )
+    monkeypatch.setattr(joint, "_PIXELS", 6)
+    small = joint._of_squares(corrected)
+    values, blind = small["counts"].values, np.zeros((2, 3), dtype=bool)
+    blind[0, 1] = True
+    np.testing.assert_array_equal(small["status"] != 0, blind)
+    assert np.isnan(values[:, :, blind]).all()
+    there = np.arange(40) != 30
+    assert np.isnan(values[0, 30]).all()
+    seen = values[:, there][:, :, ~blind]
+    off = seen - seen[:, :1] - (change[:, there, 0] - change[:, :1, 0])
+    assert np.abs(off).max() < 10.0
+    assert np.abs(off[..., 1:]).max() < 0.02
 
 
 def test_a_step_does_not_swing() -> None:
