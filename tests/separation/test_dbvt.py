@@ -109,6 +109,51 @@ def test_mean_of_the_noise_is_squared() -> None:
         assert_allclose(objective.losses(films, *others, weights())[4], expected, rtol=1e-12)
 
 
+def directional(point: Point, chosen: Weights, way: tuple[np.ndarray, np.ndarray]) -> float:
+    """Derivative of the objective along a direction, from the forces of the Newton step."""
+    films, rest, _, scale = point
+    along, (to_offset, to_first, to_second) = way
+    (_, one, other), smooth, frames = rest, films[0], films.shape[1]
+    emission = other / one
+    change = (to_second - emission * to_first) / one
+    reflection = (to_first * (1 - other) / (1 - one) - to_second) / (1 - one)
+    offset = to_offset - change * smooth[0] - emission * along[0, 0]
+    _, forces, blocks = objective.system(*point, chosen, 1.0)
+    second_step, error = offset + change * smooth, reflection * blocks[:, 4]
+    # Forces are those of the noise eliminated, which follows the other unknowns.
+    moves = np.stack([along[0], emission * along[0] + second_step, error])
+    moved, still = (
+        objective.noise_step(blocks, part, rest, scale, chosen)[1:] for part in (moves, 0.0 * moves)
+    )
+    total = (blocks[:, :2].T * (along[1:] - (moved - still))).sum(axis=0)
+    total -= (forces * np.stack([along[0], second_step, error], axis=1)).sum(axis=1)
+    bend, square = objective.bending(smooth)
+    stiff = chosen.smoothness / chosen.curvature**2
+    bent = (1 + emission**2) * (bend * along[0]).sum() + emission * square * change
+    return float(2 * (total.sum() + stiff * bent) / frames)
+
+
+@pytest.mark.parametrize("name", ["smoothness", "huber", "reconstruction", "noise", "noise_mean"])
+@pytest.mark.parametrize("along", ["smooth", "offset", "emissivity", "noise"])
+def test_slopes_match_finite_differences(name: str, along: str) -> None:
+    """The slope of each loss along each unknown is that of its finite differences."""
+    films, rest, *given = point = anywhere()
+    nothing = dict.fromkeys(("smoothness", "huber", "reconstruction", "noise_mean"), 0.0)
+    chosen = weights(**(nothing | {"noise": 1.0, "curvature": 50.0, name: 1.3}))
+    rng, step = np.random.default_rng(8), 1e-6
+    way = (rng.standard_normal(films.shape), rng.standard_normal(rest.shape))
+    way[0][1:] *= along == "noise"
+    way[0][0] *= along == "smooth"
+    way[1][:] *= [along == "offset", *(along == "emissivity",) * 2]
+
+    def total(by: float) -> float:
+        moved = films + by * way[0], rest + by * way[1]
+        return float(objective.losses(*moved, *given, chosen).sum())
+
+    expected = (total(step) - total(-step)) / (2 * step)
+    assert_allclose(directional(point, chosen, way), expected, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("noise", "pixels"), [(QUIET, 20), pytest.param((0.03, 0.05), 50, marks=pytest.mark.slow)]
 )
