@@ -30,6 +30,8 @@ from dbthermal.instruments.camera import (
 from dbthermal.instruments.recording import notes
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 
+__all__ = ["CaptureFile", "Note", "begun", "shot"]  # other tests take them from here
+
 SHAPE, RATE = (4, 80), 100.0
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)
 COLUMNS = 640
