@@ -36,7 +36,17 @@ def fit(name: str, temperature: Floats, counts: Floats, noise: float | None) -> 
     return ""
 
 
-BAD = ("top", "top, last", "floor", "5 K off", "first off", "last off", "step", "offset", "line")
+BAD: tuple[str, ...] = (
+    "top",
+    "top, last",
+    "floor",
+    "5 K off",
+    "first off",
+    "last off",
+    "step",
+    "offset",
+    "line",
+)
 BAD += ("root", "log", "exponential", "stefan", "drift", "swapped", "wrapped")
 
 
@@ -45,7 +55,7 @@ def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
     middle, place = c[len(c) // 2], np.arange(len(c))
 
     def clipped(counts: Floats, level: float) -> Floats:  # a soft limit: a fiftieth of the slope
-        return np.where(counts > level, level + (counts - level) / 50.0, counts)
+        return np.asarray(np.where(counts > level, level + (counts - level) / 50.0, counts))
 
     return {
         "top": clipped(c, middle),
