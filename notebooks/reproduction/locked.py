@@ -88,6 +88,8 @@ def end_with_parent(end: Callable[[], object]) -> None:
             time.sleep(_POLL)
         end()
 
+    threading.Thread(target=watch, daemon=True).start()
+
 
 def settings() -> dict[str, str]:
     """Environment for make: JOBS, and DBTHERMAL_DATA as an absolute path, both checked."""
