@@ -13,9 +13,6 @@ from dbthermal._coordinates import laid_on
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
 _UNCORRELATED: Final = 0.1
 _FEWEST: Final = 100
-# Share of the variance of still surroundings over time that their scale must explain.
-_EXPLAINED: Final = 0.9
-_ROUNDS: Final = 20
 _TINY: Final = np.finfo(np.float64).tiny
 
 
@@ -104,11 +101,11 @@ def uncalibrated_reflection(
     Without a response there are no temperatures, but rapid changes are still the background's.
     Smooth functions of time, which hold the object's change, are projected out of both bands. Gain
     and offset errors of each frame, rapid and small, are fitted to the uncorrelated pixels
-    (correlation below 0.1) and subtracted; large or slow ones are undone before, by `unscaled`,
-    whose `gain` then weights the frames by their noise. With :math:`\lambda` the noise variance of
-    the second band over that of the first there, the ratio k of a pixel is that of Deming's
-    regression [2]_, the pooled ratio is its median over the correlated pixels, and the reflection
-    in the first band's unit is the best linear estimate
+    (correlation below 0.1) and subtracted; where large or slow ones were undone before, a `gain`
+    weights the frames by their noise. With :math:`\lambda` the noise variance of the second band
+    over that of the first there, the ratio k of a pixel is that of Deming's regression [2]_, the
+    pooled ratio is its median over the correlated pixels, and the reflection in the first band's
+    unit is the best linear estimate
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 
@@ -203,84 +200,6 @@ def uncalibrated_reflection(
     for name, part in (("reflection", reflection), ("emission", values[0] - reflection)):
         result[name] = ("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units
     return result
-
-
-def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
-    r"""Undo the scale of each frame of two pictures, from surroundings that do not change.
-
-    A picture that is scaled anew in each frame shows still surroundings :math:`s(p)` as
-    :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's weights [1]_ by
-    each pixel's residual over time. A band where they explain less than 90 % of the weighted
-    variance over time stays as it is.
-
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own.
-    still : DataArray of bool
-        Pixels (y, x) off the object; a third of them may change after all.
-
-    Returns
-    -------
-    DataArray
-        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
-        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
-        that are, and `scale_explained`, each band's explained share.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
-
-    References
-    ----------
-    .. [1] Holland, Welsch (1977), doi:10.1080/03610927708827533
-
-    Examples
-    --------
-    A still picture whose contrast is scaled down to a tenth:
-
-    >>> gain, wall = np.linspace(1, 0.1, 50)[:, np.newaxis, np.newaxis], np.ones((20, 40))
-    >>> wall[:, :20] = 2.0
-    >>> signal = xr.DataArray([gain * wall] * 2, dims=("band", "time", "y", "x"))
-    >>> undone = unscaled(signal, xr.ones_like(signal[0, 0], dtype=bool))
-    >>> bool(undone.std("time").max() < 1e-9)
-    True
-    """
-    _check_signal(signal)
-    chosen = _pixels(still, signal, "the still pixels")
-    if chosen.sum() < 2 * _FEWEST:
-        raise ValueError(
-            f"Invalid still pixels: {chosen.sum()} of them. Must be at least {2 * _FEWEST}."
-        )
-    result = signal.astype(np.promote_types(signal.dtype, np.float32))
-    gains, shares, bands = np.ones(signal.shape[:2]), [], []
-    for place, picture in enumerate(signal.values):
-        offset, gain, explained = _scale(picture.reshape(len(picture), -1)[:, chosen].astype(float))
-        shares.append(round(explained, 4))
-        if explained >= _EXPLAINED and gain.min() > 0:
-            gains[place] = gain
-            bands.append(str(signal["band"].values[place]))
-            result[place] = ((picture.T - offset) / gain).T
-    result = result.assign_coords(gain=(("band", "time"), gains, {"units": "1"}))
-    return result.assign_attrs(scale_undone=bands, scale_explained=shares)
-
-
-def _scale(values: Array) -> tuple[Array, Array, float]:
-    """Offset (time), gain (time) and explained share of still pixels (time, pixel)."""
-    mean = values.mean(axis=0)
-    change = values - mean
-    squares = np.einsum("tp,tp->p", change, change)
-    weight = np.ones(mean.size)
-    for _ in range(_ROUNDS):
-        # Exact: o + g s - mean is linear in the mean, as mean = mean(o) + mean(g) s.
-        offset, error = _frame_errors(change, mean, weight)
-        # sum_t (c - o - e m)^2, from products over time alone
-        power = squares - 2.0 * (offset @ change + mean * (error @ change))
-        power += offset @ offset + mean * (2.0 * (offset @ error) + mean * (error @ error))
-        weight = 1.0 / (1.0 + np.maximum(power, 0.0) / max(np.median(power), _TINY))
-    explained = 1.0 - float(weight @ power) / max(float(weight @ squares), _TINY)
-    return offset, 1.0 + error, explained
 
 
 def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:

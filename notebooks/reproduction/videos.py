@@ -17,7 +17,7 @@ import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from dbthermal import metrics, separation
-from reproduction import palettes, parallax
+from reproduction import palettes, parallax, scales
 
 Array = npt.NDArray[np.float64]
 
@@ -204,7 +204,7 @@ def compare(scene: Scene, number: int) -> Comparison:
     change together (correlation above 0.5), by the separation with the scale undone. A way in which
     the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
     """
-    undone = separation.unscaled(scene.movie, still(scene.outline))
+    undone = scales.unscaled(scene.movie, still(scene.outline))
     reflections = parallax.reflections_shift(undone, scene.outline)
     shared = parallax.shared_outline(scene.outline, reflections)
     found: dict[str, xr.Dataset] = {}

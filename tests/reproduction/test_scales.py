@@ -9,6 +9,7 @@ from captures import polynomials
 from numpy.typing import NDArray
 
 from dbthermal import separation
+from reproduction import scales
 
 Floats = NDArray[np.float64]
 FRAMES, HEIGHT, WIDTH = 200, 40, 60
@@ -57,7 +58,7 @@ def test_scale_is_undone(walkers: bool) -> None:
     """Each frame's gain is the true one within 2 %, with people before a third of the wall, too."""
     rng = np.random.default_rng(5)
     truth, _ = scene(rng, walkers=walkers)
-    undone = separation.unscaled(picture(truth, rng), still())
+    undone = scales.unscaled(picture(truth, rng), still())
     gain = 1 / np.ptp(truth, axis=(2, 3))
     gain /= gain.mean(axis=1, keepdims=True)
     error = undone["gain"].values / gain - 1
@@ -77,7 +78,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     shown = picture(truth, rng)
     with pytest.raises(ValueError, match="pixels have a correlation below"):
         separation.uncalibrated_reflection(shown)  # for its scale moves all of them together
-    found = separation.uncalibrated_reflection(separation.unscaled(shown, still()))
+    found = separation.uncalibrated_reflection(scales.unscaled(shown, still()))
     functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
@@ -92,7 +93,7 @@ def test_constant_scale_is_left() -> None:
     """A scale that is the same in all frames explains nothing, and no value is changed."""
     rng = np.random.default_rng(7)
     shown = picture(scene(rng)[0], rng, between=False)
-    undone = separation.unscaled(shown, still())
+    undone = scales.unscaled(shown, still())
     assert undone.attrs["scale_undone"] == []
     assert max(undone.attrs["scale_explained"]) < 0.5
     np.testing.assert_array_equal(undone, shown)
@@ -111,7 +112,7 @@ def test_refused_still_pixels(pixels: NDArray[np.bool_], message: str) -> None:
     rng = np.random.default_rng(9)
     shown = picture(scene(rng)[0], rng)
     with pytest.raises(ValueError, match=re.escape(message)):
-        separation.unscaled(shown, xr.DataArray(pixels, dims=("y", "x")))
+        scales.unscaled(shown, xr.DataArray(pixels, dims=("y", "x")))
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0, np.nan])
