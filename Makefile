@@ -112,10 +112,9 @@ test-long: .venv/installed ## run the long counts, for which nobody waits: many 
 reproduce: export MALLOC_ARENA_MAX := 1
 reproduce: export MALLOC_MMAP_MAX_ := 0
 reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
-# One notebook more than processors, for 00_acquisition waits for its emulated instruments most of the time.
-reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, one more at a time than JOBS
+reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full
 	@$(python) -m reproduction.integrity full rig
-	JOBS=$$((JOBS + 1)) && $(parallel) full
+	$(parallel) full
 
 full: $(foreach one,$(early),$(filter results/$(one).ipynb,$(full) $(rig))) $(full) $(rig)
 

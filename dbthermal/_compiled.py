@@ -12,6 +12,7 @@ import logging
 import os
 import pickle
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -61,12 +62,19 @@ Sums may be taken in any order; NaN stays NaN.
 """
 
 
+class _Locks(threading.local):
+    """Locked files, by their numbers, of the thread that compiles."""
+
+    def __init__(self) -> None:
+        self.files: list[int] = []
+
+
 class _Cache(FunctionCache):
     """Files of a compiled function, one for each kind of arguments and processor."""
 
     def __init__(self, function: Any) -> None:
         super().__init__(function.py_func)  # type: ignore[no-untyped-call]
-        self._function, self._locks = function, list[int]()
+        self._function, self._locks = function, _Locks()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Machine code for arguments, None if it is to be compiled, by this process alone."""
@@ -97,15 +105,13 @@ class _Cache(FunctionCache):
         """Compilation that frees the lock of its file at its end, however it ends."""
 
         def compile_in_turn(sig: Any) -> Any:
-            held = len(self._locks)
+            files = self._locks.files
+            held = len(files)
             try:
                 return compile_for(sig)
             finally:
-                for lock in self._locks[held:]:
-                    with suppress(OSError):
-                        fcntl.flock(lock, fcntl.LOCK_UN)
-                    os.close(lock)
-                del self._locks[held:]
+                while len(files) > held:  # closed, a file is free
+                    os.close(files.pop())
 
         return compile_in_turn
 
@@ -114,7 +120,7 @@ class _Cache(FunctionCache):
         with suppress(OSError, AttributeError):
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o666)
-            self._locks.append(lock)
+            self._locks.files.append(lock)
             fcntl.flock(lock, fcntl.LOCK_EX)
 
     def _place(self, sig: Any, codegen: Any) -> tuple[Path, bytes]:

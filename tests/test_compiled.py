@@ -1,13 +1,18 @@
 """Compiled code is kept from process to process, by the code alone; damaged, it is made anew."""
 
+import importlib.util
 import os
 import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from dbthermal._compiled import compiled
 
 ROOT = Path(__file__).parents[1]
 # Prints what is logged, and a digest of the result; in a process of its own for each state.
@@ -108,3 +113,20 @@ def test_only_changed_code_is_compiled_again(folder: Path) -> None:
     solved(folder, "whole")
     after = files(folder)
     assert {name for name in before if after[name] != before[name]} == {"_smooth", "_centre"}
+
+
+def test_threads_that_need_the_same_code_at_once(tmp_path: Path) -> None:
+    """Each thread gets its result, whichever of them compiles."""
+    text = "\n".join(f"def f{n}(x):\n    return x.sum() + {n}\n" for n in range(6))
+    (tmp_path / "sums.py").write_text(text)
+    spec = importlib.util.spec_from_file_location("sums", tmp_path / "sums.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    arrays = [np.ones(3, kind) for kind in ("f4", "f8", "i4", "i8")] * 2
+    with ThreadPoolExecutor(len(arrays)) as pool:
+        for n in range(6):
+            function = compiled(getattr(module, f"f{n}"))
+            assert [*pool.map(function, arrays)] == [3.0 + n] * len(arrays)
+    assert len([*tmp_path.rglob("*.nbc")]) == 6 * 4

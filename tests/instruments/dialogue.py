@@ -6,6 +6,7 @@ The idea is pymeasure's ``expected_protocol``.
 from collections.abc import Iterable, Sequence
 from types import TracebackType
 
+from dbthermal.instruments.clock import Clock
 from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.transport import Closing
 
@@ -17,15 +18,14 @@ class Dialogue(Closing):
     """
     A transport that expects certain bytes, gives certain answers, and fails on leftovers.
 
-    Used as a context manager it checks at its end, unless something else went wrong, that all was
-    written and all was read. An answer in several pieces takes one read for each; an empty piece
-    is a read that times out, and so is a read for which nothing is left.
+    Used as a context manager it checks at its end that all was written and all was read. An answer
+    in several pieces takes one read for each; a read for which nothing is left times out.
     """
 
     is_simulated = True
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
-        self.clock = EmulatedClock()
+        self.clock: Clock = EmulatedClock()
         self._pairs = list(pairs)
         self._written = b""
         self._answers: list[bytes] = []

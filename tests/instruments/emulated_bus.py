@@ -15,32 +15,15 @@ import usb.backend
 
 @dataclass
 class EmulatedDevice:
-    """
-    One device that is plugged in; its serial number says that it is emulated.
-
-    Attributes
-    ----------
-    vendor, product : int
-        USB identity.
-    serial : str
-        Serial number, none if empty.
-    bus : int
-        Where it is.
-    ports : tuple of int
-        Ports on the way.
-    speed : int
-        As libusb numbers it; 2 is full, 3 high.
-    nodes : tuple of str
-        Names of its nodes, as sysfs lists them below the device's interfaces.
-    """
+    """One device that is plugged in; its serial number says that it is emulated."""
 
     vendor: int
     product: int
     serial: str = "EMULATED"
     bus: int = 1
-    ports: tuple[int, ...] = (1,)
-    speed: int = 3
-    nodes: tuple[str, ...] = ()
+    ports: tuple[int, ...] = (1,)  # on the way
+    speed: int = 3  # as libusb numbers it; 2 is full, 3 high
+    nodes: tuple[str, ...] = ()  # as sysfs lists them below the device's interfaces
 
     @property
     def path(self) -> str:
@@ -79,21 +62,16 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
 
     def get_device_descriptor(self, dev: EmulatedDevice) -> SimpleNamespace:
         """Give the device descriptor, with what libusb adds: bus, address, ports, speed."""
+        fixed = {
+            **dict.fromkeys(("bDeviceClass", "bDeviceSubClass", "bDeviceProtocol"), 0),
+            **dict.fromkeys(("bDescriptorType", "iSerialNumber", "bNumConfigurations"), 1),
+            **dict(zip(("bLength", "bcdUSB", "bMaxPacketSize0"), (18, 0x0200, 64), strict=True)),
+            **dict(zip(("bcdDevice", "iManufacturer", "iProduct"), (0x0100, 0, 0), strict=True)),
+        }
         return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=1,
-            bcdUSB=0x0200,
-            bDeviceClass=0,
-            bDeviceSubClass=0,
-            bDeviceProtocol=0,
-            bMaxPacketSize0=64,
+            **fixed,
             idVendor=dev.vendor,
             idProduct=dev.product,
-            bcdDevice=0x0100,
-            iManufacturer=0,
-            iProduct=0,
-            iSerialNumber=1,
-            bNumConfigurations=1,
             address=dev.ports[0],
             bus=dev.bus,
             port_number=dev.ports[-1],

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from checked_recording import CheckedRecording, Read, session
-from device_benches import BosonBench, Fault, FaultyBoson, LoggerBench, WheelBench
+from device_benches import BosonBench, LoggerBench, WheelBench
 from faulty_camera import Faults
+from faulty_devices import Fault, FaultyBoson
 
 from dbthermal import store
 from dbthermal.correction import find_shutter

@@ -10,100 +10,71 @@ import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import ModuleType
 
 import pytest
+from device_benches import FILTERS, WheelBench
 
-from dbthermal.instruments import _apt as apt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.filterwheel import FilterWheel, Settings
 
-Id, command = apt.Id, apt.command
-TO = apt.BAY_1
-SPEEDS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
-HOME = apt.HomeParameters(1, 2, 1, 4_397_466, -50)
-TARGET = apt.Position(1, 68_267)
-# By the function of thorlabs-apt-protocol, in its spelling: what is built here, and its arguments.
-REQUESTS: dict[str, tuple[bytes, dict[str, int]]] = {
-    "hw_no_flash_programming": (command(Id.HW_NO_FLASH_PROGRAMMING, destination=TO), {}),
-    "hw_req_info": (command(Id.HW_REQ_INFO, destination=TO), {}),
-    "hw_stop_updatemsgs": (command(Id.HW_STOP_UPDATEMSGS, destination=TO), {}),
-    "mod_set_chanenablestate": (
-        command(Id.MOD_SET_CHANENABLESTATE, 1, apt.YES, destination=TO),
-        {"chan_ident": 1, "enable_state": 1},
-    ),
-    "mod_req_chanenablestate": (
-        command(Id.MOD_REQ_CHANENABLESTATE, 1, destination=TO),
-        {"chan_ident": 1},
-    ),
-    "mot_set_velparams": (
-        command(Id.MOT_SET_VELPARAMS, data=SPEEDS.pack(), destination=TO),
-        {"chan_ident": 1, "min_velocity": 0, "acceleration": 0x35B0, "max_velocity": 0x00CCCCCD},
-    ),
-    "mot_req_velparams": (command(Id.MOT_REQ_VELPARAMS, 1, destination=TO), {"chan_ident": 1}),
-    "mot_set_homeparams": (
-        command(Id.MOT_SET_HOMEPARAMS, data=HOME.pack(), destination=TO),
-        {
-            "chan_ident": 1,
-            "home_dir": 2,
-            "limit_switch": 1,
-            "home_velocity": 4_397_466,
-            "offset_distance": -50,
-        },
-    ),
-    "mot_req_homeparams": (command(Id.MOT_REQ_HOMEPARAMS, 1, destination=TO), {"chan_ident": 1}),
-    "mot_move_home": (command(Id.MOT_MOVE_HOME, 1, destination=TO), {"chan_ident": 1}),
-    "mot_move_absolute": (
-        command(Id.MOT_MOVE_ABSOLUTE, data=TARGET.pack(), destination=TO),
-        {"chan_ident": 1, "position": 68_267},
-    ),
-    "mot_move_stop": (
-        command(Id.MOT_MOVE_STOP, 1, apt.NO, destination=TO),
-        {"chan_ident": 1, "stop_mode": 2},
-    ),
-    "mot_req_statusupdate": (
-        command(Id.MOT_REQ_STATUSUPDATE, 1, destination=TO),
-        {"chan_ident": 1},
-    ),
+RACK, CHANNEL = {"dest": 0x11}, {"dest": 0x21, "chan_ident": 1}
+SPEEDS = {"min_velocity": 0, "acceleration": 4506, "max_velocity": 21_987_328}
+HOME = {"home_dir": 2, "limit_switch": 1, "home_velocity": 4_397_466, "offset_distance": 0}
+# What the driver sends, by the function of thorlabs-apt-protocol, in its spelling.
+SENT: dict[str, dict[str, int]] = {
+    **dict.fromkeys(("hw_no_flash_programming", "hw_stop_updatemsgs", "hw_req_info"), RACK),
+    **dict.fromkeys(("mot_req_velparams", "mot_req_homeparams", "mot_req_statusupdate"), CHANNEL),
+    **dict.fromkeys(("mod_req_chanenablestate", "mot_move_home"), CHANNEL),
+    "mod_set_chanenablestate": {**CHANNEL, "enable_state": 1},
+    "mot_set_velparams": {**CHANNEL, **SPEEDS},
+    "mot_set_homeparams": {**CHANNEL, **HOME},
+    "mot_move_absolute": {**CHANNEL, "position": -14_222},
+    "mot_move_stop": {**CHANNEL, "stop_mode": 2},
 }
 
 
-@pytest.fixture
-def protocol() -> ModuleType:
-    """Another implementation of APT."""
-    module: ModuleType = pytest.importorskip("thorlabs_apt_protocol")
-    return module
+class Tap(Line):
+    """A line whose bytes are kept: `sent` by the driver, and its `answers`."""
+
+    sent: frozenset[bytes] = frozenset()
+    answers = b""
+
+    def write(self, data: bytes) -> None:
+        """Keep what is sent."""
+        self.sent |= {data}
+        super().write(data)
+
+    def read(self, size: int, timeout: float) -> bytes:
+        """Keep what comes."""
+        piece = super().read(size, timeout)
+        self.answers += piece
+        return piece
 
 
-def test_requests_agree(protocol: ModuleType) -> None:
-    """thorlabs-apt-protocol builds the same bytes, of every message that both know."""
-    built = {name: request for name, (request, _) in REQUESTS.items()}
-    assert built == {
-        name: getattr(protocol, name)(dest=TO, source=apt.HOST, **arguments)
-        for name, (_, arguments) in REQUESTS.items()
-    }
-
-
-def test_replies_agree(protocol: ModuleType) -> None:
-    """thorlabs-apt-protocol reads the same out of what a controller answers."""
+def test_both_speak_the_same_to_a_wheel() -> None:
+    """thorlabs-apt-protocol builds what the driver sends, and reads what the emulator answers."""
+    protocol = pytest.importorskip("thorlabs_apt_protocol")
+    bench = WheelBench(slot_offset=-12.5)
+    tap = Tap(bench.device, bench.clock)
+    wheel = FilterWheel(tap, FILTERS, Settings(home_offset=-12.5))
+    wheel.connect()
+    wheel.home()
+    wheel.move_to(1)
+    wheel.stop()
+    built = {getattr(protocol, name)(source=1, **values) for name, values in SENT.items()}
+    assert built == tap.sent
     unpacker = protocol.Unpacker()
-    status = apt.Status(1, -68_267, 0, apt.StatusBits(2) | apt.StatusBits.HOMED)
-    answers = [
-        (Id.MOT_GET_STATUSUPDATE, status.pack()),
-        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", "57.1.2").pack()),
-        (Id.MOT_GET_HOMEPARAMS, HOME.pack()),
-        (Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
-    ]
-    for identifier, data in answers:
-        unpacker.feed(apt.encode(apt.Message(identifier, 0, 0, apt.HOST, TO, data)))
-    where, info, homes, speeds = list(unpacker)
-    assert (where.position, where.reverse_limit_switch, where.homed) == (-68_267, True, True)
-    assert (info.serial_number, info.nchs, list(info.firmware_version)) == (
-        *(94_000_009, 1),
-        [57, 1, 2],
-    )
-    assert (homes.home_velocity, homes.offset_distance) == (HOME.velocity, HOME.offset)
-    assert (speeds.acceleration, speeds.max_velocity) == (SPEEDS.acceleration, SPEEDS.maximum)
+    unpacker.feed(tap.answers)
+    found = {message.msg: message for message in unpacker}
+    where, info = found["mot_get_statusupdate"], found["hw_get_info"]
+    assert (where.position, where.homed) == (-14_222, True)
+    assert (info.serial_number, info.nchs) == (40_000_000, 1)
+    assert list(info.firmware_version) == [1, 0, 0]
+    homes, speeds = found["mot_get_homeparams"], found["mot_get_velparams"]
+    assert (homes.home_velocity, homes.offset_distance) == (4_397_466, 0)
+    assert (speeds.acceleration, speeds.max_velocity) == (4506, 21_987_328)
 
 
 @contextmanager

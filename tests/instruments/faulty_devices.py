@@ -1,0 +1,319 @@
+"""Emulated wheel, camera and logger with faults, each set by an attribute of `faults`.
+
+The tests speak to the emulated devices in bytes that `request`, `reply` and `text` make, and name
+the messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
+"""
+
+import math
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from enum import Enum, auto
+from typing import Any
+
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
+from dbthermal.instruments.emulated.world import ROOM, World
+
+MESSAGES = frozenset(Id)
+"""Identifiers of all messages that a driver of the wheel may send."""
+
+BUSY = 0x283
+
+
+@dataclass
+class WheelFaults:
+    """Faults of the wheel and its line; may be changed at any time."""
+
+    silent: bool = False  # answers nothing
+    drop: int = 0  # next answers that never come
+    late: float = 0.0  # delay of every answer [s]
+    single_bytes: bool = False  # every byte in a piece of its own
+    hold: bool = False  # an answer comes only with the next one, until this is False again
+    noise: bytes = b""  # before every answer
+    stray_completed: bool = False  # a report of the end of some move before every answer
+    unreported: bool = False  # the end of a move is not reported
+    long_reports: bool = False  # reports of an end have the status behind, as 20 bytes
+    stuck: str = ""  # states that it always reports, joined by |
+    slow: float = 1.0  # factor by which moves take longer
+    stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
+    stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
+    slips: float = 0.0  # way that the wheel loses in every motion, unnoticed [deg]
+    deaf_to: str = ""  # name of the message that it ignores
+    weak: float = 1.0  # factor of the speeds that it takes
+    notice: str = ""  # error that it reports at the next message, once
+    polls: float = math.inf  # after which it is pulled out
+
+
+@dataclass(frozen=True)
+class StandingDrive(Drive):
+    """A motion that never ends."""
+
+    way: float = 0.0
+
+    @property
+    def duration(self) -> float:
+        """Infinite: the motion never ends."""
+        return math.inf
+
+    def place(self, time: float) -> float:
+        """Position at rest: the wheel does not move."""
+        way = min(self._rise(time - self.start), self.way)
+        return self.origin + math.copysign(way, self.distance)
+
+
+class FaultyApt(EmulatedApt):
+    """The emulated controller with faults; `received` are the messages to its addresses."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.faults = WheelFaults()
+        self.received: list[apt.Message] = []
+        self._waiting: list[tuple[float, bytes]] = []
+
+    def sent(self, name: str) -> list[bytes]:
+        """Data of the messages of a name that a driver has sent."""
+        return [message.data for message in self.received if message.id == Id[name]]
+
+    def turn_to(self, position: int) -> None:
+        """Begin a move to a place [count] without the driver."""
+        data = apt.Position(1, position).pack()
+        self.receive(apt.command(Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
+
+    def obey(self, message: apt.Message) -> None:
+        """Carry out a message, or ignore it by a fault."""
+        self.received.append(message)
+        faults = self.faults
+        if faults.silent or (faults.deaf_to and message.id == Id[faults.deaf_to]):
+            return
+        if faults.notice:
+            notice = struct.pack("<HH64s", message.id, 1, faults.notice.encode())
+            faults.notice = ""
+            self.reply(Id.HW_RICHRESPONSE, notice)
+        if message.id == Id.MOT_SET_VELPARAMS and faults.weak != 1.0:
+            speeds = apt.VelocityParameters.parse(message)
+            weak = [round(faults.weak * v) for v in (speeds.acceleration, speeds.maximum)]
+            data = replace(speeds, acceleration=weak[0], maximum=weak[1]).pack()
+            message = replace(message, data=data)
+        super().obey(message)
+
+    def poll(self) -> list[bytes]:
+        """Messages that are due, split, merged or delayed by a fault."""
+        now, self.faults.polls = self.world.clock(), self.faults.polls - 1
+        self.plugged &= self.faults.polls > 0
+        self._waiting += [(now + self.faults.late, piece) for piece in super().poll()]
+        due = [data for time, data in self._waiting if time <= now]
+        if not due or (self.faults.hold and len(due) < 2):
+            return []
+        self._waiting = [item for item in self._waiting if item[0] > now]
+        joined = b"".join(due)
+        return [bytes([byte]) for byte in joined] if self.faults.single_bytes else [joined]
+
+    def next_due(self) -> float:
+        """Time until something may be due [s]."""
+        times = [time - self.world.clock() for time, _ in self._waiting]
+        return max(0.0, min([super().next_due(), *times]))
+
+    def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
+        """Send an answer, or lose it or add to it by a fault."""
+        if self.faults.drop > 0:
+            self.faults.drop -= 1
+            return
+        if self.faults.noise:
+            self._replies.append(self.faults.noise)
+        if self.faults.stray_completed:
+            super().reply(Id.MOT_MOVE_COMPLETED, param1=1)
+        super().reply(identifier, *arguments, **options)
+
+    def report(self, identifier: Id) -> None:
+        """Report the end of a motion, in another form or not at all by a fault."""
+        if self.faults.long_reports and identifier != Id.MOT_MOVE_HOMED:
+            self.reply(identifier, self.status().pack())
+        elif not self.faults.unreported:
+            super().report(identifier)
+
+    def plan(self, drive: Drive) -> Drive:
+        """Motion that is slower, shorter or endless by a fault."""
+        degree = self.model.turn / 360.0
+        faults, way = self.faults, abs(drive.distance)
+        short = 0.0 if drive.homing else min(faults.stops_short * degree, way)
+        planned = replace(
+            drive,
+            distance=math.copysign(way - short, drive.distance),
+            velocity=drive.velocity / faults.slow,
+            acceleration=drive.acceleration / faults.slow**2,
+        )
+        if faults.stands_after * degree >= way:
+            return planned
+        values = {entry.name: getattr(planned, entry.name) for entry in fields(Drive)}
+        return StandingDrive(**values, way=faults.stands_after * degree)
+
+    def finish(self, drive: Drive) -> None:
+        """Lose steps."""
+        self.wheel -= math.copysign(self.faults.slips / 360.0 * self.model.turn, drive.distance)
+        super().finish(drive)
+
+    def status(self) -> apt.Status:
+        """State with bits that stick."""
+        status = super().status()
+        stuck = [StatusBits[name] for name in self.faults.stuck.split("|") if name]
+        return replace(status, bits=status.bits | sum(stuck))
+
+
+def request(sequence: int, command: int, data: bytes = b"", *, status: int = fslp.REQUEST) -> bytes:
+    """Bytes of a request to a Boson."""
+    return fslp.encode(sequence, command, data, status)
+
+
+def reply(sequence: int, command: int, data: bytes = b"", *, status: int = 0) -> bytes:
+    """Bytes of a reply of a Boson."""
+    return fslp.encode(sequence, command, data, status)
+
+
+def text(sequence: int, command: int) -> bytes:
+    """Bytes of debug text that a Boson sends unasked, on a channel of its own."""
+    return fslp.encode(sequence, command, b"emulated debug text", 0, channel=0x99)
+
+
+class Fault(Enum):
+    """Faults of a Boson's reply."""
+
+    DROP = auto()  # it never comes
+    LATE = auto()  # it comes after `BosonFaults.late`, and so do those behind it
+    HOLD = auto()  # it comes together with the next one
+    BAD_CHECKSUM = auto()
+    ILLEGAL_ESCAPE = auto()
+    CUT = auto()  # its second half is lost
+    WRONG_COMMAND = auto()
+    SHORT = auto()  # its last byte of data is missing, and the checksum is right
+    BUSY = auto()  # it refuses
+    DEBUG_TEXT = auto()  # text on another channel comes first
+
+
+@dataclass
+class BosonFaults:
+    """Faults of a camera's command port; may be changed at any time."""
+
+    once: deque[Fault | None] = field(default_factory=deque)  # for the next requests
+    late: float = 1.5  # delay of `Fault.LATE` [s]
+    single_bytes: bool = False  # replies come byte by byte
+    ffc_stalls: bool = False  # no reply while the shutter is closed
+
+
+class FaultyBoson(EmulatedBoson):
+    """The emulated camera with faults."""
+
+    def __init__(self, world: World, name: str) -> None:
+        super().__init__(world, name)
+        self.faults = BosonFaults()
+        self._inbox: deque[tuple[fslp.Frame, Fault | None, float]] = deque()
+        self._held = b""
+
+    def request(self, frame: fslp.Frame) -> None:
+        """Take in one request with its fault, to be answered when it is due."""
+        fault = self.faults.once.popleft() if self.faults.once else None
+        delay = self.faults.late if fault is Fault.LATE else 0.0
+        self._inbox.append((frame, fault, self._world.time + delay))
+
+    def poll(self) -> list[bytes]:
+        """Give the replies that are due, with their faults."""
+        replies = []
+        while self._inbox and self.next_due() <= 0:
+            frame, fault, _ = self._inbox.popleft()
+            replies.append(self._spoilt(frame, fault))
+        if self.faults.single_bytes:
+            return [bytes([byte]) for reply in replies for byte in reply]
+        return [reply for reply in replies if reply]
+
+    def next_due(self) -> float:
+        """Time until a reply is due [s]; infinite without a request."""
+        if not self._inbox:
+            return math.inf
+        due = self._inbox[0][2]
+        if self.faults.ffc_stalls:
+            due = max(due, self.camera.ffc_until)
+        return due - self._world.time
+
+    def _spoilt(self, frame: fslp.Frame, fault: Fault | None) -> bytes:
+        """Bytes of the reply to a request, with its fault."""
+        spoilt = _misshapen(self.reply(frame), fault)
+        if fault in {Fault.BUSY, Fault.SHORT, Fault.WRONG_COMMAND}:
+            status, data = (BUSY, b"") if fault is Fault.BUSY else self.answer(frame)
+            command = frame.command + (fault is Fault.WRONG_COMMAND)
+            data = data[:-1] if fault is Fault.SHORT else data
+            spoilt = reply(frame.sequence, command, data, status=status)
+        spoilt = self._held + spoilt
+        self._held = spoilt if fault is Fault.HOLD else b""
+        return b"" if fault in {Fault.HOLD, Fault.DROP} else spoilt
+
+
+def _misshapen(whole: bytes, fault: Fault | None) -> bytes:
+    """Damage the bytes of a reply."""
+    match fault:
+        case Fault.BAD_CHECKSUM:
+            # The byte before the end, to a value that needs no escape.
+            return whole[:-2] + bytes([0x00 if whole[-2] else 0x01]) + whole[-1:]
+        case Fault.ILLEGAL_ESCAPE:
+            return whole[:-1] + b"\x9e\x00" + whole[-1:]
+        case Fault.CUT:
+            return whole[: len(whole) // 2]
+        case Fault.DEBUG_TEXT:
+            return text(0, 0) + whole
+        case _:
+            return whole
+
+
+@dataclass
+class LoggerFaults:
+    """Faults of the logger and its library; may be changed at any time."""
+
+    open: set[int] = field(default_factory=set)  # channels whose thermocouple is open: NaN
+    reads_ambient: bool = False  # it reads as the cold junction instead, as the forum reports
+    overflow: set[int] = field(default_factory=set)  # channels whose converter overflows
+    errors: dict[str, int] = field(default_factory=dict)  # next error number of a function
+    firmware_delay: float = 0.0  # how long opening takes [s]
+    no_unit: bool = False  # nothing is plugged in
+    unplugged: bool = False  # pulled out: every function fails with error 16
+
+
+class FaultyTC08(EmulatedTC08):
+    """The emulated library with faults."""
+
+    def __init__(self, tip: Callable[[int], float], clock: Any) -> None:
+        super().__init__(tip, clock)
+        self.faults = LoggerFaults()
+        self._opening = 0.0
+
+    def __getattribute__(self, name: str) -> Any:
+        """Give a function of the library, or one that fails."""
+        if name.startswith("usb_tc08_") and name != "usb_tc08_get_last_error":
+            code = 16 if self.faults.unplugged else self.faults.errors.pop(name, 0)
+            if code:
+                self._error = code
+                return lambda *_: -1 if name.endswith("progress") else 0
+        return super().__getattribute__(name)
+
+    def usb_tc08_open_unit_async(self) -> int:
+        """Begin the firmware's download."""
+        self._opening = self.clock()
+        return super().usb_tc08_open_unit_async()
+
+    def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
+        """Wait for the firmware."""
+        if self.clock() - self._opening < self.faults.firmware_delay:
+            return 0
+        self._is_open |= self.faults.no_unit
+        return super().usb_tc08_open_unit_progress(handle, percent)
+
+    def convert(self, channel: int) -> tuple[float, bool]:
+        """Open thermocouples, and overflows with a full scale that the header leaves open [K]."""
+        if channel in self.faults.overflow:
+            return 673.15, True
+        if channel in self.faults.open:
+            return (ROOM if self.faults.reads_ambient else float("nan")), False
+        return super().convert(channel)

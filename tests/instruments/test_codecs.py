@@ -1,0 +1,308 @@
+"""Codecs of the wheel (APT) and the Boson (FSLP): public bytes, round trips, damaged input."""
+
+import struct
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal.instruments import _apt as apt
+from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments._apt import LENGTHS, Id, Message, command
+from dbthermal.instruments._fslp import Frame
+
+# Requests quoted in the tests of PnPQ, many of them from the maker's documentation; that of 0018
+# from the maker's example program.
+SPEEDS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
+REQUESTS: dict[str, tuple[Id, int, int, bytes, int]] = {
+    "53 04 06 00 A2 01 01 00 40 0D 03 00": (
+        *(Id.MOT_MOVE_ABSOLUTE, 0, 0, apt.Position(1, 200_000).pack(), 0x22),
+    ),
+    "13 04 0E 00 A2 01 01 00 00 00 00 00 B0 35 00 00 CD CC CC 00": (
+        *(Id.MOT_SET_VELPARAMS, 0, 0, SPEEDS.pack(), 0x22),
+    ),
+    "10 02 01 02 50 01": (Id.MOD_SET_CHANENABLESTATE, 1, apt.NO, b"", apt.UNIT),
+    "80 04 01 00 50 01": (Id.MOT_REQ_STATUSUPDATE, 1, 0, b"", apt.UNIT),
+    "18 00 00 00 50 01": (Id.HW_NO_FLASH_PROGRAMMING, 0, 0, b"", apt.UNIT),
+    "43 04 01 00 50 01": (Id.MOT_MOVE_HOME, 1, 0, b"", apt.UNIT),
+    "65 04 01 01 50 01": (Id.MOT_MOVE_STOP, 1, apt.YES, b"", apt.UNIT),
+}
+INFO = "06 00 54 00 81 22 89 53 9A 05 49 4F 4E 30 30 31 20 00 2C 00 02 01 39 00" + (
+    " 00" * 60 + " 01 00 03 00 01 00"
+)
+STATUS = "81 04 0E 00 81 22 01 00 01 00 00 00 00 00 00 00 07 00 00 00"
+LONG_STATUS = STATUS.replace("0E", "1C") + " 01 00" + " 00" * 12
+LONG_COMPLETED = "64 04 0E 00 81 50 01 00 68 AA A0 01 00 00 00 00 30 00 00 80"
+ENDS = [
+    first + rest for first in ("64 04", "66 04") for rest in (" 01 00 01 22", LONG_COMPLETED[5:])
+]
+LIMITS = apt.StatusBits(0b111)
+RECORDS: list[tuple[str, apt.Record]] = [
+    (STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
+    (LONG_STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
+    (INFO, apt.Info(94_000_009, "ION001", "57.1.2")),
+    ("80 00 00 00 01 21", apt.Notice(0, 0, "an error without a text")),
+]
+# Identifiers and lengths of data [byte] of PnPQ, thorlabs-apt-protocol and the maker's examples,
+# which agree.
+PUBLISHED = """
+HW_REQ_INFO 0005 0, HW_GET_INFO 0006 84, HW_STOP_UPDATEMSGS 0012 0, HW_NO_FLASH_PROGRAMMING 0018 0,
+HW_RESPONSE 0080 0, HW_RICHRESPONSE 0081 68, MOD_SET_CHANENABLESTATE 0210 0,
+MOD_REQ_CHANENABLESTATE 0211 0, MOD_GET_CHANENABLESTATE 0212 0, MOT_SET_VELPARAMS 0413 14,
+MOT_REQ_VELPARAMS 0414 0, MOT_GET_VELPARAMS 0415 14, MOT_SET_HOMEPARAMS 0440 14,
+MOT_REQ_HOMEPARAMS 0441 0, MOT_GET_HOMEPARAMS 0442 14, MOT_MOVE_HOME 0443 0, MOT_MOVE_HOMED 0444 0,
+MOT_MOVE_ABSOLUTE 0453 0 6, MOT_MOVE_COMPLETED 0464 0 14, MOT_MOVE_STOP 0465 0,
+MOT_MOVE_STOPPED 0466 0 14, MOT_REQ_STATUSUPDATE 0480 0, MOT_GET_STATUSUPDATE 0481 14 28,
+MOT_GET_DCSTATUSUPDATE 0491 14
+"""
+BITS = [4, 5, 6, 7, 8, 9, 10, 14, 24, 31]  # of `StatusBits`, in its order
+
+# Frames quoted in thurberdog/ghostCommand, but the third: LJMUAstroecology/flirpy, issue 21.
+FRAMES = {
+    "8E 00 00 00 00 01 00 05 00 02 FF FF FF FF 01 0B AE": Frame(0, 1, 0x50002, fslp.REQUEST),
+    "8E 00 00 00 00 01 00 05 00 02 00 00 00 00 00 01 6D 94 30 10 AE": Frame(
+        *(0, 1, 0x50002, 0, (93588).to_bytes(4))
+    ),
+    "8E 00 00 00 00 00 00 05 00 30 00 00 00 00 01 AF 9E 91 99 AE": Frame(
+        *(0, 0, 0x50030, 0, (431).to_bytes(2))
+    ),
+    "8E 00 00 00 00 01 00 05 00 30 FF FF FF FF 49 66 AE": Frame(0, 1, 0x50030, fslp.REQUEST),
+    "8E 00 00 00 00 01 00 05 00 30 00 00 00 00 01 7C BD CE AE": Frame(
+        *(0, 1, 0x50030, 0, (380).to_bytes(2))
+    ),
+}
+REQUEST, REPLY, ESCAPED, _, TEMPERATURE = map(bytes.fromhex, FRAMES)
+SERIAL = FRAMES[REPLY.hex(" ").upper()]
+
+
+def decode(line: str) -> Message:
+    """Return the one message that the bytes are."""
+    decoder = apt.Decoder()
+    (message,) = decoder.feed(bytes.fromhex(line))
+    assert (decoder.dropped, decoder.pending) == (0, bytearray())
+    return message
+
+
+def encoded(frame: Frame) -> bytes:
+    """Encode a frame as it is."""
+    return fslp.encode(
+        frame.sequence, frame.command, frame.data, frame.status, channel=frame.channel
+    )
+
+
+def cut(stream: bytes, places: list[int]) -> list[bytes]:
+    """Cut a stream at these places."""
+    edges = [0, *sorted(place % (len(stream) + 1) for place in places), len(stream)]
+    return [stream[start:stop] for start, stop in pairwise(edges)]
+
+
+def test_messages_have_the_published_bytes() -> None:
+    """Requests, ends of a move in both forms, identities and states are those of others."""
+    built = {
+        command(name, channel, value, data=data, destination=unit).hex(" ").upper()
+        for name, channel, value, data, unit in REQUESTS.values()
+    }
+    assert built == {*REQUESTS}
+    assert [apt.encode(decode(line)) for line in ENDS] == [bytes.fromhex(line) for line in ENDS]
+    assert decode(ENDS[0]) == Message(Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, 0x22)
+    for line, record in RECORDS:
+        assert type(record).parse(decode(line)) == record
+    entries = [f"{known.name} {known:04X} " + " ".join(map(str, LENGTHS[known])) for known in Id]
+    assert entries == PUBLISHED.strip().replace(",\n", ", ").split(", ")
+    assert [bit.bit_length() - 1 for bit in apt.StatusBits] == BITS
+
+
+def test_frames_have_the_published_bytes() -> None:
+    """Each public frame is encoded and decoded, with CRC-16/AUG-CCITT and escapes."""
+    for line, frame in FRAMES.items():
+        assert encoded(frame) == bytes.fromhex(line)
+        assert fslp.Decoder().feed(bytes.fromhex(line)) == [frame]
+    assert fslp.checksum(b"123456789") == 0xE5CC
+    assert fslp.encode(0, 0x0002001C)[-5:] == bytes.fromhex("FF 38 9E 91 AE")
+    content = bytes.fromhex("00 000000 9E81 000000 9E91 9E81 9E91 9EA1 00 9EA1")
+    sent = fslp.encode(0x8E, 0x9E, b"\xae", 0x8E9EAE00)
+    assert sent[1 : 1 + len(content)] == content
+    assert not {0x8E, 0xAE} & {*sent[1:-1]}
+
+
+number = st.integers(-(2**31), 2**31 - 1)
+letters = st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=8)
+records = st.one_of(
+    st.builds(apt.Position, st.just(1), number),
+    st.builds(apt.VelocityParameters, st.just(1), number, number, number),
+    st.builds(apt.HomeParameters, st.just(1), st.just(2), st.just(4), number, number),
+    st.builds(apt.Status, st.just(1), number, number, st.integers(0, 2**32 - 1)),
+    st.builds(apt.Info, st.integers(0, 2**32 - 1), letters, st.just("1.2.3")),
+)
+IDENTIFIERS: dict[type[apt.Record], Id] = {
+    apt.Position: Id.MOT_MOVE_ABSOLUTE,
+    apt.VelocityParameters: Id.MOT_GET_VELPARAMS,
+    apt.HomeParameters: Id.MOT_GET_HOMEPARAMS,
+    apt.Status: Id.MOT_GET_STATUSUPDATE,
+    apt.Info: Id.HW_GET_INFO,
+}
+parts = st.lists(st.tuples(st.sampled_from([b"", b"\xff", b"\xfe\xfe\xff"]), records), max_size=6)
+places = st.lists(st.integers(0, 999), max_size=6)
+
+
+@given(parts, places)
+def test_messages_come_back(noisy: list[tuple[bytes, apt.Record]], where: list[int]) -> None:
+    """Records come back from any cutting, with noise before them, which is counted."""
+    stream, sent = b"", [record for _, record in noisy]
+    for noise, record in noisy:
+        message = Message(IDENTIFIERS[type(record)], 0, 0, apt.HOST, apt.BAY_1, record.pack())
+        stream += noise + apt.encode(message)
+    decoder = apt.Decoder()
+    messages = [message for piece in cut(stream, where) for message in decoder.feed(piece)]
+    pairs = zip(sent, messages, strict=True)
+    assert [type(record).parse(message) for record, message in pairs] == sent
+    assert decoder.dropped == sum(len(noise) for noise, _ in noisy)
+
+
+# Special bytes, and those that follow an escape, are as likely as all others together.
+telling = st.one_of(
+    st.sampled_from([0x8E, 0xAE, 0x9E, 0x81, 0xA1, 0x91, 0x00]), st.integers(0, 255)
+)
+blobs = st.lists(telling, max_size=40).map(bytes)
+words = st.lists(telling, min_size=4, max_size=4).map(lambda b: int.from_bytes(bytes(b)))
+frames = st.builds(Frame, telling, words, words, words, blobs)
+
+
+@given(st.lists(frames, max_size=4), places, blobs)
+def test_frames_come_back(sent: list[Frame], where: list[int], noise: bytes) -> None:
+    """Frames come back in order however the stream is cut, with noise between them."""
+    between = bytes(byte for byte in noise if byte != 0x8E)
+    stream = b"".join(between + encoded(frame) for frame in sent)
+    decoder = fslp.Decoder()
+    assert [frame for piece in cut(stream, where) for frame in decoder.feed(piece)] == sent
+    assert (decoder.damaged, decoder.is_open) == (0, False)
+
+
+known = st.sampled_from([bytes.fromhex(line) for line in (INFO, STATUS, LONG_COMPLETED)])
+cut_short = st.tuples(known, st.integers(0, 90)).map(lambda pair: pair[0][: pair[1]])
+
+
+@given(st.lists(st.one_of(blobs, known, cut_short), max_size=8).map(b"".join), places)
+def test_any_bytes_are_accounted_for(stream: bytes, where: list[int]) -> None:
+    """Of any bytes in any pieces each is in a message or frame, counted as damaged, or pending."""
+    decoder, whole, framed = apt.Decoder(), apt.Decoder().feed(stream), fslp.Decoder()
+    messages = [message for piece in cut(stream, where) for message in decoder.feed(piece)]
+    assert messages == whole
+    read = sum(len(apt.encode(message)) for message in messages)
+    assert read + decoder.dropped + len(decoder.pending) == len(stream)
+    found = [frame for piece in cut(stream, where) for frame in framed.feed(piece)]
+    assert stream.count(0x8E) == len(found) + framed.damaged + framed.is_open
+    assert fslp.Decoder().feed(stream + REPLY)[-1] == SERIAL  # a start byte begins anew
+    decoder.discard()
+    assert decoder.pending == b""
+    assert len(decoder.feed(bytes.fromhex(STATUS))) == 1
+
+
+@given(st.binary(min_size=84, max_size=84))
+def test_parsers_meet_arbitrary_data(content: bytes) -> None:
+    """A parser returns its record of any data of each length that the decoder lets pass."""
+    parsers: dict[type[apt.Record], Id] = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
+    for parser, identifier in parsers.items():
+        for length in filter(None, LENGTHS[identifier]):
+            message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
+            assert isinstance(parser.parse(message), parser)
+
+
+@pytest.mark.parametrize("sent", [REPLY, ESCAPED, TEMPERATURE])
+def test_a_flipped_bit_is_never_believed(sent: bytes) -> None:
+    """No frame with one wrong bit is returned, and the next good one is."""
+    for bit in range(8 * len(sent)):
+        spoilt = (int.from_bytes(sent) ^ 1 << bit).to_bytes(len(sent))
+        assert fslp.Decoder().feed(spoilt + REQUEST) == [FRAMES[REQUEST.hex(" ").upper()]]
+
+
+DAMAGED_FRAMES = {
+    "cut short by the next start": REPLY[:-4] + REPLY[:1],
+    "no such escape": REPLY[:-1] + b"\x9e\x00\xae",
+    "an escape of nothing": REPLY[:-1] + b"\x9e\xae",
+    "wrong checksum": REPLY[:-2] + b"\x11\xae",
+    "empty": b"\x8e\xae",
+    "without end": b"\x8e" + bytes(fslp.MAXIMUM_FRAME + 1) + b"\xae",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED_FRAMES)
+def test_a_damaged_frame_is_dropped_and_counted(damage: str) -> None:
+    """Each kind of damage drops the frame, counts one, and does not harm the next."""
+    decoder = fslp.Decoder()
+    assert decoder.feed(DAMAGED_FRAMES[damage]) == []
+    assert decoder.damaged == 1
+    assert decoder.feed(REPLY) == [SERIAL]
+
+
+@pytest.mark.parametrize(
+    ("header", "heard"),
+    [
+        *(("64 04 00 00 81 21", 0), ("81 04 00 00 81 21", 0), ("81 04 0E 00 01 21", 0)),  # lengths
+        *(("64 04 01 00 01 11", 1), ("64 04 01 00 01 21", 1), ("64 04 01 00 01 2A", 1)),  # senders
+        *(("64 04 01 00 01 50", 1), ("64 04 01 00 01 2B", 0), ("64 04 01 00 01 01", 0)),
+        ("05 00 00 00 50 01", 0),  # its request comes back
+    ],
+)
+def test_what_a_computer_hears(header: str, heard: int) -> None:
+    """Messages of rack, bays and unit are decoded; other addresses and lengths are noise."""
+    decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
+    assert len(decoder.feed(bytes.fromhex(header))) == heard
+    assert decoder.dropped == 1 - heard
+
+
+@pytest.mark.parametrize("size", [fslp.MAXIMUM_FRAME, fslp.MAXIMUM_FRAME + 1])
+def test_the_longest_frame_is_read(size: int) -> None:
+    """A frame of the longest size is decoded, and one byte more is an error."""
+    body = bytes(size - 2)
+    sent = b"\x8e" + body + fslp.checksum(body).to_bytes(2) + b"\xae"
+    assert not {0x8E, 0x9E, 0xAE} & {*sent[1:-1]}
+    assert len(fslp.Decoder().feed(sent)) == (size == 2048)
+
+
+UNFIT: list[tuple[Any, str]] = [
+    (lambda: apt.encode(Message(0x10000, 0, 0, 1, 1)), "id=65536,.* fields must hold it"),
+    (lambda: apt.encode(Message(1, 256, 0, 1, 1)), "param1=256,.* fields must hold it"),
+    (lambda: apt.encode(Message(1, 0, -1, 1, 1)), "param2=-1,.* fields must hold it"),
+    (lambda: apt.encode(Message(1, 0, 0, 0x80, 1)), "destination=128,.* below 128"),
+    (lambda: apt.encode(Message(1, 0, 0, 1, 1, bytes(256))), "at most 255 bytes of data"),
+    (lambda: apt.encode(Message(1, 0, 1, 1, 1, b"x")), "parameters must be 0"),
+    (lambda: apt.encode(Message(1, float("nan"), 0, 1, 1)), "not an int"),  # type: ignore[arg-type]
+    (lambda: apt.Position(1, 2**31).pack(), r"Position\(channel=1, position=2147483648\)"),
+    (lambda: apt.Status(1, 2**31, 0, LIMITS).pack(), "Status.* fields must hold it"),
+    (lambda: apt.Info(1 << 32, "BSC201", "1.0.0").pack(), "Info.* fields must hold it"),
+    (lambda: apt.Info(1, "BSC201-LONG", "1.0.0").pack(), "model 'BSC201-LONG'"),
+    (lambda: command(Id.MOT_SET_VELPARAMS, destination=1), "0 bytes of MOT_SET_VELPARAMS"),
+    (lambda: fslp.encode(1 << 32, 0), "sequence number 4294967296"),
+    (lambda: fslp.encode(0, -1), "command -1. Must lie in 0 to 4294967295"),
+    (lambda: fslp.encode(0, 0, channel=256), "channel 256"),
+    (lambda: fslp.encode(0, 0, bytes(752)), "data of 752 bytes. Must be at most 751"),
+]
+
+
+@pytest.mark.parametrize(("build", "message"), UNFIT)
+def test_what_does_not_fit_is_refused(build: Any, message: str) -> None:
+    """Numbers that do not fit their field are errors, and never rounded into it."""
+    with pytest.raises(ValueError, match=f"Invalid .*{message}"):
+        build()
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        fslp.encode(1.5, 0)  # type: ignore[arg-type]
+
+
+@given(st.integers(0, (1 << 32) - 1))
+def test_sequence_numbers_need_no_escape(sequence: int) -> None:
+    """The number after any other is larger, but at the end, holds no special byte, skips few."""
+    following = fslp.next_sequence(sequence)
+    assert not {0x8E, 0x9E, 0xAE} & {*following.to_bytes(4)}
+    assert following > sequence or sequence == (1 << 32) - 1
+    numbers = [fslp.next_sequence(n) for n in (0, 0x8D, 0xADFF, 0xFFFFFFFF)]
+    assert numbers == [1, 0x8F, 0xAF00, 0]
+
+
+def test_errors_of_a_controller() -> None:
+    """An error of a controller has the message that caused it, a code and a text."""
+    data = struct.pack("<HH64s", 0x0453, 7, b"no motor")
+    message = Message(Id.HW_RICHRESPONSE, 0, 0, apt.HOST, apt.BAY_1, data)
+    assert apt.Notice.parse(decode(apt.encode(message).hex())) == apt.Notice(0x453, 7, "no motor")
