@@ -28,6 +28,12 @@ def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.compared_reflections(movie, movie, array("time", 2) - 300.5)
 
 
+def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the condition number of a pair of bands, infinite on the diagonal."""
+    matrix = fill * array("first second", 2, 2, **attrs)
+    return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
+
+
 def draw_scores(**attrs: object) -> Figure:
     """Draw the scores of two quantities."""
     parts = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
@@ -143,6 +149,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     ),
     "error_bar_calibration": (draw_scores, {"density [1]", "error / standard deviation [1]"}),
     "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
+    "condition_matrix": (draw_condition, {"condition number [1]"}),
     "error_over_noise": (draw_noise, {"median error [K]", NOISE}),
     "emissivity_errors": (
         draw_emissivity,
@@ -208,7 +215,7 @@ def test_figure_of_an_experiment(name: str) -> None:
         assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
 
-@pytest.mark.parametrize("draw", [draw_compared, draw_pooled])
+@pytest.mark.parametrize("draw", [draw_compared, draw_condition, draw_pooled])
 def test_nothing_but_nan(draw: Callable[..., Figure]) -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
     figure = draw(fill=np.nan)
