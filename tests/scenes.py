@@ -374,6 +374,20 @@ def heard(make: Callable[[], xr.Dataset]) -> Outcome:
     return Outcome(result, tuple(str(one.message) for one in said))
 
 
+def held(
+    result: xr.Dataset,
+    truth: xr.Dataset,
+    name: str = "object_temperature",
+    where: xr.DataArray | None = None,
+) -> float:
+    """Share of the samples, of some pixels, whose 95 % interval holds the truth; also printed."""
+    error = abs(result[name] - truth[name])
+    there = error.notnull() if where is None else error.notnull() & where
+    share = float((error < TO_95 * result[f"{name}_std"]).where(there).mean())
+    print(f"{name}: {share:.3f} of the 95 % intervals hold")
+    return share
+
+
 def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
     """Figures of a result against the truth.
 

@@ -126,22 +126,15 @@ def test_values_outside_the_range(bad: float) -> None:
 )
 def test_edges_that_are_no_band(edges: tuple[float, float]) -> None:
     """A band without a positive, finite width, or in micrometres, raises a ValueError."""
-    with pytest.raises(
-        ValueError, match=r"edges of band 'odd' .* Must be finite .* metres, not mic"
-    ):
+    with pytest.raises(ValueError, match=r"edges of band 'odd' .* Must be finite .* metres, not"):
         Band("odd", *edges)
 
 
 def test_filters_of_the_paper() -> None:
     """Centres and widths are the published ones, and each filter goes by its own name."""
     found = {name: (band.centre * 1e6, band.width * 1e6) for name, band in FILTERS.items()}
-    expected = {
-        "8-14": (11.0, 6.0),
-        "8.5": (8.5, 0.5),
-        "9.5": (9.5, 0.5),
-        "10.6": (10.6, 1.5),
-        "12.1": (12.1, 0.5),
-    }
+    expected = {"8-14": (11.0, 6.0), "8.5": (8.5, 0.5), "9.5": (9.5, 0.5), "10.6": (10.6, 1.5)}
+    expected["12.1"] = (12.1, 0.5)
     assert found.keys() == expected.keys()
     for name, values in expected.items():
         assert found[name] == pytest.approx(values, abs=1e-9)

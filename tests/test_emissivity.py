@@ -45,8 +45,9 @@ def table(**rows: list[float]) -> xr.Dataset:
     )
 
 
-def library(mirror: Path) -> dict[str, xr.Dataset]:
-    """Every spectrum of the mirror, by the name that the embedded table gives as its source."""
+@pytest.fixture(scope="module")
+def spectra(mirror: Path) -> dict[str, xr.Dataset]:
+    """Every spectrum of the three libraries, by the embedded table's name."""
     paths = sorted((mirror / "ecostress").glob("*.spectrum.txt"))
     spectra = {path.name: readers.ecostress(path) for path in paths}
     slum = readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv")
@@ -55,15 +56,9 @@ def library(mirror: Path) -> dict[str, xr.Dataset]:
     return spectra | {path.name: readers.ucsb(path) for path in others}
 
 
-@pytest.fixture(scope="module")
-def spectra(mirror: Path) -> dict[str, xr.Dataset]:
-    """Every spectrum of the three libraries."""
-    return library(mirror)
-
-
-@given(st.floats(0.01, 1.0), st.floats(150.0, 1000.0))
+@given(st.floats(0.01, 1.05), st.floats(150.0, 1000.0))
 def test_gray_stays_gray(value: float, temperature: float) -> None:
-    """A gray body has its one emissivity in every band, at every temperature."""
+    """A gray body, unphysical or not, has its emissivity in every band, at every temperature."""
     made = emissivity.band_table({"gray": spectrum([7, 15], [value] * 2)}, FILTERS, temperature)
     np.testing.assert_allclose(made["emissivity"], value, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(made["coverage"], 1.0)
@@ -72,19 +67,18 @@ def test_gray_stays_gray(value: float, temperature: float) -> None:
 @pytest.mark.parametrize("band", FILTERS.values(), ids=FILTERS)
 def test_average_against_quadrature(band: Band) -> None:
     """A kinked spectrum, its kinks off the band's edges, agrees with adaptive quadrature."""
-    made = spectrum(
-        [7.5, 8.31, 9.42, 10.07, 12.2, 13.3, 14.2], [0.9, 0.2, 0.8, 0.5, 0.95, 0.3, 0.7]
-    )
-    knots = made["wavelength"].values
+    knots = [7.5, 8.31, 9.42, 10.07, 12.2, 13.3, 14.2]
+    made = spectrum(knots, [0.9, 0.2, 0.8, 0.5, 0.95, 0.3, 0.7])
+    fine = made["wavelength"].values
 
     def radiance(wavelength: float) -> float:
         return float(planck.spectral_radiance(wavelength * 1e-6, 320.0)) * 1e-6
 
     def emitted(wavelength: float) -> float:
-        return radiance(wavelength) * float(np.interp(wavelength * 1e-6, knots, made["emissivity"]))
+        return radiance(wavelength) * float(np.interp(wavelength * 1e-6, fine, made["emissivity"]))
 
     edges = (band.lower * 1e6, band.upper * 1e6)
-    kinks = [knot for knot in knots * 1e6 if edges[0] < knot < edges[1]] or None
+    kinks = [knot for knot in fine * 1e6 if edges[0] < knot < edges[1]] or None
     above, below = (
         quad(f, *edges, points=kinks, epsabs=0, epsrel=1e-11)[0] for f in (emitted, radiance)
     )
@@ -96,19 +90,9 @@ def test_weight_moves_with_temperature() -> None:
     """A step at 10 um counts the share of the radiance beyond it, which falls as it gets hotter."""
     step = {"step": spectrum([8, 10 - 1e-9, 10 + 1e-9, 14], [0, 0, 1, 1])}
     for temperature in (250.0, 300.0, 600.0):
-        share = Band("upper", 10e-6, 14e-6).radiance(temperature) / FILTERS["8-14"].radiance(
-            temperature
-        )
+        upper, whole = (b.radiance(temperature) for b in (Band("", 10e-6, 14e-6), FILTERS["8-14"]))
         result = emissivity.band_table(step, ["8-14"], temperature)["emissivity"]
-        assert float(result[0, 0]) == pytest.approx(float(share), abs=1e-8)
-
-
-@pytest.mark.parametrize("bands", [FILTERS, FILTERS.values(), list(FILTERS), tuple(FILTERS)])
-def test_bands_by_name_or_as_such(bands: list[str]) -> None:
-    """Bands are given as a mapping, as objects or by name."""
-    made = emissivity.band_table({"gray": spectrum([8, 14], [0.5, 0.5])}, bands)
-    assert made["band"].values.tolist() == list(FILTERS)
-    assert schema.check(made, "emissivity_table") is made
+        assert float(result[0, 0]) == pytest.approx(float(upper / whole), abs=1e-8)
 
 
 def test_short_spectrum_is_averaged_if_asked() -> None:
@@ -117,78 +101,44 @@ def test_short_spectrum_is_averaged_if_asked() -> None:
     made = emissivity.band_table(short, FILTERS, minimum_coverage=0.7)
     alone = emissivity.band_table(short, [Band("part", 8e-6, 12.5e-6)])
     radiances = [float(Band("", 8e-6, end).radiance(300.0)) for end in (12.5e-6, 14e-6)]
-    assert float(made["emissivity"][0, 0]) == pytest.approx(
-        float(alone["emissivity"][0, 0]), abs=1e-12
-    )
+    covered = float(alone["emissivity"][0, 0])
+    assert float(made["emissivity"][0, 0]) == pytest.approx(covered, abs=1e-12)
     assert float(made["coverage"][0, 0]) == pytest.approx(radiances[0] / radiances[1], abs=1e-12)
     np.testing.assert_array_equal(made["coverage"].sel(material="whole"), 1.0)
 
 
-def test_unphysical_values_are_kept() -> None:
-    """An emissivity of 1.02 enters as it is."""
-    odd = {"bark": spectrum([8, 9.4, 9.6, 14], [1.0, 1.02, 1.02, 1.0])}
-    made = emissivity.band_table(odd, ["9.5", "12.1"])
-    assert float(made["emissivity"][0, 0]) > 1.0
+SHORT, METAL = spectrum([8, 11], [1, 1]), spectrum([0.3, 12.5], [0.1, 0.1])
+BAD: list[tuple[dict[str, object], str]] = [
+    ({"spectra": {}}, "Empty spectra"),
+    ({"spectra": [1, 2]}, "Invalid spectra of type list"),
+    ({"bands": []}, "Invalid bands []"),
+    ({"bands": ["9.5", "9.5"]}, "Invalid bands ['9.5', '9.5']"),
+    ({"bands": ["9.4"]}, "Unknown band '9.4'"),
+    ({"bands": "9.4"}, "Unknown band '9.4'"),
+    ({"bands": ["9.5", 8.5]}, "Invalid band 8.5"),
+    ({"spectra": {"%": spectrum([8, 14], [86.0, 86.0])}}, "Invalid emissivity 86.0 of '%'"),
+    (
+        {"spectra": {"metal": METAL}},
+        "coverage 0.7808 of band '8-14' by the spectrum of 'metal', 3e-",
+    ),
+    (
+        {"spectra": {"m": SHORT}, "bands": ["12.1"], "minimum_coverage": 1e-9},
+        "0.0000 of band '12.1'",
+    ),
+    ({"spectra": {"holed": spectrum([8, 9, 14], [1, np.nan, 1])}}, "nan of 'holed' at 9e-06 m"),
+    ({"spectra": {"turned": spectrum([14, 8], [1, 1])}}, "Unordered 'wavelength'"),
+    ({"temperature": 27.0}, "Invalid temperature [K] in band '8-14' 27.0"),
+    ({"minimum_coverage": 0.0}, "Invalid minimum_coverage 0.0"),
+    ({"minimum_coverage": 1.1}, "Invalid minimum_coverage 1.1"),
+]
 
 
-def test_wrong_spectrum_is_named() -> None:
-    """The stage's own error carries the material's name."""
-    with pytest.raises(ValueError, match="Unordered 'wavelength'") as caught:
-        emissivity.band_table({"turned": spectrum([14, 8], [1, 1])}, FILTERS)
-    assert caught.value.__notes__ == ["In the spectrum of 'turned'."]
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"spectra": {}}, ValueError, "Empty spectra"),
-        ({"bands": []}, ValueError, "Invalid bands []"),
-        ({"bands": ["9.5", "9.5"]}, ValueError, "Invalid bands ['9.5', '9.5']"),
-        ({"bands": ["9.4"]}, KeyError, "Unknown band '9.4'"),
-        ({"bands": ["9.5", 8.5]}, TypeError, "Invalid band 8.5"),
-        ({"bands": "9.4"}, KeyError, "Unknown band '9.4'"),
-        ({"spectra": [1, 2]}, TypeError, "Invalid spectra of type list"),
-        (
-            {"spectra": {"percent": spectrum([8, 14], [86.0, 86.0])}},
-            ValueError,
-            "Invalid emissivity 86.0 of 'percent'",
-        ),
-        (
-            {"spectra": {"metal": spectrum([0.3, 12.5], [0.1, 0.1])}},
-            ValueError,
-            "Invalid coverage 0.7808 of band '8-14' by the spectrum of 'metal', 3e-07 to 1.25e-05",
-        ),
-        (
-            {
-                "spectra": {"m": spectrum([8, 11], [1, 1])},
-                "bands": ["12.1"],
-                "minimum_coverage": 1e-9,
-            },
-            ValueError,
-            "Invalid coverage 0.0000 of band '12.1'",
-        ),
-        (
-            {"spectra": {"holed": spectrum([8, 9, 14], [1, np.nan, 1])}},
-            ValueError,
-            "Invalid emissivity nan of 'holed' at 9e-06 m",
-        ),
-        ({"temperature": 27.0}, ValueError, "Invalid temperature [K] in band '8-14' 27.0"),
-        ({"minimum_coverage": 0.0}, ValueError, "Invalid minimum_coverage 0.0"),
-        ({"minimum_coverage": 1.1}, ValueError, "Invalid minimum_coverage 1.1"),
-    ],
-)
-def test_bad_arguments(change: dict[str, object], error: type[Exception], message: str) -> None:
+@pytest.mark.parametrize(("change", "message"), BAD)
+def test_bad_arguments(change: dict[str, object], message: str) -> None:
     """Invalid arguments raise an error with the rule."""
     arguments: dict[str, object] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
-    with pytest.raises(error, match=re.escape(message)):
+    with pytest.raises((ValueError, KeyError, TypeError), match=re.escape(message)):
         emissivity.band_table(**(arguments | change))  # type: ignore[arg-type]
-
-
-def test_condition_number_of_glass() -> None:
-    """Emissivities of 0.86 and 0.72 give 9.58 either way round; a band and itself are singular."""
-    numbers = emissivity.condition_numbers(table(glass=[0.86, 0.72]))
-    np.testing.assert_allclose(numbers.values[0, [0, 1], [1, 0]], 9.58, rtol=0, atol=0.005)
-    np.testing.assert_array_equal(numbers.values[0, [0, 1], [0, 1]], np.inf)
 
 
 @given(*[st.floats(0.0, 1.0)] * 2)
@@ -199,8 +149,9 @@ def test_condition_number_closed_form(first: float, second: float) -> None:
     low, high = sorted((first, second))
     excess = ((1 - high) ** 2 + low**2) / (high - low)
     expected = 1 + excess + np.sqrt(excess * (excess + 2))
-    result = float(emissivity.condition_numbers(table(m=[first, second]))[0, 0, 1])
-    assert result == pytest.approx(expected, rel=1e-9)
+    (result,) = emissivity.condition_numbers(table(m=[first, second])).values
+    assert result[0, 1] == pytest.approx(expected, rel=1e-9)
+    assert result.diagonal().tolist() == [np.inf, np.inf]
 
 
 def test_pair_summary_leaves_gray_out_of_the_mean() -> None:
@@ -246,20 +197,29 @@ def test_choice_weighs_condition_against_noise() -> None:
     assert choice.attrs["lowest_std"] == "8.5"
 
 
+def noise_of(*values: float, units: str = "K") -> xr.DataArray:
+    """Noise of the first of both bands."""
+    names = {"band": ["8-14", "9.5"][: len(values)]}
+    return xr.DataArray(list(values), names, dims="band", attrs={"units": units})
+
+
 @pytest.mark.parametrize(
-    ("bands", "values", "units", "message"),
+    ("row", "noise", "more", "message"),
     [
-        (["8-14"], [0.03], "K", "Missing band '9.5' in the noise"),
-        (["8-14", "9.5"], [0.03, 0.0], "K", "Invalid noise [K] 0.0"),
-        (["8-14", "9.5"], [0.03, np.nan], "K", "Invalid noise [K] nan"),
-        (["8-14", "9.5"], [3.0, 3.0], "count", "Invalid units 'count' of the noise"),
+        ([0.86, 0.72], noise_of(0.03), {}, "Missing band '9.5' in the noise"),
+        ([0.86, 0.72], noise_of(0.03, 0.0), {}, "Invalid noise [K] 0.0"),
+        ([0.86, 0.72], noise_of(0.03, np.nan), {}, "Invalid noise [K] nan"),
+        ([0.86, 0.72], noise_of(3.0, 3.0, units="count"), {}, "Invalid units 'count' of the noise"),
+        ([86.0, 72.0], noise_of(0.03, 0.03), {}, "Invalid emissivity of the table 86"),
+        ([0.86, 0.72], noise_of(0.03, 0.03), {"beside": "10.6"}, "Must hold '10.6'"),
     ],
 )
-def test_bad_noise(bands: list[str], values: list[float], units: str, message: str) -> None:
-    """Noise is a positive number of kelvin for every band."""
-    noise = xr.DataArray(values, coords={"band": bands}, dims="band", attrs={"units": units})
+def test_tables_that_rank_no_filter(
+    row: list[float], noise: xr.DataArray, more: dict[str, str], message: str
+) -> None:
+    """Noise that is no positive kelvin of every band, per cent and an absent band are refused."""
     with pytest.raises(ValueError, match=re.escape(message)):
-        emissivity.rank_filters(table(glass=[0.86, 0.72]), noise)
+        emissivity.rank_filters(table(glass=row), noise, **more)
 
 
 def test_embedded_table_is_whole() -> None:
@@ -272,14 +232,9 @@ def test_embedded_table_is_whole() -> None:
     assert {*made["library"].values} == {"ECOSTRESS 1.0", "SLUM 1.0", "MODIS UCSB"}
     glass = made["emissivity"].sel(material="plate window glass", band=["8-14", "9.5"])
     np.testing.assert_allclose(glass, [0.861, 0.718], rtol=0, atol=0.002)
-
-
-def test_embedded_table_cites_its_sources() -> None:
-    """The file names each library's papers and the credit line that one asks for."""
     text = Path(emissivity.__file__).with_name("emissivity_table.csv").read_text("utf-8")
-    assert "courtesy of the Jet Propulsion Laboratory" in text
-    for doi in ("j.rse.2008.11.007", "j.rse.2019.05.015", "j.isprsjprs.2014.05.005"):
-        assert f"doi:10.1016/{doi}" in text
+    for credit in ("courtesy of the Jet Propulsion", "doi:10.1016/j.isprsjprs.2014.05.005"):
+        assert credit in text
 
 
 @pytest.mark.data
@@ -365,20 +320,14 @@ def test_gap_is_not_covered() -> None:
     np.testing.assert_array_equal(coarse["coverage"], 1.0)
 
 
-def test_tables_that_have_no_filter() -> None:
-    """Emissivities in per cent, one band alone, another band's place, and no arrays are refused."""
-    percent, noise = table(glass=[86.0, 72.0]), emissivity.filter_noise(0.03, ["8-14", "9.5"])
-    for call, message in (
-        (lambda: emissivity.condition_numbers(percent), "Invalid emissivity of the table 86"),
-        (lambda: emissivity.rank_filters(percent, noise), "Invalid emissivity of the table 86"),
-        (lambda: emissivity.condition_numbers(table(m=[0.9])), "Must be at least two"),
-        (
-            lambda: emissivity.rank_filters(table(m=[0.9, 0.8]), noise, beside="10.6"),
-            "Must hold '10.6'",
-        ),
+def test_tables_that_have_no_pair() -> None:
+    """Emissivities in per cent, one band alone, and no arrays are refused."""
+    for row, message in (
+        ([86.0, 72.0], "Invalid emissivity of the table 86"),
+        ([0.9], "least two"),
     ):
         with pytest.raises(ValueError, match=message):
-            call()
+            emissivity.condition_numbers(table(m=row))
     with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
         emissivity.pair_summary(np.ones(3))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):

@@ -1,6 +1,7 @@
 """Planck's law against closed forms and constants that it must contain."""
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -117,13 +118,14 @@ def test_what_is_no_number_is_refused(value: object) -> None:
 
 def test_stated_units_must_agree() -> None:
     """A DataArray whose units are not those in the name raises a ValueError."""
-    micrometres = xr.DataArray([10.0], attrs={"units": "um"})
-    with pytest.raises(ValueError, match=re.escape("Invalid units 'um' of wavelength [m]")):
-        planck.spectral_radiance(micrometres, 300.0)
-    celsius = xr.DataArray([20.0], attrs={"units": "degC"})
-    with pytest.raises(ValueError, match=re.escape("Invalid units 'degC' of temperature [K]")):
-        planck.spectral_radiance(1e-5, celsius)
-    with pytest.raises(ValueError, match=re.escape("Invalid units 'degC' of temperature [K]")):
-        get("9.5").slope(celsius)
+    celsius, micrometres = (xr.DataArray([10.0], attrs={"units": u}) for u in ("degC", "um"))
+    calls: list[tuple[Callable[[], object], str]] = [
+        (lambda: planck.spectral_radiance(micrometres, 300.0), "'um' of wavelength [m]"),
+        (lambda: planck.spectral_radiance(1e-5, celsius), "'degC' of temperature [K]"),
+        (lambda: get("9.5").slope(celsius), "'degC' of temperature [K]"),
+    ]
+    for call, name in calls:
+        with pytest.raises(ValueError, match=re.escape(f"Invalid units {name}")):
+            call()
     radiance = xr.DataArray([1e7], attrs={"units": "W m-2 sr-1 m-1"})
     assert planck.brightness_temperature(1e-5, radiance) > 0

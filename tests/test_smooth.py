@@ -12,41 +12,30 @@ from scipy.linalg import block_diag
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
 
-TIMES = st.lists(st.floats(0.01, 10.0), min_size=12, max_size=40).map(np.cumsum)
+STEPS = st.lists(st.floats(0.01, 10.0), min_size=12, max_size=40).map(np.cumsum)
+TIMES = st.builds(
+    lambda t, unit, start: start + unit * t, STEPS, st.floats(0.1, 10), st.floats(-1e3, 1e3)
+)
 ORDERS = st.integers(1, 6)
 
 
-@given(TIMES, ORDERS)
-def test_basis_is_orthonormal(time: Array, order: int) -> None:
-    """The functions are orthonormal over the capture's own times, evenly spaced or not."""
+@given(TIMES, ORDERS, st.integers(0, 1000))
+def test_basis_is_that_of_the_polynomials(time: Array, order: int, seed: int) -> None:
+    """Orthonormal, at any times in any unit, and a polynomial of a degree below is its own fit."""
     functions = smooth.polynomial_basis(time, order)
     np.testing.assert_allclose(functions.T @ functions, np.eye(order), rtol=0, atol=1e-12)
-
-
-@given(TIMES, ORDERS, st.integers(0, 1000))
-def test_basis_spans_the_polynomials(time: Array, order: int, seed: int) -> None:
-    """A polynomial of a degree below the order is its own projection."""
     coefficients = np.random.default_rng(seed).standard_normal(order)
     signal = np.polynomial.Polynomial(coefficients, domain=[time[0], time[-1]])(time)
-    functions = smooth.polynomial_basis(time, order)
-    np.testing.assert_allclose(functions @ (functions.T @ signal), signal, rtol=0, atol=1e-10)
-
-
-@given(st.floats(0.01, 100.0), st.floats(-1e4, 1e4))
-def test_basis_ignores_unit_and_start_of_time(scale: float, start: float) -> None:
-    """Seconds or minutes, from whenever: the functions are the same."""
-    time = np.arange(20.0) ** 1.2
-    functions = smooth.polynomial_basis(start + scale * time, 5)
-    np.testing.assert_allclose(
-        np.abs(functions), np.abs(smooth.polynomial_basis(time, 5)), rtol=0, atol=1e-6
-    )
+    np.testing.assert_allclose(functions @ (functions.T @ signal), signal, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("order", [0, -1, 6])
 def test_bad_order(order: int) -> None:
-    """An order of zero, or above the number of frames, raises an error."""
+    """An order of zero, or more functions than frames, raises an error with the numbers."""
     with pytest.raises(ValueError, match=re.escape(f"Invalid order {order} of the smooth")):
         smooth.polynomial_basis(np.arange(5.0), order)
+    with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
+        smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
 
 
 def test_leverage_is_the_hat_matrix() -> None:
@@ -63,23 +52,6 @@ def test_leverage_is_the_hat_matrix() -> None:
 def segmented(frames: int, *events: int) -> np.ndarray:
     """Number of events before each frame."""
     return np.searchsorted(events, np.arange(frames), side="right")
-
-
-def test_steps_and_pieces_are_in_the_subspace() -> None:
-    """Steps of the camera and a polynomial in each piece are their own projection."""
-    time = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
-    first = np.isin(np.arange(60), [0, 20, 23, 41])
-    rising = smooth.subspace(time, 6, segment=segmented(60, 30)).rising
-    functions = smooth.piecewise(time, first, rising, segment=segmented(60, 30))
-    assert (functions.orders, functions.steps) == (1, 3 * smooth.PIECE_ORDER + 3)
-    piece = np.cumsum(first)
-    curve = piece * (3.0 + 0.1 * (time - time[35]) ** 3) + np.sin(7.0 * time) * (piece == 2)
-    fit = functions.functions.T @ (curve + 2.0 * segmented(60, 30))
-    np.testing.assert_allclose(
-        functions.object_part @ fit, curve, rtol=0, atol=1e-8 * np.ptp(curve)
-    )
-    identity = functions.functions.T @ functions.functions
-    np.testing.assert_allclose(identity, np.eye(functions.steps + 1), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("events", [(30,), (5, 8), (5, 50), (23, 30, 58)])
@@ -122,34 +94,20 @@ def test_leverage_of_chosen_pieces(events: tuple[int, ...]) -> None:
     np.testing.assert_allclose(added, shares * own[1], rtol=1e-9, atol=0)
 
 
-@given(
-    st.floats(-50, 50),
-    st.lists(st.integers(5, 55), min_size=1, max_size=3, unique=True).map(sorted),
-)
+EVENTS = st.lists(st.integers(5, 55), max_size=3, unique=True).map(sorted)
+
+
+@given(st.floats(-50, 50), EVENTS)
 def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list[int]) -> None:
     """The object's part of a curve with steps of the camera is the curve alone."""
     time = np.arange(60.0)
     curve = 0.01 * (time - 20.0) ** 2
-    signal = curve + height * segmented(60, *events)
     functions = smooth.subspace(time, 4, segment=segmented(60, *events))
-    own = functions.object_part @ (functions.functions.T @ signal)
+    own = functions.object_part @ (
+        functions.functions.T @ (curve + height * segmented(60, *events))
+    )
     np.testing.assert_allclose(own, curve, rtol=0, atol=1e-9)
-
-
-def test_without_steps_the_subspace_is_the_basis() -> None:
-    """No event: the polynomials, all of them the object's own."""
-    time = np.arange(30.0)
-    for segment in (None, np.zeros(30, int), np.full(30, 7)):
-        found = smooth.subspace(time, 5, segment=segment)
-        np.testing.assert_array_equal(found.functions, smooth.polynomial_basis(time, 5))
-        np.testing.assert_array_equal(found.object_part, found.functions)
-        assert found.steps == 0
-
-
-def test_more_steps_than_frames() -> None:
-    """More functions than frames raise an error with both numbers."""
-    with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
-        smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
+    assert functions.steps == len(events)
 
 
 @pytest.mark.parametrize("pause", [3.6e3, 1e9])

@@ -51,20 +51,17 @@ def emissivity(folder: Path, text: str) -> float:
     return float(readers.slum(path)["A1"]["emissivity"][0])
 
 
-@pytest.mark.parametrize("text", ["1", "0.75", ".5", "1.", "1e0", "5E-1", " 0.7\t"])
-def test_decimal_numbers(tmp_path: Path, text: str) -> None:
-    """Decimal numbers have Python's value."""
-    assert emissivity(tmp_path, text) == float(text)
+def test_decimal_numbers(tmp_path: Path) -> None:
+    """Decimal numbers have Python's value; words, other digits and separators are refused."""
+    for text in ("1", "0.75", ".5", "1.", "1e0", "5E-1", " 0.7\t"):
+        assert emissivity(tmp_path, text) == float(text)
+    for text in ("", "nan", "inf", "1e999", "1_000", "1 000", "0x10", "\u0661\u0662", "1d3"):
+        message = f"f.csv, line 2, column 2: Invalid number {text!r}"
+        with pytest.raises(ValueError, match=re.escape(message)):
+            emissivity(tmp_path, text)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "nan", "inf", "1e999", "1_000", "1 000", "0x10", "\u0661\u0662", "1d3"]
-)
-def test_what_is_no_decimal_number(tmp_path: Path, text: str) -> None:
-    """Words, separators, other digits and what is beyond the floats are refused by place."""
-    message = f"f.csv, line 2, column 2: Invalid number {text!r}"
-    with pytest.raises(ValueError, match=re.escape(message)):
-        emissivity(tmp_path, text)
+ODD = "No 012 0o17 12:30 1_000 1e3 .inf -.5 1.0e+999 2026-01-02 0x1F ="
 
 
 @given(st.dictionaries(WORDS, st.recursive(LEAVES, st.lists, max_leaves=20)))
@@ -85,10 +82,7 @@ def test_yaml_of_json_is_read_back(content: dict[str, object]) -> None:
         ("null: 1", "line 1, column 1: Invalid key None. Must be text or a number"),
         ("{[1]: 1}", "Invalid key [1]"),
         ("a: on", "line 1, column 4: Invalid value on. Must be a finite decimal number, true"),
-        *((f"a: {value}", f"Invalid value {value}. Must") for value in ("No", "012", "0o17")),
-        *((f"a: {value}", f"Invalid value {value}. Must") for value in ("12:30", "1_000", "1e3")),
-        *((f"a: {value}", f"Invalid value {value}. Must") for value in (".inf", "-.5", "1.0e+999")),
-        *((f"a: {value}", f"Invalid value {value}. Must") for value in ("2026-01-02", "0x1F", "=")),
+        *((f"a: {value}", f"Invalid value {value}. Must") for value in ODD.split()),
         ("a: " + "9" * 5000, "Invalid value 999"),
         ("a: {<<: {b: 1}}", "Invalid value <<"),
         ("a: &x [1]\nb: *x", "line 1, column 4: Invalid anchor or alias 'x'. Must be written out"),

@@ -49,9 +49,8 @@ def with_(value: float, *places: Any) -> Callable[[Counts], Counts]:
 
 def scattered(share: float) -> Callable[[Counts], Counts]:
     """Counts of which a share is NaN."""
-    return lambda counts: np.where(
-        np.random.default_rng(1).random(counts.shape) < share, np.nan, counts
-    )
+    rng = np.random.default_rng
+    return lambda counts: np.where(rng(1).random(counts.shape) < share, np.nan, counts)
 
 
 ODD: dict[str, Callable[[Counts], Counts]] = {
@@ -80,24 +79,21 @@ ODD: dict[str, Callable[[Counts], Counts]] = {
 QUICK = ("a band NaN", "60 % NaN", "an infinite row", "one huge sample", "tiny")
 
 
-def blackbody(counts: Counts) -> xr.DataArray:
+def blackbody(capture: xr.Dataset) -> xr.DataArray:
     """Six of the frames as those of a blackbody."""
     coordinates = {"band": BANDS, "temperature": np.linspace(285.0, 335.0, 6)}
-    return xr.DataArray(counts[:, :6], coordinates, dims=("band", "temperature", "y", "x"))
+    counts = capture["counts"].values[:, :6]
+    return xr.DataArray(counts, coordinates, dims=("band", "temperature", "y", "x"))
 
 
-def measured(counts: Counts) -> xr.Dataset:
+def measured(capture: xr.Dataset) -> xr.Dataset:
     """Some of the counts as those of an emissivity bench."""
-    dims, stage = ("band", "measurement"), {"band": BANDS}
-    return xr.Dataset(
-        {
-            "counts": (dims, counts[:, :3, 0, 0]),
-            "reflected_counts": (dims, counts[:, 5:8, 1, 1]),
-            "object_temperature": ("measurement", [300.0, 320.0, 335.0]),
-            "background_temperature": ("measurement", [330.0, 310.0, 295.0]),
-        },
-        stage,
-    )
+    counts, dims = capture["counts"].values, ("band", "measurement")
+    parts = {"counts": (dims, counts[:, :3, 0, 0])}
+    parts["reflected_counts"] = (dims, counts[:, 5:8, 1, 1])
+    kelvin = {"object": [300.0, 320.0, 335.0], "background": [330.0, 310.0, 295.0]}
+    rest = {f"{who}_temperature": ("measurement", values) for who, values in kelvin.items()}
+    return xr.Dataset({**parts, **rest}, {"band": BANDS})
 
 
 def solved(method: str, capture: xr.Dataset) -> None:
@@ -120,11 +116,11 @@ def films(capture: xr.Dataset) -> list[Counts]:
     return [part.values.reshape(60, -1) for part in capture["counts"]]
 
 
+METHODS = ("subspace", "calibrated", "naive", "ratio", "bcp", "apparent")
+PLACES = xr.DataArray(np.ones((6, 8), bool), dims=("y", "x"))
+STD = (0.1, 0.1)
 CALLS: dict[str, Callable[[xr.Dataset], Any]] = {
-    **{
-        f"solve {method}": partial(solved, method)
-        for method in ("subspace", "calibrated", "naive", "ratio", "bcp", "apparent")
-    },
+    **{f"solve {method}": partial(solved, method) for method in METHODS},
     "separated": separated,
     "uncalibrated_reflection": lambda it: scales.uncalibrated_reflection(it["counts"]),
     "correlation": lambda it: metrics.correlation(it["counts"][0], it["counts"][1]),
@@ -136,19 +132,11 @@ CALLS: dict[str, Callable[[xr.Dataset], Any]] = {
     "mark_bad": correction.mark_bad,
     "mark_shutter": correction.mark_shutter,
     "undo_lag": lambda it: correction.undo_lag(it, 10.0),
-    "undo_drift": lambda it: correction.undo_drift(
-        it, xr.DataArray(np.ones((6, 8), bool), dims=("y", "x"))
-    ),
-    "fit_correction": lambda it: correction.fit_correction(
-        blackbody(it["counts"].values).to_dataset(name="counts")
-    ),
-    "fit_response": lambda it: calibration.fit_response(blackbody(it["counts"].values)[..., 0, 0]),
-    "fit_emissivity": lambda it: calibration.fit_emissivity(
-        measured(it["counts"].values), CAMERA, (0.1, 0.1)
-    ),
-    "reflector_emissivity": lambda it: calibration.reflector_emissivity(
-        measured(it["counts"].values), CAMERA, (0.1, 0.1)
-    ),
+    "undo_drift": lambda it: correction.undo_drift(it, PLACES),
+    "fit_correction": lambda it: correction.fit_correction(blackbody(it).to_dataset(name="counts")),
+    "fit_response": lambda it: calibration.fit_response(blackbody(it)[..., 0, 0]),
+    "fit_emissivity": lambda it: calibration.fit_emissivity(measured(it), CAMERA, STD),
+    "reflector_emissivity": lambda it: calibration.reflector_emissivity(measured(it), CAMERA, STD),
 }
 
 
@@ -166,9 +154,8 @@ def warnings_are_errors() -> Iterator[None]:
 )
 def test_odd_counts_warn_of_nothing(name: str, call: str) -> None:
     """Odd counts give a result, with NaN and status where there is none, or a ValueError."""
-    capture = CAPTURE.assign(
-        counts=CAPTURE["counts"].copy(data=ODD[name](CAPTURE["counts"].values))
-    )
+    counts = CAPTURE["counts"]
+    capture = CAPTURE.assign(counts=counts.copy(data=ODD[name](counts.values)))
     message = "Must"
     try:
         CALLS[call](capture)

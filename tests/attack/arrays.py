@@ -1,6 +1,7 @@
 """Hostile arrays into the separation: samples, clocks, shapes, responses, maps of other windows."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -127,8 +128,19 @@ def gray(rng: Rng) -> Attack:
 
 _NUMBERS: Final = ("f4", "f8", ">f4", ">f8")
 _OTHERS: Final = (
-    *("u1", "u2", ">u2", "i2", "i4", "i8"),
-    *("f2", "O", "c8", "U8", "M8[s]", "m8[s]", "b1"),
+    "u1",
+    "u2",
+    ">u2",
+    "i2",
+    "i4",
+    "i8",
+    "f2",
+    "O",
+    "c8",
+    "U8",
+    "M8[s]",
+    "m8[s]",
+    "b1",
 )
 
 
@@ -140,10 +152,8 @@ def dtypes(rng: Rng) -> Attack:
         counts = made.counts()
         whole = counts.round().astype(int)
         counts = (whole if kind.strip(">")[0] in "uiMm" else counts).astype(kind)
-    method = any_method(rng)
-    return solving(
-        f"counts of {kind}", made.with_counts(counts), None, method, "counts", good=kind in _NUMBERS
-    )
+    spoilt, good = made.with_counts(counts), kind in _NUMBERS
+    return solving(f"counts of {kind}", spoilt, None, any_method(rng), "counts", good=good)
 
 
 def samples(rng: Rng) -> Attack:
@@ -157,30 +167,25 @@ def samples(rng: Rng) -> Attack:
     _SPOILS[what](rng, part)
     counts[place] = part
     method = any_method(rng) if bands == 2 else "subspace"
-    return solving(
-        f"{what} in band {place}", made.with_counts(counts), None, method, "counts|frame|sample"
-    )
+    what, spoilt = f"{what} in band {place}", made.with_counts(counts)
+    return solving(what, spoilt, None, method, "counts|frame|sample")
 
 
-def _frozen(rng: Rng, part: Any) -> None:
-    first, length = int(rng.integers(5, 60)), int(rng.choice([3, 5, 10, 25, 60]))
-    part[..., first : first + length, :, :] = part[..., first : first + 1, :, :]
+def _held(rng: Rng, part: Any, *lengths: int, share: float = 1.0) -> None:
+    """Frames, or a share of their pixels, keep their value for a while."""
+    first, length = int(rng.integers(5, 60)), int(rng.choice(lengths))
+    where = rng.random(part.shape[-2:]) < share
+    part[..., first : first + length, where] = part[..., first : first + 1, where]
 
 
-def _clip(rng: Rng, part: Any) -> None:
+def _clip(rng: Rng, part: Any, *, above: bool) -> None:
     share = rng.choice([0.02, 0.1, 0.25])
-    part[...] = np.minimum(part, np.quantile(part, 1 - share))
+    bound = np.quantile(part, 1 - share if above else share)
+    part[...] = np.minimum(part, bound) if above else np.maximum(part, bound)
 
 
-def _clip_below(rng: Rng, part: Any) -> None:
-    part[...] = np.maximum(part, np.quantile(part, rng.choice([0.02, 0.1, 0.25])))
-
-
-def _scattered(value: float) -> Callable[[Rng, Any], None]:
-    def spoil(rng: Rng, part: Any) -> None:
-        part[rng.random(part.shape) < rng.choice([0.001, 0.01, 0.1, 0.5])] = value
-
-    return spoil
+def _scattered(rng: Rng, part: Any, value: float) -> None:
+    part[rng.random(part.shape) < rng.choice([0.001, 0.01, 0.1, 0.5])] = value
 
 
 def _lines(rng: Rng, part: Any) -> None:
@@ -201,16 +206,8 @@ def _copies(rng: Rng, part: Any) -> None:
     frames = part.shape[-3] // 2 * 2
     some = rng.random() < 0.5
     step = slice(1, frames, 2 if some else int(rng.choice([3, 5, 10])))
-    before = slice(0, frames - 1, step.step)
-    length = len(range(*step.indices(frames)))
+    before, length = slice(0, frames - 1, step.step), len(range(*step.indices(frames)))
     part[..., step, :, :] = part[..., before, :, :][..., :length, :, :]
-
-
-def _frozen_pixels(rng: Rng, part: Any) -> None:
-    """Some pixels keep their value for a while."""
-    first, length = int(rng.integers(5, 60)), int(rng.choice([5, 10, 40]))
-    where = rng.random(part.shape[-2:]) < 0.3
-    part[..., first : first + length, where] = part[..., first : first + 1, where]
 
 
 def _coarse(rng: Rng, part: Any) -> None:
@@ -218,19 +215,17 @@ def _coarse(rng: Rng, part: Any) -> None:
     part[...] = np.round(part / step) * step
 
 
+_SCATTERED: Final = {"NaN": np.nan, "infinite": np.inf, "zeros": 0.0, "at the limit": 65535.0}
 _SPOILS: Final[Mapping[str, Callable[[Rng, Any], None]]] = {
-    "frozen frames": _frozen,
-    "clipped from above": _clip,
-    "clipped from below": _clip_below,
-    "scattered NaN": _scattered(np.nan),
-    "scattered infinite": _scattered(np.inf),
-    "scattered zeros": _scattered(0.0),
-    "scattered at the limit": _scattered(65535.0),
+    "frozen frames": lambda rng, part: _held(rng, part, 3, 5, 10, 25, 60),
+    "clipped from above": partial(_clip, above=True),
+    "clipped from below": partial(_clip, above=False),
+    **{f"scattered {name}": partial(_scattered, value=v) for name, v in _SCATTERED.items()},
     "a line lost": _lines,
     "frames NaN": _frames_nan,
     "every other frame NaN": _every_other,
     "copied frames": _copies,
-    "pixels frozen": _frozen_pixels,
+    "pixels frozen": lambda rng, part: _held(rng, part, 5, 10, 40, share=0.3),
     "coarse counts": _coarse,
     "all one value": lambda _, part: part.fill(20_000.0),
     "all NaN": lambda _, part: part.fill(np.nan),
@@ -261,17 +256,16 @@ def _gap(rng: Rng, time: Array, length: float) -> Array:
     return time + length * (np.arange(time.size) >= rng.integers(10, time.size - 10))
 
 
-def _repeated(rng: Rng, time: Array) -> Array:
-    time = time.copy()
-    place = int(rng.integers(1, time.size))
-    time[place] = time[place - 1] - rng.choice([0.0, 0.05, 5.0])
+def _changed(rng: Rng, time: Array, *values: float) -> Array:
+    """One stamp that is another value, or so much before the one ahead of it."""
+    time, place = time.copy(), int(rng.integers(1, time.size))
+    value = rng.choice(values)
+    time[place] = time[place - 1] - value if np.isfinite(value) else value
     return time
 
 
-def _spoilt_stamp(rng: Rng, time: Array) -> Array:
-    time = time.copy()
-    time[int(rng.integers(time.size))] = rng.choice([np.nan, np.inf, -np.inf])
-    return time
+def _one_lost(rng: Rng, time: Array) -> Array:
+    return np.delete(np.append(time, time[-1] + 0.1), int(rng.integers(time.size)))
 
 
 _CLOCKS: Final[Mapping[str, Callable[[Rng, Array], Any]]] = {
@@ -287,9 +281,9 @@ _CLOCKS: Final[Mapping[str, Callable[[Rng, Array], Any]]] = {
     "hour's pause": lambda rng, time: _gap(rng, time, 3600.0),
     "gap": lambda rng, time: _gap(rng, time, float(rng.choice([0.5, 3, 30]))),
     "year's pause": lambda rng, time: _gap(rng, time, 3e7),
-    "repeated or backward": _repeated,
+    "repeated or backward": lambda rng, time: _changed(rng, time, 0.0, 0.05, 5.0),
     "backward": lambda _, time: time[::-1].copy(),
-    "not a number": _spoilt_stamp,
+    "not a number": lambda rng, time: _changed(rng, time, np.nan, np.inf, -np.inf),
     "since 1970": lambda _, time: time + 1.7e9,
     "since 1970 in single precision": lambda _, time: (time + 1.7e9).astype(np.float32),
     "single precision": lambda _, time: time.astype(np.float32),
@@ -297,9 +291,7 @@ _CLOCKS: Final[Mapping[str, Callable[[Rng, Array], Any]]] = {
     "whole seconds": lambda _, time: np.arange(time.size),
     "of another unit": lambda _, time: time * 1e3,
     "text": lambda _, time: time.astype(str),
-    "sixtieths with one lost": lambda rng, time: np.delete(
-        np.append(time, time[-1] + 0.1), int(rng.integers(time.size))
-    ),
+    "sixtieths with one lost": _one_lost,
 }
 
 
@@ -327,22 +319,24 @@ def _with_unit(rng: Rng, capture: xr.Dataset) -> xr.Dataset:
     return capture.assign(counts=capture["counts"].assign_attrs(units=units))
 
 
-def _same_bands(_: Rng, capture: xr.Dataset) -> xr.Dataset:
-    return capture.assign_coords(band=["8-14"] * capture.sizes["band"])
+def _with_bits(rng: Rng, capture: xr.Dataset) -> xr.Dataset:
+    bits = np.full((6, 8), 1 << int(rng.integers(17, 31)), np.uint32)
+    return capture.assign(status=(("y", "x"), bits))
 
 
+def _segments(rng: Rng, capture: xr.Dataset) -> xr.Dataset:
+    return capture.assign(segment=("time", rng.integers(0, 3, 64)))
+
+
+_ORDERS: Final = ("time band y x", "y x band time", "band time x y")
 _SHAPES: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
     "tiny": _tiny,
-    "dims in another order": lambda rng, one: one.transpose(
-        *rng.choice(
-            [["time", "band", "y", "x"], ["y", "x", "band", "time"], ["band", "time", "x", "y"]]
-        )
-    ),
+    "dims in another order": lambda rng, one: one.transpose(*str(rng.choice(_ORDERS)).split()),
     "no coordinate time": lambda _, one: one.drop_vars("time"),
     "no coordinate band": lambda _, one: one.drop_vars("band"),
     "no counts": lambda _, one: one.rename(counts="signal"),
     "another unit": _with_unit,
-    "the same band twice": _same_bands,
+    "the same band twice": lambda _, one: one.assign_coords(band=["8-14"] * one.sizes["band"]),
     "one band": lambda _, one: one.isel(band=slice(0, 1)),
     "few frames": lambda rng, one: one.isel(time=slice(0, int(rng.integers(1, 32)))),
     "no frames": lambda _, one: one.isel(time=slice(0, 0)),
@@ -350,11 +344,9 @@ _SHAPES: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
     "another dim": lambda _, one: one.rename(y="row"),
     "a dim more": lambda _, one: one.expand_dims("run"),
     "no dataset": lambda _, one: one["counts"],
-    "unknown bits": lambda rng, one: one.assign(
-        status=(("y", "x"), np.full((6, 8), 1 << int(rng.integers(17, 31)), np.uint32))
-    ),
+    "unknown bits": _with_bits,
     "status of another shape": lambda _, one: one.assign(status=("x", np.zeros(8, np.uint32))),
-    "falling segments": lambda rng, one: one.assign(segment=("time", rng.integers(0, 3, 64))),
+    "falling segments": _segments,
 }
 
 
@@ -377,10 +369,12 @@ def _spoilt_coefficient(rng: Rng, response: xr.Dataset) -> xr.Dataset:
 
 
 def _spoilt_noise(rng: Rng, response: xr.Dataset) -> xr.Dataset:
-    values = response["noise"].values * rng.choice(
-        [np.nan, np.inf, 0.0, -1.0], response.sizes["band"]
-    )
-    return response.assign(noise=("band", values, {"units": "count"}))
+    worse = rng.choice([np.nan, np.inf, 0.0, -1.0], response.sizes["band"])
+    return response.assign(noise=("band", response["noise"].values * worse, {"units": "count"}))
+
+
+def _with_kelvin(name: str, value: float, units: str = "K") -> Callable[[Rng, xr.Dataset], Any]:
+    return lambda _, one: one.assign({name: ((), value, {"units": units})})
 
 
 def _narrow(rng: Rng, response: xr.Dataset) -> xr.Dataset:
@@ -396,10 +390,8 @@ _RESPONSE_SPOILS: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
     "a noise damaged": _spoilt_noise,
     "another range": _narrow,
     "no range": lambda _, one: one.drop_vars("temperature_min"),
-    "range turned round": lambda _, one: one.assign(temperature_max=((), 200.0, {"units": "K"})),
-    "in degrees Celsius": lambda _, one: one.assign(
-        reference_temperature=((), 25.0, {"units": "degC"})
-    ),
+    "range turned round": _with_kelvin("temperature_max", 200.0),
+    "in degrees Celsius": _with_kelvin("reference_temperature", 25.0, "degC"),
     "no bands named": lambda _, one: one.drop_vars("band"),
     "no dataset": lambda _, one: one["amplitude"],
     "empty": lambda _, one: one.isel(band=slice(0, 0)),
@@ -417,8 +409,6 @@ def windows(rng: Rng) -> Attack:
         "emissivity": made.known,
         "emissivity_std": 0 * made.known + 0.01,
     }
-    if rng.random() < 0.1:
-        return _foreign_result(rng, made)
     name = str(rng.choice(list(maps)))
     array = maps[name].assign_coords(y=edge, x=left)
     what = str(rng.choice(list(_WINDOWS)))
@@ -439,25 +429,6 @@ def windows(rng: Rng) -> Attack:
     return solving(f"{name} of {what}", made, None, method, name, good=good, **more)
 
 
-def _foreign_result(rng: Rng, made: Scene) -> Attack:
-    """`materials` with a result of another window, time or band."""
-    dim = str(rng.choice(["y", "x", "time", "band"]))
-    response = response_of(made)
-    result = separate(made, response)
-    other = ("a", "b") if dim == "band" else result[dim].values + int(rng.integers(1, 50))
-    result = result.assign_coords({dim: list(other)})
-    return Attack(
-        f"materials: result of another {dim}",
-        lambda: separation.materials(result, made.capture, response),
-        lambda _: Verdict("silent", f"a result of another {dim} was taken by position", 1, 1),
-        (f"result|'{dim}'",),
-    )
-
-
-def _permuted(_: Rng, array: xr.DataArray) -> xr.DataArray:
-    return array.isel(band=slice(None, None, -1)) if "band" in array.dims else array
-
-
 _WINDOWS: Final[Mapping[str, Callable[[Rng, xr.DataArray], Any]]] = {
     "the same window": lambda _, one: one,
     "no coordinates": lambda _, one: one.drop_vars(["y", "x"]),
@@ -467,7 +438,9 @@ _WINDOWS: Final[Mapping[str, Callable[[Rng, xr.DataArray], Any]]] = {
     "another size": lambda rng, one: one.isel(x=slice(0, int(rng.integers(0, 11)))),
     "other dims": lambda _, one: one.rename(y="row"),
     "transposed": lambda _, one: one.transpose(),
-    "bands turned round": _permuted,
+    "bands turned round": lambda _, one: one.isel(
+        band=slice(None, None, -1), missing_dims="ignore"
+    ),
     "text": lambda _, one: one.astype(str),
     "another type": lambda _, one: one.values,
     "NaN": lambda _, one: one.astype(float).where(one["x"] > 45),

@@ -11,7 +11,7 @@ from attack.arrays import FLOOR, Rng, judge, response_of
 from attack.oracle import Attack, Verdict
 from attack.scenes import SLOPE, Scene, clock, counts_of, pick
 from attack.stages import wrong
-from dbthermal import alignment, separation
+from dbthermal import separation
 from reproduction.experiments.pictures import Picture, smooth_shift
 
 GLASS: Final = np.array([0.86, 0.72])
@@ -110,62 +110,6 @@ def shifts(rng: Rng) -> Attack:
     return Attack(f"shift {what}", act, lambda found: judge(made, found), names, good, limit)
 
 
-def fields(rng: Rng) -> Attack:
-    """`reflection_shift` of captures that are small, still, cut, or of one band."""
-    size = pick(rng, [0.0, 2.4, 6.0, 12.0])
-    made, truth = _picture(int(rng.integers(1, 4)), size)
-    what = pick(rng, sorted(_CAPTURES))
-    capture, response = _CAPTURES[what](rng, made), response_of(made)
-
-    def check(found: xr.Dataset) -> Verdict:
-        known = found["known"].values
-        error = np.abs(found["shift"].values - truth["shift"].sel(x=found["x"]).values)
-        off = known & (error > np.maximum(5 * found["shift_std"].values, 0.5)).any(axis=0)
-        share = off.sum() / max(known.sum(), 1)
-        return wrong(f"{share:.0%} of the known pixels off", where=bool(share > 0.02))
-
-    names = ("counts|band|image|pixel|frame|response|reflect|shift|chang|noise|time|texture",)
-    good = what == "nothing"
-    return Attack(
-        f"reflection_shift of {size} pixels: {what}",
-        lambda: alignment.reflection_shift(capture, response),
-        check,
-        names,
-        good,
-    )
-
-
-def _frames_lost(rng: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[int(rng.integers(2)), rng.random(counts.shape[1]) < 0.2] = np.nan
-    return made.with_counts(counts).capture
-
-
-def _still_band(_: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[1] = counts[1].mean(axis=0)
-    return made.with_counts(counts).capture
-
-
-def _noise_alone(rng: Rng, made: Scene) -> xr.Dataset:
-    counts = made.counts()
-    counts[...] = rng.normal(15_000, 30, counts.shape)
-    return made.with_counts(counts).capture
-
-
-_CAPTURES: Final[Mapping[str, Callable[[Rng, Scene], Any]]] = {
-    "nothing": lambda _, made: made.capture,
-    "frames lost": _frames_lost,
-    "a band still": _still_band,
-    "cut": lambda rng, made: made.capture.isel(x=slice(0, int(rng.integers(1, 30)))),
-    "few frames": lambda rng, made: made.capture.isel(time=slice(0, int(rng.integers(1, 12)))),
-    "one band": lambda _, made: made.capture.isel(band=[0]),
-    "raw": lambda _, made: made.capture.round().astype("uint16"),
-    "noise alone": _noise_alone,
-    "other bands": lambda _, made: made.capture.assign_coords(band=["a", "b"]),
-}
-
-
 @cache
 def _incomplete(seed: int) -> tuple[Scene, dict[str, Any]]:
     """A scene half at rest, with the arguments that complete its separation."""
@@ -233,13 +177,6 @@ def completions(rng: Rng) -> Attack:
         share = off.sum() / max((marked & has).sum(), 1)
         return wrong(f"{share:.0%} of what is completed off", where=bool(share > 0.01))
 
-    names = (
-        "prior|material|label|pool|surroundings|result|counts|response|band|status|dims|'x'|'y'",
-    )
-    return Attack(
-        f"complete: {what}",
-        lambda: separation.complete(**arguments),
-        check,
-        names,
-        what in ("nothing", "no prior"),
-    )
+    names = "prior|material|label|pool|surroundings|result|counts|response|band|status|dims|'x'|'y'"
+    act, good = lambda: separation.complete(**arguments), what in ("nothing", "no prior")
+    return Attack(f"complete: {what}", act, check, (names,), good)

@@ -31,17 +31,8 @@ few MB. A machine that is busy with other work makes nothing late."""
 
 _REFUSALS: Final = (ValueError, TypeError, OSError)
 # Of the libraries, those that name what does not fit: a model's field, a coordinate.
-_OURS: Final = re.compile(
-    "|".join(
-        [
-            *(
-                re.escape(f"{Path(str(room.__file__)).parent}/")
-                for room in (dbthermal, reproduction)
-            ),
-            "/pydantic/|/xarray/structure/alignment",
-        ]
-    )
-)
+_ROOMS: Final = [re.escape(f"{Path(str(m.__file__)).parent}/") for m in (dbthermal, reproduction)]
+_OURS: Final = re.compile("|".join([*_ROOMS, "/pydantic/|/xarray/structure/alignment"]))
 _WORK: Final = ("right", "refused", "flagged", "silent")
 
 
@@ -117,11 +108,8 @@ def _warned(leaked: list[warnings.WarningMessage], attack: Attack) -> Verdict:
 
 def _missing(text: str, attack: Attack) -> list[str]:
     """Names that a text should contain, and does not."""
-    return [
-        names
-        for names in attack.names
-        if not any(name.lower() in text.lower() for name in names.split("|"))
-    ]
+    low = text.lower()
+    return [one for one in attack.names if not any(n in low for n in one.lower().split("|"))]
 
 
 def _verdict(attack: Attack) -> Verdict:

@@ -11,45 +11,22 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, kills, media, mirrored, recordings, stages, steps
+from attack import arrays, files, mirrored, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
 
+_SHARES: Final = {
+    arrays: "clean 6 gray 10 dtypes 4 samples 12 clocks 10 shapes 4 responses 4 windows 5",
+    mirrored: "shifts 6 completions 6",
+    stages: "offset 6 align 6 register 3 correct_capture 5 fit_response 8",
+    steps: "steps 17",
+    files: "bits 8 kills 4",
+}
 CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
-    "clean": (arrays.clean, 6),
-    "gray": (arrays.gray, 10),
-    "dtypes": (arrays.dtypes, 4),
-    "samples": (arrays.samples, 12),
-    "clocks": (arrays.clocks, 10),
-    "shapes": (arrays.shapes, 4),
-    "responses": (arrays.responses, 4),
-    "windows": (arrays.windows, 5),
-    "shifts": (mirrored.shifts, 6),
-    "fields": (mirrored.fields, 2),
-    "completions": (mirrored.completions, 6),
-    "offset": (stages.offset, 6),
-    "align": (stages.aligned, 6),
-    "register": (stages.registered, 3),
-    "correct_capture": (stages.corrected, 5),
-    "pixels": (stages.pixels, 5),
-    "fit_response": (stages.response_fits, 8),
-    "band_table": (stages.tables, 3),
-    "plan": (stages.plans, 3),
-    "steps": (steps.steps, 8),
-    "metrics": (stages.measures, 3),
-    "bits": (files.bits, 8),
-    "chunks": (files.chunks, 5),
-    "stores": (files.stores, 5),
-    "cells": (files.cells, 1),
-    "numbers": (files.numbers, 3),
-    "sessions": (files.sessions, 10),
-    "parameters": (files.parameters, 3),
-    "manifest": (files.manifests, 3),
-    "spectra": (media.spectra, 8),
-    "videos": (media.videos, 8),
-    "recordings": (recordings.recordings, 8),
-    "kills": (kills.kills, 4),
+    name: (getattr(module, name), int(share))
+    for module, words in _SHARES.items()
+    for name, share in zip(words.split()[::2], words.split()[1::2], strict=True)
 }
 """Class -> its generator, and its share of the inputs."""
 
@@ -74,9 +51,7 @@ class Tally:
 
     def bad_lines(self) -> list[str]:
         """A line on each bad one."""
-        return [
-            f"{self.name}:{seed} {kind} | {one.what} | {one.note}" for seed, kind, one in self.bad
-        ]
+        return [f"{self.name}:{n} {kind} | {o.what} | {o.note}" for n, kind, o in self.bad]
 
 
 def make(name: str, seed: int) -> Attack:

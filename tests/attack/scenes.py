@@ -16,13 +16,8 @@ from scipy.interpolate import CubicSpline
 
 Array = npt.NDArray[np.float64]
 
-EDGES: Final = {
-    "8-14": (8.0, 14.0),
-    "9.5": (9.25, 9.75),
-    "10.6": (9.85, 11.35),
-    "8.5": (8.25, 8.75),
-    "12.1": (11.85, 12.35),
-}
+EDGES: Final = {"8-14": (8.0, 14.0), "9.5": (9.25, 9.75), "10.6": (9.85, 11.35)}
+EDGES.update({"8.5": (8.25, 8.75), "12.1": (11.85, 12.35)})
 """Edges of the bands [um]."""
 
 SLOPE: Final = 110.0
@@ -81,10 +76,6 @@ class Scene:
         dims = ("band", "y", "x")
         return xr.DataArray(self.emissivity, dims=dims, coords={"band": list(self.bands)})
 
-    def changed(self, **variables: Any) -> "Scene":
-        """The scene with variables of its capture replaced."""
-        return replace(self, capture=self.capture.assign(variables))
-
     def counts(self) -> npt.NDArray[Any]:
         """Copy of the counts, to spoil."""
         return np.array(self.capture["counts"].values)
@@ -92,7 +83,14 @@ class Scene:
     def with_counts(self, counts: npt.NDArray[Any]) -> "Scene":
         """The scene with spoilt counts."""
         array = self.capture["counts"]
-        return self.changed(counts=(array.dims, counts, array.attrs))
+        changed = self.capture.assign(counts=(array.dims, counts, array.attrs))
+        return replace(self, capture=changed)
+
+    def put(self, place: Any, value: Any) -> xr.Dataset:
+        """The capture with a value, or what a function makes of the counts, at a place of them."""
+        counts = self.counts()
+        counts[place] = value(counts) if callable(value) else value
+        return self.with_counts(counts).capture
 
 
 def pick(rng: np.random.Generator, options: Sequence[Any]) -> Any:
@@ -158,23 +156,12 @@ def scene(
         share = emissivity[place]
         counts[place] = share * counts_of(band, x) + (1 - share) * counts_of(band, y)
         counts[place] += rng.normal(0, noise[place], x.shape)
-    made = Scene(
-        names,
-        time,
-        warm.reshape(-1, *shape),
-        cold.reshape(-1, *shape),
-        np.broadcast_to(emissivity[:, None, None], (bands, *shape)).copy(),
-        noise,
-        delay,
-    )
+    warm, cold = (film.reshape(-1, *shape) for film in (warm, cold))
+    maps = np.broadcast_to(emissivity[:, None, None], (bands, *shape)).copy()
+    made = Scene(names, time, warm, cold, maps, noise, delay)
+    values = counts.reshape(bands, -1, *shape).astype(np.float32)
     made.capture = xr.Dataset(
-        {
-            "counts": (
-                ("band", "time", "y", "x"),
-                counts.reshape(bands, -1, *shape).astype(np.float32),
-                {"units": "count"},
-            )
-        },
+        {"counts": (("band", "time", "y", "x"), values, {"units": "count"})},
         {"band": list(names), "time": ("time", time, {"units": "s"})},
         {"origin": "simulated"},
     )

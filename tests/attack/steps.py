@@ -12,7 +12,7 @@ from attack.arrays import Rng, response_of
 from attack.oracle import Attack, Verdict
 from attack.scenes import blackbody, clock, counts_of, pick, scene
 from attack.stages import RIGHT, wrong
-from dbthermal import calibration, correction, emissivity, limits, response, separation
+from dbthermal import calibration, correction, emissivity, limits, metrics, response, separation
 
 
 @dataclass(frozen=True)
@@ -81,32 +81,47 @@ def _steps() -> Mapping[str, Step]:
     )
     std = (0.1, 0.1)
     fixed = {"response": curves, "reading_std": std}
+    wavelength = np.linspace(6e-6, 16e-6, 60)
+    values = ("wavelength", 0.8 + 0.15 * np.sin(wavelength * 1e6), {"units": "1"})
+    spectrum = xr.Dataset({"emissivity": values}, {"wavelength": wavelength})
+    map_, other = truth["object_temperature"], truth["object_temperature"] + 0.1
+    pair = [one.assign_coords(place).assign_attrs(kelvin) for one in (other, map_)]
+    errors = dict(zip(("estimate", "truth"), pair, strict=True))
+    maps_of_any_unit = dict(
+        zip(("first", "second"), map(xr.DataArray.drop_attrs, pair), strict=True)
+    )
+    materials = {"result": result, "corrected": corrected, "response": curves}
+    calls: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+        (correction.blackbody_statistics, {"movies": movies}, ""),
+        (correction.fit_correction, {"blackbody": frames}, ""),
+        (correction.renew_offset, {"correction": fit, "flat": flat}, "flat"),
+        (correction.correct, {"capture": raw, "correction": fit}, "correction"),
+        (correction.undo_lag, {"corrected": corrected, "time_constant": 0.01}, ""),
+        (correction.undo_drift, {"corrected": corrected, "reference": rest}, "reference"),
+        (calibration.fit_emissivity, {"measured": bench, **fixed}, ""),
+        (calibration.reflector_emissivity, {"measured": reflector, **fixed}, ""),
+        (response.apparent_temperature, {"response": curves, "counts": corrected["counts"]}, ""),
+        (separation.reflected_change, {"apparent": apparent, "result": result[_USED]}, "result"),
+        (separation.materials, materials, "result"),
+        (limits.bounds, {"scene": truth, "response": curves}, ""),
+        (limits.plan, {"table": table, "noise": netd}, ""),
+        (emissivity.condition_numbers, {"table": table}, ""),
+        (emissivity.rank_filters, {"table": table, "noise": netd}, ""),
+        (_band_table, {"spectrum": spectrum}, ""),
+        (metrics.correlation, maps_of_any_unit, "first"),
+        (metrics.relative_error_celsius, errors, "estimate"),
+    ]
+    # Used where the object is constant, and where there is no flag.
+    partly = {"reflected_change": ("apparent",), "materials": ("result", "corrected")}
     return {
-        "blackbody_statistics": Step(correction.blackbody_statistics, {"movies": movies}),
-        "fit_correction": Step(correction.fit_correction, {"blackbody": frames}),
-        "renew_offset": Step(correction.renew_offset, {"correction": fit, "flat": flat}, ("flat",)),
-        "correct": Step(correction.correct, {"capture": raw, "correction": fit}, ("correction",)),
-        "undo_lag": Step(correction.undo_lag, {"corrected": corrected, "time_constant": 0.01}),
-        "undo_drift": Step(
-            correction.undo_drift, {"corrected": corrected, "reference": rest}, ("reference",)
-        ),
-        "fit_emissivity": Step(calibration.fit_emissivity, {"measured": bench, **fixed}),
-        "reflector_emissivity": Step(
-            calibration.reflector_emissivity, {"measured": reflector, **fixed}
-        ),
-        "apparent_temperature": Step(
-            response.apparent_temperature, {"response": curves, "counts": corrected["counts"]}
-        ),
-        "reflected_change": Step(
-            separation.reflected_change,
-            {"apparent": apparent, "result": result[_USED]},
-            ("result",),
-            ("apparent",),  # used where the object is constant
-        ),
-        "bounds": Step(limits.bounds, {"scene": truth, "response": curves}),
-        "condition_numbers": Step(emissivity.condition_numbers, {"table": table}),
-        "rank_filters": Step(emissivity.rank_filters, {"table": table, "noise": netd}),
+        call.__name__: Step(call, arguments, (*windowed.split(),), partly.get(call.__name__, ()))
+        for call, arguments, windowed in calls
     }
+
+
+def _band_table(spectrum: Any) -> xr.Dataset:
+    """Band emissivities of one spectrum."""
+    return emissivity.band_table({"glass": spectrum}, ["8-14", "9.5"])
 
 
 def steps(rng: Rng) -> Attack:
@@ -121,11 +136,13 @@ def steps(rng: Rng) -> Attack:
     clean = step.call(**step.arguments)
 
     def judge(found: Any) -> Verdict:
-        if what == "bands turned round" and "band" in getattr(found, "coords", ()):
-            return wrong("other values", where=not _close(found.sel(band=clean["band"]), clean))
+        if what == "bands turned round":
+            named = {"band", "filter"} & {*getattr(found, "coords", ())}
+            ordered = found.sel({dim: clean[dim].values for dim in named})
+            return wrong("other values", where=bool(named) and not _close(ordered, clean))
         if _close(found, clean):
             return wrong(f"{what} made no difference", where=_demanded(step, argument, what))
-        if what == "NaN" and _lost(found) > _lost(clean):
+        if what in ("NaN", "infinite") and _lost(found) > _lost(clean):
             return Verdict("flagged")
         return RIGHT if what in ("another window", "bands turned round") else wrong("other values")
 
@@ -143,7 +160,7 @@ def _demanded(step: Step, argument: str, what: str) -> bool:
         return argument in step.windowed
     if what == "of other bands":
         return sum("band" in getattr(one, "dims", ()) for one in step.arguments.values()) > 1
-    if what == "NaN" and argument in step.partly:
+    if what in _DIFFERENT and argument in step.partly:
         return False
     if what == "of another unit":
         return "units" in str(_first(step.arguments[argument]).attrs)
@@ -167,9 +184,11 @@ def _close(first: Any, second: Any) -> bool:
 
 
 def _lost(found: Any) -> int:
-    """Number of values that are NaN or marked."""
+    """Number of values that are not finite, or marked."""
     if isinstance(found, xr.Dataset):
         return sum(_lost(found[name]) for name in found)
+    if found.dtype.kind == "f":
+        return int((~np.isfinite(found.values)).sum())
     return int(found.isnull().sum()) + int((found.values != 0).sum() if found.dtype == bool else 0)
 
 
@@ -185,9 +204,9 @@ def _each(change: Callable[[xr.DataArray], xr.DataArray]) -> Callable[[Rng, Any]
     return damage
 
 
-def _hole(array: xr.DataArray) -> xr.DataArray:
+def _hole(array: xr.DataArray, value: float = np.nan) -> xr.DataArray:
     values = array.values.astype(float)
-    values[(1,) * values.ndim] = np.nan
+    values[(1,) * values.ndim] = value
     return array.copy(data=values)
 
 
@@ -206,6 +225,7 @@ def _turned(_: Rng, one: Any) -> Any:
 
 _DAMAGES: Final[Mapping[str, Callable[[Rng, Any], Any]]] = {
     "NaN": _each(_hole),
+    "infinite": _each(lambda one: _hole(one, np.inf)),
     "text": _each(lambda one: one.astype(str)),
     "complex": _each(lambda one: one.astype(complex)),
     "times": _each(lambda one: one.astype(int).astype("datetime64[s]")),
@@ -216,7 +236,7 @@ _DAMAGES: Final[Mapping[str, Callable[[Rng, Any], Any]]] = {
     "of other bands": _without_bands,
     "bands turned round": _turned,
 }
-_DIFFERENT: Final = ("NaN", "complex", "text", "times")
+_DIFFERENT: Final = ("NaN", "infinite", "complex", "text", "times")
 _WORDS: Final = (
     *("counts", "band", "gain", "offset", "bad", "dims", "units", "emissivity", "temperature"),
     *("amplitude", "noise", "pixel", "material", "reference", "Dataset", "DataArray", "type"),

@@ -14,7 +14,7 @@ from attack import oracle
 from attack.oracle import Attack, Verdict, carry_out
 from attack.runner import CLASSES, Worker, attack_all, table
 
-SHORT, WEEKLY, LONG = 300, 1500, 6000
+SHORT, WEEKLY, LONG = 200, 1500, 6000
 """Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
 
 
@@ -101,8 +101,8 @@ def test_oracle(act: Callable[[], Any], kind: str) -> None:
 def test_dead_process_is_told(worker: Worker) -> None:
     """A process that an attack kills is told as a crash, and made anew."""
     os.kill(worker.process.pid or 0, 9)
-    assert worker.run("metrics", 1).kind == "crash"
-    assert worker.run("metrics", 1).kind != "crash"
+    assert worker.run("bits", 1).kind == "crash"
+    assert worker.run("bits", 1).kind != "crash"
 
 
 def test_time_of_the_processor_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

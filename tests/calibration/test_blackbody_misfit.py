@@ -25,30 +25,18 @@ def sensor(name: str, temperature: Floats) -> Floats:
     return np.asarray(15500.0 + unit * radiance(temperature))
 
 
-def sweep(name: str, temperature: Floats, counts: Floats) -> xr.DataArray:
-    """Blackbody counts of one band, labelled."""
+def fit(name: str, temperature: Floats, counts: Floats, noise: float | None) -> str:
+    """Fit a response to one band's counts and noise [count]; the refusal, or nothing."""
     coords = {"band": [name], "temperature": temperature}
-    return xr.DataArray([counts], dims=("band", "temperature"), coords=coords)
+    labelled = None if noise is None else xr.DataArray([noise], {"band": [name]}, "band")
+    try:
+        calibration.fit_response(xr.DataArray([counts], coords), labelled)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
-def noise_of(name: str, counts: float) -> xr.DataArray:
-    """Noise of one band [count]."""
-    return xr.DataArray([counts], dims="band", coords={"band": [name]})
-
-
-def clipped(counts: Floats, level: float) -> Floats:
-    """A soft limit: counts above it grow at a fiftieth of their slope."""
-    return np.where(counts > level, level + (counts - level) / 50.0, counts)
-
-
-def one_off(counts: Floats, place: int, by: float) -> Floats:
-    """One reading off by some counts."""
-    changed = counts.copy()
-    changed[place] += by
-    return changed
-
-
-BAD = (
+BAD: tuple[str, ...] = (
     "top",
     "top, last",
     "floor",
@@ -58,25 +46,24 @@ BAD = (
     "step",
     "offset",
     "line",
-    "root",
-    "log",
-    "exponential",
-    "stefan",
-    "drift",
-    "swapped",
-    "wrapped",
 )
+BAD += ("root", "log", "exponential", "stefan", "drift", "swapped", "wrapped")
 
 
 def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
     """Counts c (temperature) at t [K], of slope s [count/K], spoilt in one of the ways `BAD`."""
+    middle, place = c[len(c) // 2], np.arange(len(c))
+
+    def clipped(counts: Floats, level: float) -> Floats:  # a soft limit: a fiftieth of the slope
+        return np.asarray(np.where(counts > level, level + (counts - level) / 50.0, counts))
+
     return {
-        "top": clipped(c, c[len(c) // 2]),
+        "top": clipped(c, middle),
         "top, last": clipped(c, 0.5 * (c[-2] + c[-1])),
-        "floor": -clipped(-c, -c[len(c) // 2]),
-        "5 K off": one_off(c, len(c) // 2, -4.9 * s),
-        "first off": one_off(c, 0, -5.0 * s),
-        "last off": one_off(c, -1, 5.0 * s),
+        "floor": -clipped(-c, -middle),
+        "5 K off": c - 4.9 * s * (place == len(c) // 2),
+        "first off": c - 5.0 * s * (place == 0),
+        "last off": c + 5.0 * s * (place == len(c) - 1),
         "step": np.where(t > 315.0, 1.3 * c - 0.3 * 15500.0, c),
         "offset": np.where(t > 315.0, c + 4.0 * s, c),
         "line": 15500.0 + s * t,
@@ -86,7 +73,7 @@ def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
         "stefan": 15500.0 + s * 300.0 * (t / 300.0) ** 12 / 12.0,
         "drift": c + s * 4.0 * np.sin((t - 283.0) / 10.0),
         "swapped": c[[0, 2, 1, *range(3, len(c))]],
-        "wrapped": np.where(c > c[len(c) // 2], c - 65536.0, c).astype(np.int32),
+        "wrapped": np.where(c > middle, c - 65536.0, c).astype(np.int32),
     }[bad]
 
 
@@ -94,15 +81,10 @@ def refusal(bad: str, name: str, number: int, noise: float | None) -> str:
     """Message by which a kind of bad counts is refused; empty if they are accepted."""
     temperature, slope = np.linspace(283.15, 343.15, number), EDGES[name][2]
     counts = spoilt(bad, sensor(name, temperature), temperature, slope)
-    given = None
-    if noise is not None:
-        counts = counts + noise * slope * np.random.default_rng(1).standard_normal(number)
-        given = noise_of(name, noise * slope)
-    try:
-        calibration.fit_response(sweep(name, temperature, counts), given)
-    except ValueError as error:
-        return str(error)
-    return ""
+    if noise is None:
+        return fit(name, temperature, counts, None)
+    scatter = noise * slope * np.random.default_rng(1).standard_normal(number)
+    return fit(name, temperature, counts + scatter, noise * slope)
 
 
 @pytest.mark.parametrize("bad", BAD)
@@ -133,14 +115,10 @@ def false_alarms(seeds: range, noise: float | None) -> list[str]:
         temperature = uneven if rng.random() < 0.5 else np.linspace(*ends, number)
         counts = sensor(name, temperature + 0.1 * rng.standard_normal(number))
         counts += (noise or 0.0) * EDGES[name][2] * rng.standard_normal(number)
-        given = None if noise is None else noise_of(name, noise * EDGES[name][2])
-        if rng.random() < 0.5:
-            counts = np.rint(counts)
-        try:
-            calibration.fit_response(sweep(name, temperature, counts), given)
-        except ValueError as error:
-            messages.append(str(error))
-    return messages
+        counts = np.rint(counts) if rng.random() < 0.5 else counts
+        given = None if noise is None else noise * EDGES[name][2]
+        messages.append(fit(name, temperature, counts, given))
+    return [message for message in messages if message]
 
 
 @pytest.mark.parametrize("noise", [None, 0.03, 0.35, 1.0])

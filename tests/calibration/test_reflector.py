@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 
 from dbthermal import calibration, response
 from dbthermal.calibration import Bias
@@ -24,15 +25,11 @@ from reproduction.experiments.procedures import compare_procedures, reflector_se
 STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
 TRUE = np.array([0.3, 0.45])
 NO_ERRORS = Bench(
-    reading_std=1e-9,
-    probe_tolerance=0.0,
-    logger_tolerance=0.0,
     contact=(0.0, 0.0),
-    blackbody_std=1e-9,
-    blackbody_tolerance=0.0,
     foil_emissivity=0.0,
-    foil_std=1e-9,
     mirrored_excess=(0.0, 0.0),
+    **dict.fromkeys(("reading_std", "blackbody_std", "foil_std"), 1e-9),
+    **dict.fromkeys(("probe_tolerance", "logger_tolerance", "blackbody_tolerance"), 0.0),
 )
 
 
@@ -44,20 +41,12 @@ def known() -> xr.Dataset:
 
 def measured(of: xr.Dataset, warm: float, foil: float, number: int = 1) -> xr.Dataset:
     """Measurements without errors of a material in front of one reflected temperature [K]."""
-    levels = xr.DataArray([warm, foil], dims="level")
-    own, reflected = response.counts(of, levels).values.T
-    one = np.ones((1, number))
-    return xr.Dataset(
-        {
-            "counts": (
-                ("band", "measurement"),
-                (TRUE * own + (1 - TRUE) * reflected)[:, np.newaxis] * one,
-            ),
-            "reflected_counts": (("band", "measurement"), reflected[:, np.newaxis] * one),
-            "object_temperature": ("measurement", np.full(number, warm)),
-        },
-        coords={"band": of["band"].values},
-    )
+    own, reflected = response.counts(of, xr.DataArray([warm, foil], dims="level")).values.T
+    films = {"counts": TRUE * own + (1 - TRUE) * reflected, "reflected_counts": reflected}
+    wide = {name: np.repeat(one[:, np.newaxis], number, axis=1) for name, one in films.items()}
+    labelled = {name: (("band", "measurement"), one) for name, one in wide.items()}
+    read = {"object_temperature": ("measurement", np.full(number, warm))}
+    return xr.Dataset(labelled | read, {"band": of["band"].values})
 
 
 def test_exact_without_errors(known: xr.Dataset) -> None:
@@ -79,35 +68,14 @@ def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
     assert float(found["emissivity_std"].sel(band="9.5")) == pytest.approx(expected, rel=1e-6)
 
 
-def test_deviation_is_true(known: xr.Dataset) -> None:
-    """Over 4000 simulated measurements the scatter is the stated deviation within 5 %."""
-    rng, number = np.random.default_rng(4), 4000
-    exact = measured(known, 325.0, 295.0, number)
-    curves = [response.curve(known, str(name)) for name in known["band"].values]
-    noise = known["noise"].values[:, np.newaxis]
-    uneven = np.stack([curve.counts(295.0 + rng.normal(0, STDS[1], number)) for curve in curves])
-    own, foil = (noise * rng.standard_normal((2, number)) for _ in range(2))
-    read = exact["object_temperature"].values + rng.normal(0, STDS[0], number)
-    warm = np.stack([curve.counts(read) for curve in curves])
-    each = (exact["counts"].values + own - uneven - foil) / (warm - uneven - foil)
-    stated = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
-    np.testing.assert_allclose(each.std(axis=1) / stated["emissivity_std"], 1, rtol=0, atol=0.05)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda it: it.drop_vars("reflected_counts"), "Missing variable 'reflected_counts'"),
         (lambda it: it.transpose(), "Invalid dims ('measurement', 'band')"),
         (lambda it: it.assign(counts=it["counts"] * np.nan), "Invalid counts: NaN or infinite"),
-        (
-            lambda it: it.assign(object_temperature=it["object_temperature"] + 60),
-            "Invalid object temperature 385.0 K in band '8-14'",
-        ),
-        (
-            lambda it: it.assign(object_temperature=it["object_temperature"] - 29.5),
-            "between object and reflection in band '8-14'. Must exceed 1.08",
-        ),
+        (lambda it: warmer(it, 60), "Invalid object temperature 385.0 K in band '8-14'"),
+        (lambda it: warmer(it, -29.5), "and reflection in band '8-14'. Must exceed 1.08"),
         (lambda it: it.assign_coords(band=["8-14", "10.6"]), "Missing band '10.6'"),
     ],
 )
@@ -119,6 +87,11 @@ def test_bad_measurements(
         calibration.reflector_emissivity(change(measured(known, 325.0, 295.0)), known, STDS)
 
 
+def warmer(it: xr.Dataset, by: float) -> xr.Dataset:
+    """Measurements with other readings of the object."""
+    return it.assign(object_temperature=it["object_temperature"] + by)
+
+
 @pytest.mark.parametrize("sample", OBJECTS, ids=lambda sample: sample.name)
 def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sample) -> None:
     """With errors of zero, noise of a billionth and a perfect mirror both give the truth."""
@@ -127,10 +100,9 @@ def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sam
     true = band_emissivity(mirror, ("8-14", "9.5"))
     series = bench_series(quiet, mirror, NO_ERRORS, rng)
     foil = reflector_series(quiet, mirror, NO_ERRORS, rng)
-    for found in (
-        calibration.fit_emissivity(series, quiet, STDS),
-        calibration.reflector_emissivity(foil, quiet, STDS),
-    ):
+    by_contact = calibration.fit_emissivity(series, quiet, STDS)
+    by_foil = calibration.reflector_emissivity(foil, quiet, STDS)
+    for found in (by_contact, by_foil):
         np.testing.assert_allclose(found["emissivity"], true, rtol=0, atol=1e-8)
 
 
@@ -162,16 +134,9 @@ def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
     np.testing.assert_allclose(mean.values[2:], [0.87, 0.95, 0.95], rtol=0, atol=0.03)
 
 
-@pytest.mark.parametrize(
-    "excess",
-    [(0.0, 11.0), pytest.param((0.0, 5.0, 11.0), marks=pytest.mark.slow)],
-    ids=["two", "three"],
-)
-def test_its_failure_is_the_mirrored_direction(
-    known: xr.Dataset, excess: tuple[float, ...]
-) -> None:
+def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
     """In a uniform room its error is below 0.015; it grows with the mirrored direction's excess."""
-    found = reflector_sensitivity(known, np.random.default_rng(1), excess, repeats=60)
+    found = reflector_sensitivity(known, np.random.default_rng(1), (0.0, 11.0), repeats=60)
     print(found["mean"].sel(band="8-14").to_pandas())
     assert found["mean"].dims == ("object", "excess", "band")
     even = found["mean"].sel(excess=0.0)
@@ -201,17 +166,10 @@ def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
     """Sixteen times the measurements: a deviation of noise falls by 4, one of a bias stays."""
 
     def stated(number: int, bias: Bias) -> float:
-        warm, cold = np.full(number, 330.0), np.full(number, 295.0)
-        series = contact_measurements(
-            known,
-            xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]}),
-            warm,
-            cold,
-            (0.1, 0.05),
-            np.random.default_rng(0),
-        )
-        found = calibration.fit_emissivity(series, known, (0.1, 0.05), bias)
-        return float(found["emissivity_std"][0])
+        stds, warm = (0.1, 0.05), np.full(number, 330.0)
+        rng, true = np.random.default_rng(0), emissivity_of(0.9, 0.8)
+        series = contact_measurements(known, true, warm, warm - 35.0, stds, rng)
+        return float(calibration.fit_emissivity(series, known, stds, bias)["emissivity_std"][0])
 
     alone, common = Bias(), Bias(object_tolerance=2.0)
     assert stated(4, alone) / stated(64, alone) == pytest.approx(4.0, rel=0.01)
@@ -220,10 +178,9 @@ def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
 
 def test_scatter_does_not_pass_for_contrast(known: xr.Dataset) -> None:
     """Readings that scatter by 0.5 K at a contrast of 2 K give no bias; the scatter is stated."""
-    rng, number = np.random.default_rng(3), 60
-    true = xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]})
+    rng, true = np.random.default_rng(3), emissivity_of(0.9, 0.8)
     warm, stds = np.full(200, 300.0), (0.5, 0.05)
-    series = (contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(number))
+    series = (contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(60))
     found = xr.concat([calibration.fit_emissivity(it, known, stds) for it in series], "repeat")
     spread, stated = found["emissivity"].std("repeat"), found["emissivity_std"].mean("repeat")
     np.testing.assert_allclose(found["emissivity"].mean("repeat"), true, rtol=0, atol=0.01)

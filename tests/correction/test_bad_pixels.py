@@ -1,6 +1,6 @@
 """Bad pixels: noisy, blinking and stuck ones are marked, edges and shutter events are not."""
 
-import re
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from dbthermal import schema, simulation
 from dbthermal.correction import mark_bad, mark_shutter
 
 DEAD = schema.Status.DEAD_PIXEL
+THRESHOLDS: tuple[object, ...] = (0, "6", True, [6.0], np.inf)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -61,14 +62,20 @@ def holes(kind: str, seed: int = 3) -> npt.NDArray[np.bool_]:
     return np.broadcast_to(places[kind], shape)
 
 
-def check_holes(kind: str) -> None:
-    """Bad pixels are found beside the holes, and few others."""
+@pytest.mark.parametrize(
+    "kind",
+    ["10%"]
+    + [
+        pytest.param(kind, marks=pytest.mark.slow)
+        for kind in ("1%", "40%", "rows", "frames of a band", "every other frame")
+    ],
+)
+def test_holes_do_not_hide_bad_pixels(kind: str) -> None:
+    """Bad pixels are found, and few others, where up to 40 %, rows or every other frame lack."""
     capture = walkers(0)
     spoiled = simulation.spoil_pixels(capture, 0.005, np.random.default_rng(0))
     valid = ~holes(kind)
-    found = [
-        mark_bad(part.assign(counts=part["counts"].where(valid))) for part in (capture, spoiled)
-    ]
+    found = [mark_bad(one.assign(counts=one["counts"].where(valid))) for one in (capture, spoiled)]
     judged = valid.sum(axis=1).min(axis=0) >= 16
     assert found[0].attrs["unjudged_pixels"] == np.count_nonzero(~judged)
     false, marked = ((part["status"].values & DEAD != 0)[judged] for part in found)
@@ -76,18 +83,6 @@ def check_holes(kind: str) -> None:
     print(f"{kind} NaN: {false.mean():.1e} false alarms, {marked[bad].mean():.3f} found")
     assert false.mean() < 3e-3
     assert marked[bad].mean() > 0.85
-
-
-def test_holes_do_not_hide_bad_pixels() -> None:
-    """With a tenth of the samples NaN bad pixels are found, as without."""
-    check_holes("10%")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["1%", "40%", "rows", "frames of a band", "every other frame"])
-def test_no_pattern_of_holes_hides_bad_pixels(kind: str) -> None:
-    """So they are whatever lacks, up to 40 % of the samples, or rows, or every other frame."""
-    check_holes(kind)
 
 
 def test_bad_pixels_are_added_to_the_status() -> None:
@@ -105,20 +100,22 @@ def test_bad_pixels_are_added_to_the_status() -> None:
     assert [marked.attrs[name] for name in names] == [1, 0, 6.0]
 
 
-def test_bad_pixels_refuse_nonsense() -> None:
-    """Too few frames and an invalid threshold raise a ValueError."""
-    capture = still()
-    with pytest.raises(ValueError, match=re.escape("Invalid band '8-14' of 15 frames")):
-        mark_bad(capture.isel(time=slice(15)))
-    with pytest.raises(ValueError, match="Invalid threshold of bad pixels 0"):
-        mark_bad(capture, threshold=0)
-    sparse = capture.assign(counts=capture["counts"].where(~holes("90%")[:, :60, :20, :24]))
-    with pytest.raises(ValueError, match="'8-14': no pixel has 16 samples that are not NaN"):
-        mark_bad(sparse.isel(time=slice(16)))
+SPARSE = still().where(
+    xr.DataArray(~holes("90%")[:, :60, :20, :24], dims=("band", "time", "y", "x"))
+)
 
 
-@pytest.mark.parametrize("threshold", ["6", True, [6.0], np.inf])
-def test_threshold_is_a_number(threshold: object) -> None:
-    """A threshold that is no finite number raises an error that names it."""
-    with pytest.raises((TypeError, ValueError), match="Invalid threshold of bad pixels"):
-        mark_bad(still(), threshold=threshold)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("capture", "options", "message"),
+    [(still(), {"threshold": one}, "Invalid threshold of bad pixels") for one in THRESHOLDS]
+    + [
+        (still().isel(time=slice(15)), {}, "Invalid band '8-14' of 15 frames"),
+        (SPARSE.isel(time=slice(16)), {}, "'8-14': no pixel has 16 samples that are not NaN"),
+    ],
+)
+def test_bad_pixels_refuse_nonsense(
+    capture: xr.Dataset, options: dict[str, Any], message: str
+) -> None:
+    """Too few frames or samples, and a threshold that is no positive number, are named."""
+    with pytest.raises((TypeError, ValueError), match=message):
+        mark_bad(capture, **options)

@@ -63,15 +63,12 @@ def recorded() -> Recorded:
 def error(recorded: Recorded, **changes: Any) -> float:
     """RMS error of the unflagged pixels until the shutter opens, less each band's mean [count].
 
-    That the samples of a stuck pixel are saturated or frozen is told in any case: it counts unless
-    the search for bad pixels has flagged it.
+    A stuck pixel, told as saturated or frozen in any case, counts unless the search flagged it.
     """
-    corrected = correct_capture(
-        recorded.raw, recorded.correction, **{**recorded.options, **changes}
-    )
-    apart = (corrected["counts"] - recorded.clean["counts"]).where(
-        (corrected["status"] & ~np.uint32(Status.FROZEN_FRAMES | Status.SATURATED)) == 0
-    )
+    options = {**recorded.options, **changes}
+    corrected = correct_capture(recorded.raw, recorded.correction, **options)
+    flags = corrected["status"] & ~np.uint32(Status.FROZEN_FRAMES | Status.SATURATED)
+    apart = (corrected["counts"] - recorded.clean["counts"]).where(flags == 0)
     apart = apart.where(apart["time"] < SHUTTER + 0.2)
     return float((apart - apart.mean(("time", "y", "x"))).std())
 
@@ -91,20 +88,20 @@ def test_everything_undone_leaves_the_noise(recorded: Recorded) -> None:
 
 @pytest.mark.filterwarnings("ignore:Fixed pattern")  # of offsets that were not renewed
 @pytest.mark.parametrize(
-    "off",
+    ("step", "off"),
     [
-        {"flat": None},
-        {"shutter": False},
-        {"time_constant": None},
-        {"bad_pixels": None},
-        {"drift_reference": None},
+        ("flat", None),
+        ("shutter", False),
+        ("time_constant", None),
+        ("bad_pixels", None),
+        ("drift_reference", None),
     ],
-    ids=lambda off: next(iter(off)),
 )
-def test_each_step_matters(recorded: Recorded, off: dict[str, Any]) -> None:
+def test_each_step_matters(recorded: Recorded, step: str, off: object) -> None:
     """Without any one of the steps the error is larger by a quarter at least."""
-    print(f"{off}: {error(recorded, **off):.2f} count, with it {error(recorded):.2f} count")
-    assert error(recorded, **off) > 1.25 * error(recorded)
+    without, error_with = error(recorded, **{step: off}), error(recorded)
+    print(f"without {step}: {without:.2f} count, with it {error_with:.2f} count")
+    assert without > 1.25 * error_with
 
 
 def test_provenance_of_every_step(recorded: Recorded) -> None:
@@ -112,13 +109,16 @@ def test_provenance_of_every_step(recorded: Recorded) -> None:
     before = recorded.raw.copy(deep=True)
     attrs = correct_capture(recorded.raw, recorded.correction, **recorded.options).attrs
     xr.testing.assert_identical(recorded.raw, before)
-    assert attrs["gain_offset_offset_renewed"] == 1
-    assert attrs["shutter_events"] == 2  # one in each band
-    assert attrs["frames_taken_out"] == [12, 12]
-    assert attrs["lag_time_constant"] == [LAG, LAG]
-    assert attrs["bad_threshold"] == 6.0
-    assert attrs["drift_order"] == 5
-    assert attrs["shutter_closed_frames"] == -1
+    expected = {
+        "gain_offset_offset_renewed": 1,
+        "shutter_events": 2,
+        "frames_taken_out": [12, 12],
+        "lag_time_constant": [LAG, LAG],
+        "bad_threshold": 6.0,
+        "drift_order": 5,
+        "shutter_closed_frames": -1,
+    }
+    assert {name: attrs[name] for name in expected} == expected
     plain = correct_capture(recorded.raw, recorded.correction, shutter=False, bad_pixels=None)
     steps = {"shutter_events", "lag_time_constant", "bad_threshold", "drift_order"}
     assert not steps & plain.attrs.keys()

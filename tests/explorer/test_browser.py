@@ -20,6 +20,7 @@ import nbformat
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 
 from dbthermal import separation, simulation, store
 from dbthermal.explorer import Region, View
@@ -199,17 +200,15 @@ def check_curve(page: Any, view: View, name: str) -> Region:
 
 def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     """Curves of a drawn and a moved region are the view's; keys step; no request goes outside."""
-    rig, rng = simulation.Rig(), np.random.default_rng(4)
-    table = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(120) / 10, (24, 32), table, rng)
-    capture = simulation.observe(scene, rig.response(), rng)
-    result = separation.solve(capture, rig.response())
-    parts = {"result": result, "capture": capture, "response": rig.response()}
+    response, rng = simulation.Rig().response(), np.random.default_rng(4)
+    scene = simulation.walkers(np.arange(120) / 10, (24, 32), emissivity_of(0.86, 0.72), rng)
+    capture = simulation.observe(scene, response, rng)
+    result = separation.solve(capture, response)
+    parts = {"result.zarr": result, "capture.zarr": capture, "response.zarr": response}
     for name, part in parts.items():
-        store.save(part, lab.folder / f"{name}.zarr", {})
-    names = [f"{name}.zarr" for name in parts]
-    lab.run(page, CELL.format(arguments=", ".join(map(repr, names))))
-    view = View(result, capture, rig.response())
+        store.save(part, lab.folder / name, {})
+    lab.run(page, CELL.format(arguments=", ".join(map(repr, parts))))
+    view = View(result, capture, response)
 
     canvas = page.locator("canvas[data-pane=object_temperature]")
     page.locator("[data-tool=ellipse]").click()
@@ -243,11 +242,11 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
 def large_store(folder: Path, shape: tuple[int, int, int]) -> None:
     """Result and capture of a size (time, y, x), of smooth films with noise, row by row."""
     frames, height, width = shape
-    rng, rig = np.random.default_rng(2), simulation.Rig()
+    rng, response = np.random.default_rng(2), simulation.Rig().response()
     time, columns = np.arange(frames) / 30, np.linspace(0, 20, width)
     film = 295 + np.linspace(0, 10, frames)[:, None, None] + columns + np.zeros((1, 16, 1))
     names = ("object_temperature", "background_temperature")
-    maps = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    maps = emissivity_of(0.86, 0.72).expand_dims(y=16, x=width).transpose("band", "y", "x")
 
     def results() -> Iterator[xr.Dataset]:
         for _ in range(0, height, 16):
@@ -255,24 +254,16 @@ def large_store(folder: Path, shape: tuple[int, int, int]) -> None:
             films = dict.fromkeys(names, noisy) | {f"{name}_std": noisy / 3000 for name in names}
             arrays = {name: (("time", "y", "x"), one) for name, one in films.items()}
             status = ("y", "x"), np.zeros((16, width), np.uint32)
-            yield xr.Dataset({**arrays, "status": status}, {"time": time}).assign(
-                emissivity=maps.expand_dims(y=16, x=width).transpose("band", "y", "x")
-            )
+            yield xr.Dataset({**arrays, "status": status}, {"time": time}).assign(emissivity=maps)
+
+    def captured() -> Iterator[xr.Dataset]:
+        for part in results():
+            counts = counts_of(response, part["object_temperature"])
+            yield counts.astype(np.float32).to_dataset(name="counts")
 
     store.save_rows(results(), folder / "large.zarr", {})
-    counts = (
-        part[["object_temperature"]]
-        .rename(object_temperature="counts")
-        .map(lambda one: response_counts(rig.response(), one))
-        for part in results()
-    )
-    store.save_rows(counts, folder / "large_capture.zarr", {})
-    store.save(rig.response(), folder / "large_response.zarr", {})
-
-
-def response_counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
-    """Counts of both bands, float32."""
-    return counts_of(response, temperature).astype(np.float32)
+    store.save_rows(captured(), folder / "large_capture.zarr", {})
+    store.save(response, folder / "large_response.zarr", {})
 
 
 @pytest.mark.bench

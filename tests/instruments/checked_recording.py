@@ -8,22 +8,14 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from faulty_camera import Faults, FaultyCamera
+from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
 
 from dbthermal import store
-from dbthermal.instruments.camera import (
-    DAMAGED,
-    UNTIMED,
-    Counts,
-    Frame,
-    FrameFlag,
-    FrameSource,
-)
+from dbthermal.instruments.camera import DAMAGED, UNTIMED, Counts, Frame, FrameFlag
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Reading, notes, record
-from dbthermal.instruments.session import Camera, Session
 
-BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
+SHAPE, RATE, MILLI = (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)
 PATTERN = np.random.default_rng(1).integers(5000, 6000, SHAPE).astype(np.uint16)
 SOURCE_FLAGS = 0x07  # flags that are the source's to set
@@ -34,12 +26,6 @@ Read = Callable[[], float]
 def picture(time: float) -> Counts:
     """Counts that tell the time [ms], pixel by pixel."""
     return (PATTERN + round(time / MILLI)).astype(np.uint16)
-
-
-def session(duration: float = 1.0) -> Session:
-    """Two emulated cameras with small frames."""
-    camera = Camera("v4l2:///dev/video0")
-    return Session("faults", True, "scene", duration, dict.fromkeys(BANDS, camera), RATE, SHAPE)
 
 
 class Witness(FaultyCamera):
@@ -65,23 +51,24 @@ class CheckedRecording:
     world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:
-        self.cameras: dict[str, Witness] = {}
-        for number, band in enumerate(BANDS):
-            self.world.add_camera(band, number)
-            faults = self.faults.get(band, Faults())
-            pictures = {band: picture}
-            self.cameras[band] = Witness(
-                self.world, band, pictures, band, SHAPE, RATE, faults=faults
-            )
+        self.cameras = two_cameras(
+            picture, SHAPE, RATE, faults=self.faults, world=self.world, kind=Witness
+        )
+
+    def frames(self, band: str) -> list[Frame]:
+        """Frames that the camera of a band gave."""
+        camera = self.cameras[band]
+        assert isinstance(camera, Witness)
+        return camera.frames
 
     def record(
         self, duration: float, readings: Mapping[str, Read] | None = None
     ) -> "CheckedRecording":
         """Record for a duration [s], and check the recording."""
         instruments = {name: Reading(read) for name, read in (readings or {}).items()}
-        sources: dict[str, FrameSource] = dict(self.cameras)
+        session = two_bands(duration, SHAPE, RATE)
         self.summary = record(
-            session(duration), sources, self.path, readings=instruments, limits=LIMITS
+            session, dict(self.cameras), self.path, readings=instruments, limits=LIMITS
         )
         self.log = [note[1:] for note in notes(self.path)]
         for band in BANDS:
@@ -103,7 +90,7 @@ class CheckedRecording:
 
     def check(self, band: str) -> None:
         """Check that all frames are stored unchanged, each with its time, and losses counted."""
-        frames, kept = self.cameras[band].frames, self.stored(band)
+        frames, kept = self.frames(band), self.stored(band)
         assert len(frames) == kept.sizes["time"] > 0
         np.testing.assert_array_equal(kept["counts"], [frame.counts for frame in frames])
         np.testing.assert_array_equal(kept["sequence"], [frame.sequence for frame in frames])

@@ -1,4 +1,4 @@
-"""Ways to open each device of the rig for tests: on a stub, on its emulator, on hardware."""
+"""Ways to open each device of the rig for tests: an emulator, hardware; for frames also a stub."""
 
 import os
 from collections.abc import Callable
@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from device_benches import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
-from device_stubs import StubCamera, StubController, StubLibrary
+from device_benches import FILTERS, QUICK, BosonBench, LoggerBench, WheelBench
+from faulty_camera import two_cameras
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.camera import EmulatedCamera
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
@@ -38,19 +36,13 @@ class Opened(NamedTuple):
     again: Callable[[], object] | None = None
 
 
-def stub_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on a table of answers."""
-    clock = Clock()
-    return Opened(Boson(StubCamera(clock)), True)
-
-
 def loop_camera(_: ExitStack) -> Opened:
     """A Boson's driver on the emulator, in memory."""
     return Opened(BosonBench().camera, True)
 
 
 def named_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on the emulator, by its address and in real time."""
+    """A Boson's driver on the emulator, by its address."""
     return Opened(Boson.from_url("sim://boson/wide"), True)
 
 
@@ -60,22 +52,14 @@ def real_camera(_: ExitStack) -> Opened:
     return Opened(Boson.from_url(url), False, lambda: Boson.from_url(url))
 
 
-def stub_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on a controller that takes no time."""
-    wheel = FilterWheel(StubController(Clock()), FILTERS, QUICK)
-    wheel.connect()
+def loop_wheel(_: ExitStack) -> Opened:
+    """A wheel's driver on the emulator, in memory."""
+    (wheel := WheelBench().wheel).connect()
     return Opened(wheel, True)
 
 
-def loop_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, in memory."""
-    bench = WheelBench()
-    bench.wheel.connect()
-    return Opened(bench.wheel, True)
-
-
 def named_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, by its address, in real time, but a fast wheel."""
+    """A wheel's driver on the emulator, by its address, but a fast wheel."""
     return Opened(FilterWheel.from_url("sim://apt/wheel", FILTERS, QUICK), True)
 
 
@@ -84,12 +68,6 @@ def real_wheel(_: ExitStack) -> Opened:
     url = address("DBTHERMAL_WHEEL")
     opened = FilterWheel.from_url(url, FILTERS)
     return Opened(opened, False, lambda: FilterWheel.from_url(url, FILTERS))
-
-
-def stub_logger(_: ExitStack) -> Opened:
-    """A TC-08's driver on an object of a few functions."""
-    library = StubLibrary()
-    return Opened(TC08(library).open(), True, lambda: TC08(library).open())
 
 
 def emulated_logger(_: ExitStack) -> Opened:
@@ -112,22 +90,15 @@ def stub_video(_: ExitStack) -> Opened:
 
 
 def emulated_video(_: ExitStack) -> Opened:
-    """An emulated camera on a clock without real waiting."""
-    clock = Clock()
-    world = World(clock=clock)
-    world.add_camera("wide", 1)
+    """An emulated camera."""
     picture = np.ones((4, 6), dtype=np.uint16)
-    pictures = {"8-14": lambda _: picture}
-    camera = EmulatedCamera(world, "wide", pictures, "8-14", (4, 6), 60.0)
-    return Opened(camera, True)
+    return Opened(two_cameras(lambda _: picture, (4, 6), 60.0)["9.5"], True)
 
 
 def y16_video(stack: ExitStack) -> Opened:
     """The emulated Y16 camera of a session, as `open_devices` opens it."""
-    session = Session.load(
-        Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml",
-        {"shape": [4, 6], "frame_rate": 60},
-    )
+    file = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
+    session = Session.load(file, {"shape": [4, 6], "frame_rate": 60})
     return Opened(stack.enter_context(open_devices(session)).sources["8-14"], True)
 
 
@@ -143,7 +114,7 @@ def real_video(stack: ExitStack) -> Opened:
 
 Opening = Callable[[ExitStack], Opened]
 
-CAMERAS: list[Opening] = [stub_camera, loop_camera, named_camera, real_camera]
-WHEELS: list[Opening] = [stub_wheel, loop_wheel, named_wheel, real_wheel]
-LOGGERS: list[Opening] = [stub_logger, emulated_logger, real_logger]
+CAMERAS: list[Opening] = [loop_camera, named_camera, real_camera]
+WHEELS: list[Opening] = [loop_wheel, named_wheel, real_wheel]
+LOGGERS: list[Opening] = [emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]

@@ -1,8 +1,9 @@
 """An emulated camera with faults, and a movie as its scene."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,9 +16,12 @@ from dbthermal.instruments.camera import (
     FrameSource,
     NoFrameError,
 )
-from dbthermal.instruments.emulated.camera import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.session import Camera, Session
 
 LIMITS = np.iinfo(np.uint16)
+BANDS = ("8-14", "9.5")
 
 
 @dataclass(frozen=True)
@@ -38,46 +42,19 @@ class Movie:
 
 @dataclass(frozen=True)
 class Faults:
-    """
-    Faults of an emulated camera; frames are counted from 0 at its opening.
+    """Faults of an emulated camera; frames are counted from 0 at its opening."""
 
-    Attributes
-    ----------
-    dropped : frozenset of int
-        Frames that never come; the sequence number leaps.
-    corrupt : frozenset of int
-        Frames whose lower half is not of this image; the driver says so.
-    unseen : frozenset of int
-        Corrupt frames of which the driver says nothing.
-    short : frozenset of int
-        Frames of which only the first half of the rows comes.
-    repeated : frozenset of int
-        Frames that show the image before once more, with a number and a time of their own.
-    ffc : frozenset of int
-        Frames at which the camera starts a flat-field correction of its own accord.
-    offset_step : float
-        RMS of the change of each pixel's offset by a flat-field correction [count].
-    clock_rate : float
-        Seconds of the camera's clock per second; other than 1 it is a clock of its own.
-    unplugged : int or None
-        Frame at which it is pulled out.
-    mute : bool
-        Gives no frame at all.
-    seed : int
-        Of the random numbers.
-    """
-
-    dropped: frozenset[int] = frozenset()
-    corrupt: frozenset[int] = frozenset()
-    unseen: frozenset[int] = frozenset()
-    short: frozenset[int] = frozenset()
-    repeated: frozenset[int] = frozenset()
-    ffc: frozenset[int] = frozenset()
-    offset_step: float = 0.0
-    clock_rate: float = 1.0
-    unplugged: int | None = None
-    mute: bool = False
-    seed: int = 0
+    dropped: frozenset[int] = frozenset()  # never come; the sequence number leaps
+    corrupt: frozenset[int] = frozenset()  # lower half is not of this image; the driver says so
+    unseen: frozenset[int] = frozenset()  # corrupt, and the driver says nothing
+    short: frozenset[int] = frozenset()  # only the first half of the rows comes
+    repeated: frozenset[int] = frozenset()  # show the image before once more
+    ffc: frozenset[int] = frozenset()  # a flat-field correction starts of the camera's own accord
+    offset_step: float = 0.0  # RMS change of a pixel's offset by a correction [count]
+    clock_rate: float = 1.0  # camera's seconds per second; other than 1 it is a clock of its own
+    unplugged: int | None = None  # frame at which it is pulled out
+    mute: bool = False  # gives no frame at all
+    seed: int = 0  # of the random numbers
 
 
 @dataclass
@@ -134,8 +111,7 @@ class FaultyCamera(EmulatedCamera):
         if count == 0 or self.faults.offset_step == 0:
             return image
         if self._offsets[0] != count:
-            serial_number = self.world.camera(self.name).serial_number
-            rng = np.random.default_rng([self.faults.seed, serial_number, count])
+            rng = np.random.default_rng([self.faults.seed, count])
             step = rng.normal(0.0, self.faults.offset_step, self.shape)
             self._offsets = count, np.rint(step).astype(np.int32)
         counts: Counts = np.clip(image + self._offsets[1], 0, LIMITS.max).astype(np.uint16)
@@ -156,3 +132,29 @@ def frames(source: FrameSource, number: int) -> Iterator[Frame]:
     """Yield a number of frames."""
     for _ in range(number):
         yield source.read()
+
+
+def two_cameras(
+    picture: Picture,
+    shape: tuple[int, int],
+    rate: float,
+    rows: int = 0,
+    *,
+    faults: Mapping[str, Faults] | None = None,
+    world: World | None = None,
+    kind: type[FaultyCamera] = FaultyCamera,
+) -> dict[str, FaultyCamera]:
+    """Two emulated cameras on one bench that see one picture, with the faults of each band."""
+    world, sources = world or World(), {}
+    for number, band in enumerate(BANDS):
+        world.add_camera(band, 100 + number)
+        form, known = (band, {band: picture}, band, shape, rate, rows), faults or {}
+        sources[band] = kind(world, *form, faults=known.get(band, Faults()))
+    return sources
+
+
+def two_bands(duration: float, shape: tuple[int, int], rate: float, rows: int = 0) -> Session:
+    """Session of two emulated cameras that records a scene for a duration [s]."""
+    cameras = {band: Camera(f"v4l2:///dev/video{place}") for place, band in enumerate(BANDS)}
+    telemetry_rows: Literal[0, 2] = 2 if rows else 0
+    return Session("test", True, "scene", duration, cameras, rate, shape, telemetry_rows)

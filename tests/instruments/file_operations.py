@@ -3,18 +3,20 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 
 OPERATIONS = frozenset({"open", "os.rename", "os.mkdir", "os.remove", "os.scandir", "os.rmdir"})
 """Events of Python's audit that touch a file system; a sync comes after an ``open``."""
 
 
+@dataclass
 class _Hook:
     """The process's one audit hook, which cannot be taken off."""
 
-    def __init__(self) -> None:
-        self.count, self.moment = 0, -1
-        self.act: Callable[[], object] = lambda: None
-        self.is_placed = False
+    count: int = 0
+    moment: int = -1
+    act: Callable[[], object] = lambda: None
 
     def __call__(self, event: str, _: object) -> None:
         """Count the operation, and act before the chosen one."""
@@ -26,24 +28,25 @@ class _Hook:
             self.act()
 
 
-_HOOK = _Hook()
+@cache
+def _hook() -> _Hook:
+    sys.addaudithook(hook := _Hook())
+    return hook
 
 
 @contextmanager
 def before_operation(number: int, act: Callable[[], object]) -> Iterator[None]:
     """Do something before the n-th file operation from now on, counted from 1."""
-    if not _HOOK.is_placed:
-        sys.addaudithook(_HOOK)
-        _HOOK.is_placed = True
-    _HOOK.count, _HOOK.moment, _HOOK.act = 0, number, act
+    hook = _hook()
+    hook.count, hook.moment, hook.act = 0, number, act
     try:
         yield
     finally:
-        _HOOK.moment = -1
+        hook.moment = -1
 
 
 def operations_of(work: Callable[[], object]) -> int:
     """Number of file operations of a piece of work."""
     with before_operation(sys.maxsize, lambda: None):
         work()
-    return _HOOK.count
+    return _hook().count

@@ -1,13 +1,14 @@
 """A small rig of two cameras, wheel and thermocouples, described in YAML and emulated."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from dbthermal import _text
 from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.emulated.camera import Picture
@@ -49,8 +50,10 @@ blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, time
 
 
 def from_yaml(text: str) -> Session:
-    """A session as `Session.load` reads it, of a text."""
-    return Session._checked(_text.parse_yaml(text, "session"), {}, "session")
+    """Session that is loaded from a text."""
+    with TemporaryDirectory() as folder:
+        (file := Path(folder) / "session.yaml").write_text(text, encoding="utf-8")
+        return Session.load(file)
 
 
 def replaced(*changes: tuple[str, str], text: str = TEXT) -> str:
@@ -77,22 +80,16 @@ def bench(session: Session, **settings: Any) -> World:
 def pictures(world: World) -> dict[str, Picture]:
     """Counts of the emulated bands: a level, ten times the blackbody's kelvin, and stripes."""
 
-    def seen(level: int) -> Picture:
-        pattern = np.arange(SHAPE[1]) % 2
+    def seen(level: int, _: float) -> Counts:
+        row = level + round(10 * world.blackbody_temperature) + np.arange(SHAPE[1]) % 2
+        return np.broadcast_to(row, SHAPE).astype(np.uint16)
 
-        def picture(_: float) -> Counts:
-            row = level + round(10 * world.blackbody_temperature) + pattern
-            return np.broadcast_to(row, SHAPE).astype(np.uint16)
-
-        return picture
-
-    return {band: seen(level) for band, level in LEVELS.items()}
+    return {band: partial(seen, level) for band, level in LEVELS.items()}
 
 
 @contextmanager
 def rig(session: Session, world: World | None = None) -> Iterator[Devices]:
     """Devices of an emulated session, with its pictures."""
     world = bench(session) if world is None else world
-    shown: Mapping[str, Picture] = pictures(world)
-    with open_devices(session, world, shown) as devices:
+    with open_devices(session, world, pictures(world)) as devices:
         yield devices

@@ -1,71 +1,17 @@
-"""The emulated camera and its line: they show their world, and have the faults that are set."""
+"""The emulated camera shows its world; `test_faults` has what a camera does wrong."""
 
-import math
+from typing import Any
 
 import numpy as np
 import pytest
 from device_benches import Clock
-from faulty_camera import Faults, FaultyCamera, Movie, frames
+from faulty_camera import Movie, frames
 
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import (
-    Counts,
-    Frame,
-    FrameFlag,
-    NoFrameError,
-    SourceLostError,
-)
+from dbthermal.instruments.camera import Counts, NoFrameError
 from dbthermal.instruments.emulated import camera as emulated
-from dbthermal.instruments.emulated.clock import EmulatedClock
-from dbthermal.instruments.emulated.line import Line
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.transport import TransportError
-
-AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
-
-
-class Echo:
-    """A device that echoes its input."""
-
-    def __init__(self) -> None:
-        self.plugged = True
-        self.said: list[bytes] = []
-
-    def receive(self, data: bytes) -> None:
-        """Take in bytes."""
-        self.said.append(data)
-
-    def poll(self) -> list[bytes]:
-        """Give them back."""
-        said, self.said = self.said, []
-        return said
-
-    def next_due(self) -> float:
-        """Nothing comes by itself."""
-        return math.inf
-
-
-def test_reads_are_short_and_time_out() -> None:
-    """All bytes come back unchanged, in order, and silence takes no time on an injected clock."""
-    line = Line(Echo(), EmulatedClock())
-    line.write(AWKWARD)
-    line.write(b"ab")
-    assert (line.read(10, 1.0) + line.read(4096, 1.0), line.read(2, 1.0)) == (AWKWARD, b"ab")
-    assert line.read(2, 5.0) == b""
-
-
-def test_an_end_is_an_end() -> None:
-    """A line that was closed, twice, and one whose device was unplugged raise errors."""
-    closed, device = Line(Echo(), EmulatedClock()), Echo()
-    for _ in range(2):
-        closed.close()
-    device.plugged = False
-    for line in (closed, Line(device, EmulatedClock())):
-        with pytest.raises(TransportError, match="It must stay connected and open"):
-            line.write(b"x")
-        with pytest.raises(TransportError, match="It must stay connected and open"):
-            line.read(1, 30.0)
-
 
 SHAPE, RATE = (8, 80), 10.0
 
@@ -76,84 +22,57 @@ def level(counts: int) -> Movie:
     return Movie(np.broadcast_to(steps[:, None, None], (100, *SHAPE)), RATE, endless=True)
 
 
-def camera(faults: Faults | None = None, band: str | None = "8-14", rows: int = 0) -> FaultyCamera:
+def camera(band: str | None = "8-14", rows: int = 0, **scene: Any) -> EmulatedCamera:
     """A camera on a bench with a wheel of two filters, on a simulated clock."""
-    clock = Clock(1000.0)
-    world = World(clock=clock, filters={1: "9.5", 2: "11"})
+    world = World(clock=Clock(1000.0), filters={1: "9.5", 2: "11"}, **scene)
     world.add_camera("wide", 93588)
     pictures = {"8-14": level(1000), "9.5": level(2000), "11": level(3000)}
-    return FaultyCamera(world, "wide", pictures, band, SHAPE, RATE, rows, faults=faults or Faults())
+    return EmulatedCamera(world, "wide", pictures, band, SHAPE, RATE, rows)
 
 
-def shown(frame: Frame) -> int:
-    """Counts of the first pixel."""
-    return int(frame.counts[0, 0])
+def shown(source: EmulatedCamera, number: int = 1) -> list[int]:
+    """Counts of the first pixel of the next frames."""
+    return [int(frame.counts[0, 0]) for frame in frames(source, number)]
 
 
 def test_frames_come_at_their_rate() -> None:
-    """Number, picture and both clocks go on together."""
-    found = list(frames(camera(), 5))
+    """Number, picture and both clocks go on together; a wait shorter than a frame has none."""
+    source = camera()
+    found = list(frames(source, 5))
     assert [frame.sequence for frame in found] == list(range(5))
-    assert [shown(frame) for frame in found] == list(range(1000, 1005))
+    assert [int(frame.counts[0, 0]) for frame in found] == list(range(1000, 1005))
     times = [frame.device_time for frame in found]
     np.testing.assert_allclose(times, 1000 + np.arange(5) / RATE, rtol=0, atol=1e-9)
     assert all(frame.host_time == pytest.approx(frame.device_time) for frame in found)
-
-
-def test_it_says_that_it_is_emulated() -> None:
-    """Identity and `is_simulated` label the camera as emulated."""
-    assert camera().is_simulated
-    assert "emulated" in camera().identity["model"]
-    assert camera().identity["device"].startswith("sim://")
+    with pytest.raises(NoFrameError, match=r"No frame from emulated camera 'wide' in 0\.01 s"):
+        source.read(0.01)
+    assert source.read().sequence == 5
 
 
 def test_wheel_changes_what_is_seen() -> None:
     """Behind the wheel the band is the filter's; between two filters the beam is closed."""
     behind = camera(band=None)
-    found = [shown(behind.read())]
+    found = shown(behind)
     for position in (2, None, 3):
         behind.world.wheel_position = position
-        found.append(shown(behind.read()))
+        found += shown(behind)
     assert found == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
 
 
-def test_shutter_freezes_and_leaves_other_offsets() -> None:
-    """During a correction the image stands, without a flag; after it each pixel has an offset."""
-    source = camera(Faults(ffc=frozenset({3}), offset_step=20.0))
-    found = list(frames(source, 12))
-    assert all(frame.flags == 0 for frame in found)
-    assert all(np.array_equal(frame.counts, found[2].counts) for frame in found[3:8])
-    step = found[8].counts.astype(int) - 1008
-    assert 15 < step.std() < 25
-    np.testing.assert_array_equal(found[9].counts.astype(int) - 1009, step)
-
-
-def test_shutter_may_be_anothers_command() -> None:
-    """A correction that was started over the serial line freezes the frames too."""
-    source = camera()
-    last = shown(source.read())
-    source.world.start_ffc("wide", 0.25)
-    assert [shown(frame) - last for frame in frames(source, 4)] == [0, 0, 3, 4]
-
-
 def test_telemetry_says_what_the_camera_is_about() -> None:
-    """Counter, corrections and temperature are in the rows, and in the world."""
-    source = camera(Faults(ffc=frozenset({3})), rows=2)
+    """Counter, corrections and temperature are in the rows; a correction freezes the image."""
+    source = camera(rows=2)
     source.world.camera("wide").fpa_temperature = 311.2
-    last = list(frames(source, 6))[-1]
-    assert last.telemetry is not None
-    fields = telemetry.decode(last.telemetry)
-    assert [fields[name] for name in ("frame_counter", "last_ffc_frame")] == [5, 3]
-    assert fields["camera_serial"] == 93588
+    (last,) = shown(source)
+    source.world.start_ffc("wide", 0.25)
+    assert [value - last for value in shown(source, 4)] == [0, 0, 3, 4]
+    frame = source.read()
+    assert frame.telemetry is not None
+    fields = telemetry.decode(frame.telemetry)
+    assert [fields[name] for name in ("frame_counter", "camera_serial")] == [5, 93588]
+    assert fields["last_ffc_frame"] in {0, 1}
     assert fields["fpa_temperature"] == pytest.approx(311.2, abs=1e-9)
-    assert last.metadata == telemetry.metadata(last.telemetry)
-
-
-def test_dropped_frames_leave_a_gap() -> None:
-    """A frame that never comes is missing in the numbers, and takes its time."""
-    found = list(frames(camera(Faults(dropped=frozenset({2, 3}))), 4))
-    assert [frame.sequence for frame in found] == [0, 1, 4, 5]
-    assert found[2].device_time - found[1].device_time == pytest.approx(0.3)
+    assert frame.metadata == telemetry.metadata(frame.telemetry)
 
 
 def test_nobody_reads() -> None:
@@ -166,67 +85,17 @@ def test_nobody_reads() -> None:
     assert source.read().sequence == 47
 
 
-def test_damage() -> None:
-    """A corrupt frame is flagged unless its fault is hidden; missing bytes of a short one are 0."""
-    faults = Faults(corrupt=frozenset({1}), unseen=frozenset({2}), short=frozenset({3}))
-    found = list(frames(camera(faults), 5))
-    expected = [0, FrameFlag.DRIVER_ERROR, 0, FrameFlag.WRONG_SIZE, 0]
-    assert [frame.flags for frame in found] == expected
-    lower = [int(np.ptp(frame.counts[4:].astype(int))) for frame in found]
-    assert [value > 0 for value in lower] == [False, True, True, False, False]
-    assert (found[3].counts[4:] == 0).all()
-
-
-def test_repeated_image_has_its_own_number() -> None:
-    """A repeated image has a new sequence number."""
-    found = list(frames(camera(Faults(repeated=frozenset({2}))), 4))
-    assert [shown(frame) for frame in found] == [1000, 1001, 1001, 1003]
-    assert [frame.sequence for frame in found] == [0, 1, 2, 3]
-
-
-def test_clock_of_its_own() -> None:
-    """A drifting clock advances at its rate, and is labelled as the camera's own."""
-    found = list(frames(camera(Faults(clock_rate=1.01)), 3))
-    assert np.diff([frame.device_time for frame in found]) == pytest.approx(0.101)
-    assert all(frame.flags == FrameFlag.FOREIGN_CLOCK for frame in found)
-
-
-def test_unplugged_and_closed() -> None:
-    """A camera that is gone, or was closed, says which."""
-    source = camera(Faults(unplugged=2))
-    list(frames(source, 2))
-    with pytest.raises(SourceLostError, match="emulated camera 'wide': it is unplugged"):
-        source.read()
-    assert not source.world.camera("wide").plugged
-    with camera() as other:
-        pass
-    other.close()
-    with pytest.raises(SourceLostError, match="it is closed"):
-        other.read()
-
-
-def test_no_frame_in_time() -> None:
-    """A wait shorter than a frame ends without one; the next wait has it."""
-    source = camera()
-    source.read()
-    with pytest.raises(NoFrameError, match=r"No frame from emulated camera 'wide' in 0\.01 s"):
-        source.read(0.01)
-    assert source.read().sequence == 1
-
-
 def test_scene_begins_when_it_is_told() -> None:
     """Before, its beginning is seen; then pictures and thermocouples go with its own time."""
-    clock = Clock(1000.0)
-    world = World(clock=clock, scene=lambda time: {"plate": 300.0 + time}, waits=True)
-    world.add_camera("wide", 1)
+    source = camera(scene=lambda time: {"plate": 300.0 + time}, waits=True)
+    world = source.world
     world.thermocouples[1] = "plate"
-    clock.sleep(5.0)
-    source = FaultyCamera(world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE)
-    assert [shown(frame) for frame in frames(source, 3)] == [1000] * 3
+    world.clock.sleep(5.0)
+    assert shown(source, 3) == [1000] * 3
     assert (world.scene_time(), world.thermocouple_temperature(1)) == (0.0, 300.0)
     world.begin()
-    assert world.scene_began == clock()
-    assert [shown(frame) for frame in frames(source, 3)] == [1001, 1002, 1003]
+    assert world.scene_began == world.clock()
+    assert shown(source, 3) == [1001, 1002, 1003]
     assert world.thermocouple_temperature(1) == pytest.approx(300.3)
     world.begin()
     assert (world.scene_time(), world.scene_time(1.0)) == (0.0, 0.0)
@@ -247,24 +116,19 @@ def test_pictures_are_counts(picture: Counts, message: str) -> None:
         source.read()
 
 
-def test_unknown_names() -> None:
-    """A band without a picture, and a camera that is not on the bench, are named."""
-    source = camera(band="12")
+def test_world_has_places_and_slots() -> None:
+    """Thermocouples read what they are at; unknown names and repeated cameras are named."""
+    source = camera(band="12", scene=lambda time: {"plate": 300.0 + time})
+    world = source.world
     with pytest.raises(KeyError, match="Unknown band '12'"):
         source.read()
     with pytest.raises(KeyError, match="Unknown camera 'narrow'"):
-        FaultyCamera(source.world, "narrow", {})
-
-
-def test_world_has_places_and_slots() -> None:
-    """Thermocouples read what they are at; names are checked."""
-    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock(1000.0))
+        EmulatedCamera(world, "narrow", {})
     world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
     world.blackbody_temperature = 320.0
     assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 320.0]
     assert np.isnan(world.thermocouple_temperature(3))
     with pytest.raises(KeyError, match="Unknown place 'moon' of thermocouple 4"):
         world.thermocouple_temperature(4)
-    world.add_camera("wide", 1)
     with pytest.raises(ValueError, match="Repeated camera 'wide'"):
         world.add_camera("wide", 2)

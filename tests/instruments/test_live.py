@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from faulty_camera import Faults, FaultyCamera, Movie
+from faulty_camera import BANDS, Faults, Movie, two_bands, two_cameras
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
@@ -20,13 +20,10 @@ from dbthermal import schema, simulation
 from dbthermal.figures import LiveFigure, Panel
 from dbthermal.instruments import live, telemetry
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
-from dbthermal.instruments.session import Camera, Session
 from dbthermal.separation import Stream
 from dbthermal.simulation import Rig
 
-BANDS = ("8-14", "9.5")
 DEGREE = "\N{DEGREE SIGN}C"
 RAMP = (5000 + np.arange(384, dtype=np.uint16)).reshape(16, 24)
 
@@ -77,29 +74,20 @@ class Recorder:
 
 
 def recording(path: Path, view: live.View) -> Summary:
-    """Record two emulated cameras, whose shutters are closed, until a view has seen enough."""
-    world, sources, stop = World(), {}, threading.Event()
-    wide = np.tile(RAMP, (1, 3))  # two rows of it hold the telemetry
+    """Record two emulated cameras, whose shutters are closed, until a view has drawn them twice."""
+    stop, wide = threading.Event(), np.tile(RAMP, (1, 3))  # two rows of it hold the telemetry
     movie, faults = Movie(wide[None], 60.0, endless=True), Faults(ffc=frozenset(range(1, 6000)))
-    for number, band in enumerate(BANDS):
-        world.add_camera(band, number)
-        sources[band] = FaultyCamera(
-            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults=faults
-        )
+    form = (wide.shape, 100.0, telemetry.ROWS)
+    sources = dict(two_cameras(movie, *form, faults=dict.fromkeys(BANDS, faults)))
 
     def show(shown: Preview) -> None:
         view(shown)
-        if "plate" in shown.readings and min(one.frames for one in view.status.values()) > 9:
+        if shown.time > 1.1:  # it is drawn once a second
             stop.set()
 
-    camera = Camera("v4l2:///dev/video0")
-    cameras = dict.fromkeys(BANDS, camera)
-    session = Session("test", True, "scene", 60.0, cameras, 100.0, wide.shape, telemetry.ROWS)
     limits = Limits(reserve=0, preview_period=0.0, reading_period=0.05)
-    plate = {"plate": Reading(lambda: 303.15)}
-    return record(
-        session, dict(sources), path, readings=plate, limits=limits, preview=show, stop=stop
-    )
+    plate, session = {"plate": Reading(lambda: 303.15)}, two_bands(60.0, *form)
+    return record(session, sources, path, readings=plate, limits=limits, preview=show, stop=stop)
 
 
 def test_numbers_of_a_preview() -> None:
@@ -107,7 +95,7 @@ def test_numbers_of_a_preview() -> None:
     found = status(preview())
     assert (found.frames, found.lost, found.refused, found.damaged) == (1, 2, 3, 4)
     assert (found.lowest, found.highest, found.dead, found.saturated) == (5000, 5383, 0, 0)
-    expected = np.percentile(RAMP[::4, ::4], live._PERCENTILES)
+    expected = np.percentile(RAMP[::4, ::4], (1.0, 99.0))
     np.testing.assert_allclose(found.limits, expected, rtol=0, atol=1e-9)
     assert math.isnan(found.frame_rate)
 
@@ -138,29 +126,25 @@ def test_another_recording_begins_anew() -> None:
     assert watch.status()["11"].warning == "no frame has come"
 
 
+CLOSED = frame(flags=FrameFlag.SHUTTER_CLOSED)
+STATES = ("none performed", "imminent", "in progress", "complete")
+
+
 @pytest.mark.parametrize(
-    ("number", "name"),
+    ("seen", "state"),
     [
-        (0.0, "none performed"),
-        (1.0, "imminent"),
-        (2.0, "in progress"),
-        (3.0, "complete"),
-        (math.nan, "no answer"),
-        (7.0, "state 7"),
+        *((ffc(ffc=float(number)), name) for number, name in enumerate(STATES)),
+        (ffc(ffc=math.nan), "no answer"),
+        (ffc(ffc=7.0), "state 7"),
+        # A closed shutter is a correction, though the camera's answer is older or late.
+        (preview(shown=CLOSED), "in progress"),
+        (ffc(shown=CLOSED, ffc=3.0), "in progress"),
+        (preview(), "unknown"),
     ],
 )
-def test_state_of_the_correction_as_the_camera_answers(number: float, name: str) -> None:
-    """Known states have a name, unknown ones a number, and failed readings "no answer"."""
-    assert status(ffc(ffc=number)).ffc == name
-
-
-def test_state_of_the_correction_by_the_frame() -> None:
-    """A closed shutter is a correction, though the camera's answer is older or late."""
-    closed = frame(flags=FrameFlag.SHUTTER_CLOSED)
-    assert status(preview(shown=closed)).ffc == "in progress"
-    assert status(ffc(shown=closed, ffc=3.0)).ffc == "in progress"
-    assert status(preview()).ffc == "unknown"
-    assert status(ffc(shown=closed, ffc=math.nan)).warning == "shutter closed: FFC in progress"
+def test_state_of_the_correction(seen: Preview, state: str) -> None:
+    """Known states have a name, unknown ones a number, failed readings "no answer"."""
+    assert status(seen).ffc == state
 
 
 def test_time_since_the_last_correction() -> None:
@@ -213,20 +197,14 @@ def test_bad_pictures_are_told(value: int, pixels: int, warning: str) -> None:
     assert status(preview(shown=frame(counts))).warning == warning
 
 
-def test_title_says_that_it_is_emulated() -> None:
-    """An emulated rig is never shown as a real one, nor a real one as emulated."""
+def test_title_and_readings() -> None:
+    """An emulated rig is marked; readings have degrees Celsius, their unit, or no answer."""
+    named = {"plate": 303.15, "air": 40.0, "room": math.nan, "ffc 11": 3.0, "fpa 9.5": 308.15}
     for is_simulated, title in ((True, "pot (emulated), 2.0 s"), (False, "pot, 2.0 s")):
         view = live.View(title="pot", is_simulated=is_simulated)
-        view(preview(2.0))
+        view(replace(preview(2.0), readings=named, units={"air": "%"}))
         assert texts(view)[0] == title
-
-
-def test_readings_are_written_below() -> None:
-    """Thermocouples are in degrees Celsius, other readings in their unit, failures as no answer."""
-    view = live.View(is_simulated=True)
-    named = {"plate": 303.15, "air": 40.0, "room": math.nan, "ffc 11": 3.0, "fpa 9.5": 308.15}
-    view(replace(preview(), readings=named, units={"air": "%"}))
-    assert texts(view)[-1] == f"plate 30.0 {DEGREE}, air 40 %, room no answer, ffc 11 complete"
+        assert texts(view)[-1] == f"plate 30.0 {DEGREE}, air 40 %, room no answer, ffc 11 complete"
 
 
 def test_one_figure_is_used_again() -> None:
@@ -262,25 +240,19 @@ def test_no_picture_of_a_recording_before() -> None:
 
 
 def test_updates_keep_the_period() -> None:
-    """The view is drawn at most once a period, and at once for another recording."""
+    """A PNG and words for a terminal come at most once a period, or for another recording."""
     display = Recorder()
-    view = live.View(display, is_simulated=True)
+    view = live.View(display, title="pot", is_simulated=True)
     shown = []
     for at in (0.0, 0.4, 0.9, 1.0, 1.9, 2.1, 0.3, 0.5):
         before = len(display.displayed + display.updated)
-        view(preview(at))
+        view(preview(at, plate=303.15))
         shown += [at] * (len(display.displayed + display.updated) - before)
     assert shown == [0.0, 1.0, 2.1, 0.3]
     view(replace(preview(0.1), frames={}))
     view(preview(0.2))
     assert "2 lost" in repr(display.updated[-1])
     assert len(display.updated) == 4
-
-
-def test_what_a_display_is_handed() -> None:
-    """A display gets a PNG of the figure, and the same in words for a terminal."""
-    display = Recorder()
-    live.View(display, title="pot", is_simulated=True)(preview(plate=303.15))
     picture = display.displayed[0]
     assert picture._repr_png_().startswith(b"\x89PNG\r\n")
     assert repr(picture).startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
@@ -312,11 +284,11 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
     detector = simulation.pattern(rig, (12, 16), rng)
     raw = simulation.capture(capture, detector)["counts"]
-    gain, offset = 1.0 / detector["gain"], -detector["offset"] / detector["gain"]
+    gain = 1.0 / detector["gain"]
     dead = detector["dead"].any("band") * np.uint32(schema.Status.DEAD_PIXEL)
     template = capture.isel(time=[0]).assign(status=dead.astype(np.uint32))
     stream = Stream(template, response, frame_rate=rate, refresh=2.0)
-    correction = xr.Dataset({"gain": gain, "offset": offset})
+    correction = xr.Dataset({"gain": gain, "offset": -detector["offset"] * gain})
     separation = live.Separation(stream, correction)
     view = live.View(is_simulated=True, separation=separation)
     for number, at in enumerate(capture["time"].values):
@@ -324,10 +296,8 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
             str(band): replace(frame(raw.sel(band=band).values[number]), host_time=100.0 + at)
             for band in rig.bands
         }
-        totals = {
-            band: {"frames": number, "lost": 0, "refused": 0, "damaged": 0} for band in frames
-        }
-        shown = Preview(float(at), frames, totals, {})
+        totals = {"frames": number, "lost": 0, "refused": 0, "damaged": 0}
+        shown = Preview(float(at), frames, dict.fromkeys(frames, totals), {})
         view(shown)
         separation(shown)  # the same frames once more are left out
         assert stream.is_ready or "not known yet" in texts(view)
@@ -338,9 +308,7 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
         separation(replace(shown, frames=closed))
     assert stream.lost_frames == 0
     result = stream.result()
-    truth = scene.assign_coords(time=scene["time"] + 100.0).sel(
-        time=result["time"], method="nearest"
-    )
+    truth = scene.sel(time=result["time"].values - 100.0, method="nearest")
     error = result["object_temperature"].values - truth["object_temperature"].values
     off = float(np.median(abs(error[:, result["status"].values == 0])))
     print(f"emulated camera: median error {off:.3f} K")
@@ -351,9 +319,8 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     assert titles[2:4] == ["object", "background"]
 
 
-def test_recording_without_a_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recording_without_a_notebook(tmp_path: Path) -> None:
     """Two emulated cameras are watched from within a recording, each by its own frames."""
-    monkeypatch.setattr(live, "_PERIOD", 0.0)
     view = live.View(title="test", is_simulated=True)
     assert recording(tmp_path / "a.zarr", view).ended == "stopped"
     for one in view.status.values():

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_camera import BANDS
 from file_operations import before_operation, operations_of
 from rig_session import from_yaml, rig
-from test_capture_file import Note
-from test_killed import BANDS, RATE, check, frame, two_bands
+from test_capture_file import Note, begun, shot
+from test_killed import check
 from test_protocols import TWO, swept
 from test_record import SMALL, bench, session
 
@@ -19,6 +20,7 @@ from dbthermal import store
 from dbthermal.instruments.recording import Preview, notes, open_sweep, record
 
 FRAMES = 15
+EVERY = pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
 
 
 def itself(path: Path) -> Path:
@@ -51,48 +53,34 @@ def twice(path: Path) -> Path:
     return parent(itself(path))
 
 
-MOVES = (itself, parent, elsewhere, replaced_by_another, twice)
-
-
-def write(path: Path) -> Path:
-    """Write a whole recording frame by frame, and return where it lies."""
-    file = two_bands(path)
+def write(path: Path, then: Callable[[int], object] = lambda _: None) -> Path:
+    """Write a whole recording, do something after each frame, and return where it lies."""
+    file = begun(path, chunk=3)
     for number in range(FRAMES):
-        file.note(Note.READING, "plate", number / RATE, number)
+        file.note(Note.READING, "plate", number / 100, number)
         for band in BANDS:
-            file.frame(band, frame(number))
+            file.frame(band, shot(number))
+        then(number)
     file.close(complete=True, ended="stopped")
     return file.recording.place()
 
 
-def check_whole(place: Path) -> None:
-    """Check that a recording has every frame and note, and no part of another's name."""
-    opened = store.open_dataset(place)
-    assert opened.attrs["frames_written"] == dict.fromkeys(BANDS, FRAMES)
-    assert (opened.attrs["closed"], opened.attrs["complete"]) == (True, True)
-    check(opened, 2 * [FRAMES])
-    readings = [value for _, kind, _, value in notes(place) if kind == "reading"]
-    np.testing.assert_array_equal(readings, np.arange(FRAMES))
-
-
 def moments(tmp_path: Path, every: int) -> range:
     """Every so many-th file operation of a recording, from when it is begun to its end."""
-    begun = operations_of(lambda: two_bands(tmp_path / "a.zarr"))
-    return range(begun + 1, operations_of(lambda: write(tmp_path / "b.zarr")), every)
+    start = operations_of(lambda: begun(tmp_path / "a.zarr", chunk=3))
+    return range(start + 1, operations_of(lambda: write(tmp_path / "b.zarr")), every)
 
 
-@pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("move", MOVES)
+@EVERY
+@pytest.mark.parametrize("move", [itself, parent, elsewhere, replaced_by_another, twice])
 def test_moved_at_any_operation_it_goes_on(
     tmp_path: Path, move: Callable[[Path], Path], every: int
 ) -> None:
     """Moved before any file operation, the recording is whole at its new place, and says so."""
     noted = 0
     for moment in (chosen := moments(tmp_path, every)):
-        folder = tmp_path / f"{moment}" / "deep"
-        folder.mkdir(parents=True)
-        path = folder / "a.zarr"
-        places: list[Path] = []
+        path, places = tmp_path / f"{moment}" / "deep" / "a.zarr", list[Path]()
+        path.parent.mkdir(parents=True)
 
         def act(to: list[Path] = places, at: Path = path) -> None:
             to.append(move(at))
@@ -100,7 +88,12 @@ def test_moved_at_any_operation_it_goes_on(
         with before_operation(moment, act):
             place = write(path)
         assert [place] == places
-        check_whole(place)
+        opened = store.open_dataset(place)
+        assert opened.attrs["frames_written"] == dict.fromkeys(BANDS, FRAMES)
+        assert (opened.attrs["closed"], opened.attrs["complete"]) == (True, True)
+        check(opened, 2 * [FRAMES])
+        readings = [value for _, kind, _, value in notes(place) if kind == "reading"]
+        np.testing.assert_array_equal(readings, np.arange(FRAMES))
         assert path.exists() == (move is replaced_by_another)
         noted += "folder_moved" in [note[1] for note in notes(place)]
         shutil.rmtree(tmp_path / f"{moment}")
@@ -130,11 +123,8 @@ def array_replaced(path: Path) -> None:
     (path.parent / "copy").rename(path / "counts")
 
 
-LOSSES = (deleted, carried_off, array_moved, array_replaced)
-
-
-@pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("lose", LOSSES)
+@EVERY
+@pytest.mark.parametrize("lose", [deleted, carried_off, array_moved, array_replaced])
 def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], every: int) -> None:
     """Without its folder, or an array's, a recording ends with its name, and makes no other."""
     for moment in moments(tmp_path, every):
@@ -159,20 +149,14 @@ def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], ev
 )
 def test_without_a_chunk_it_is_not_complete(tmp_path: Path, part: str) -> None:
     """Chunks that are deleted while it is written are missed by name, and never filled up."""
-    file = two_bands(path := tmp_path / "a.zarr")
+    gone = (path := tmp_path / "a.zarr") / part
 
-    def write_on() -> None:
-        for number in range(FRAMES):
-            file.note(Note.READING, "plate", number / RATE, number)
-            for band in BANDS:
-                file.frame(band, frame(number))
-            if number == 8:
-                gone = path / part
-                shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-        file.close(complete=True, ended="stopped")
+    def lose(number: int) -> None:
+        if number == 8:
+            shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
 
     with pytest.raises(FileNotFoundError, match=rf"{part}.*'"):
-        write_on()
+        write(path, lose)
     with pytest.raises(ValueError, match=f"Missing file '{part}"):
         store.open_dataset(path)
 

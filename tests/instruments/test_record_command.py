@@ -23,6 +23,7 @@ ONE = replaced(
     ("window: 3", "window: 0.1"),
     ("0.15", "0.6"),  # a reading takes a third of it
 )
+REAL = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
 
 
 @pytest.fixture(autouse=True)
@@ -37,23 +38,26 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "open_devices", opened)
 
 
-def written(path: Path, text: str) -> str:
-    """Write a session to a file, and return its path."""
-    path.write_text(text, encoding="utf-8")
-    return str(path)
+def run(folder: Path, text: str, *options: str) -> int:
+    """Exit status of a session that is written to a file, and recorded beside it."""
+    (file := folder / "a.yaml").write_text(text, encoding="utf-8")
+    return main(["record", str(file), str(folder / "recorded"), *options])
 
 
 def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A sweep prints its emulated devices and its progress, and its movies open."""
-    file, folder = written(tmp_path / "a.yaml", ONE), tmp_path / "recorded"
-    assert main(["record", file, str(folder)]) == 0
+    folder = tmp_path / "recorded"
+    assert run(tmp_path, ONE) == 0
     said = capsys.readouterr().out
     assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
-    assert "filter_wheel: model BSC201" in said
-    assert "Setting the emulated blackbody to 16.85 degC." in said
-    assert "11: " in said
-    assert "FPA 35.0 \N{DEGREE SIGN}C, FFC complete" in said
-    assert f"{folder / 'plate_00_11.zarr'}: duration" in said
+    for part in (
+        "filter_wheel: model BSC201",
+        "Setting the emulated blackbody to 16.85 degC.",
+        "11: ",
+        "FPA 35.0 \N{DEGREE SIGN}C, FFC complete",
+        f"{folder / 'plate_00_11.zarr'}: duration",
+    ):
+        assert part in said
     movies = recording.open_sweep(folder, "plate", frames=8)
     levels = [LEVELS["8-14"] + 2900, LEVELS["11"] + 2900]
     np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], levels)
@@ -62,56 +66,53 @@ def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
     """Told to simulate, a session of hardware is recorded from the simulation's blackbody."""
     text = scene_text().replace("simulated: true", "simulated: false")
-    file = written(tmp_path / "a.yaml", text.replace('3: "11"', "3: 10.6"))
-    assert main(["record", file, str(tmp_path), "--simulate"]) == 0
-    capture = open_capture(tmp_path / "plate.zarr")
+    assert run(tmp_path, text.replace('3: "11"', "3: 10.6"), "--simulate") == 0
+    capture = open_capture(tmp_path / "recorded" / "plate.zarr")
     assert capture.attrs["is_simulated"] is True
     assert float(capture["counts"].std("x").mean()) > 1
 
 
-def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A dry run opens and names the devices, and records nothing."""
-    arguments = ["record", written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
-    assert main(arguments) == 0
-    said = capsys.readouterr().out
-    assert "9.5: device sim://boson/9.5" in said
-    assert "Preparing" not in said
-    assert not (tmp_path / "b").exists()
-
-
 @pytest.mark.parametrize(
-    ("text", "status", "message"),
+    ("text", "message"),
     [
-        ("name: plate", 1, "Missing 'simulated'. Must be set"),
-        (TEXT.replace("tc08:", "tc09:"), 1, "Invalid address 'tc09:'. Must be tc08:"),
-        (TEXT.replace("v4l2:///dev/video0", "v4l2:///tmp/x"), 1, "Must be v4l2:///dev/<node>"),
+        ("name: plate", "Missing 'simulated'. Must be set"),
+        (TEXT.replace("tc08:", "tc09:"), "Invalid address 'tc09:'. Must be tc08:"),
+        (TEXT.replace("v4l2:///dev/video0", "v4l2:///tmp/x"), "Must be v4l2:///dev/<node>"),
+        (REAL, "/dev/none/"),
     ],
 )
 def test_failures_have_a_status(
-    text: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str,
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A failure prints its message and exits with the documented status."""
-    file = written(tmp_path / "a.yaml", text)
-    assert main(["record", file, str(tmp_path)]) == status
-    assert message in capsys.readouterr().err
+    """A failure prints its message, after the report of the bus, with the documented status."""
+    monkeypatch.setattr(inventory, "find", lambda **_: [])
+    assert run(tmp_path, text) == 1
+    said = capsys.readouterr()
+    assert message in said.err
+    assert (inventory.describe([]) in said.out) is (text is REAL)
 
 
-def test_recorded_scene_is_refused_at_once(
+def test_what_is_refused_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An existing scene raises an error before a device is opened; a dry run opens them."""
-    file = written(tmp_path / "a.yaml", scene_text())
-    (tmp_path / "plate.zarr").mkdir()
-    assert main(["record", file, str(tmp_path), "--dry-run"]) == 0
+    """A dry run names devices and records nothing; an existing scene and no file are errors."""
+    folder, text = tmp_path / "recorded", scene_text()
+    assert run(tmp_path, text, "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "9.5: device sim://boson/9.5" in said
+    assert "Preparing" not in said
+    assert not folder.exists()
+    (folder / "plate.zarr").mkdir(parents=True)
+    assert run(tmp_path, text, "--dry-run") == 0
     monkeypatch.setattr(command, "open_devices", lambda _: pytest.fail("a device was opened"))
-    assert main(["record", file, str(tmp_path)]) == 1
+    assert run(tmp_path, text) == 1
     assert "plate.zarr'. Must be a new recording." in capsys.readouterr().err
-
-
-def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A missing session file is named, with exit status 1."""
-    assert main(["record", str(tmp_path / "a.yaml"), str(tmp_path)]) == 1
-    assert "a.yaml" in capsys.readouterr().err
+    assert main(["record", str(tmp_path / "b.yaml"), str(tmp_path)]) == 1
+    assert "b.yaml" in capsys.readouterr().err
 
 
 def test_interrupted(
@@ -123,45 +124,33 @@ def test_interrupted(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "_progress", interrupt)
-    file = written(tmp_path / "a.yaml", scene_text())
-    assert main(["record", file, str(tmp_path)]) == 130
+    assert run(tmp_path, scene_text()) == 130
     assert "Interrupted: what was recorded is kept." in capsys.readouterr().err
-    assert (tmp_path / "plate.zarr").is_dir()
+    assert (tmp_path / "recorded" / "plate.zarr").is_dir()
 
 
-def test_hardware_is_looked_for_and_asked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("error", [None, EOFError, NotImplementedError])
+def test_blackbody_is_set_by_the_user(
+    error: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the rig the report of the bus and the first address name the missing devices."""
-    monkeypatch.setattr(inventory, "find", lambda **_: [])
-    real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
-    assert main(["record", written(tmp_path / "a.yaml", real), str(tmp_path)]) == 1
-    said = capsys.readouterr()
-    assert inventory.describe([]) in said.out
-    assert "/dev/none/" in said.err
-
-
-def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A real blackbody is set by the user, who gets the temperature in degrees Celsius."""
+    """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
     asked: list[str] = []
-    monkeypatch.setattr("builtins.input", asked.append)
+
+    def answer(text: str) -> None:
+        asked.append(text)
+        if error:
+            raise error
+
+    monkeypatch.setattr("builtins.input", answer)
     devices = Devices(from_yaml(TEXT), {})
-    command._set_blackbody(devices, 300.0)
-    assert asked == [
-        "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
-    ]
-
-
-@pytest.mark.parametrize("error", [EOFError, NotImplementedError])
-def test_nobody_at_the_keyboard(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a keyboard, as under papermill, the error says where to run the session."""
-
-    def refuse(_: str) -> str:
-        raise error
-
-    monkeypatch.setattr("builtins.input", refuse)
-    with pytest.raises(RuntimeError, match=r"26\.85 degC\. Must be run in a terminal, or in Jup"):
-        protocols.ask_for_blackbody("plate", 300.0)
+    if error:
+        told = r"26\.85 degC\. Must be run in a terminal, or in Jup"
+        with pytest.raises(RuntimeError, match=told):
+            command._set_blackbody(devices, 300.0)
+    else:
+        command._set_blackbody(devices, 300.0)
+    told = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
+    assert asked == [told]
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:

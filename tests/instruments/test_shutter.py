@@ -10,7 +10,7 @@ from test_y16 import SESSION
 from dbthermal import correction
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.clock import Task
-from dbthermal.instruments.devices import Devices, open_devices
+from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.world import FFC_DURATION
 from dbthermal.instruments.protocols import record_scene
 from dbthermal.instruments.recording import Limits, Preview, notes, open_capture
@@ -21,32 +21,22 @@ RATE, SHAPE = 50.0, [16, 80]
 
 def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
     """A scene during which the narrow camera corrects its offsets, once, by its command port."""
-    cameras = {
-        band: {"video": "v4l2:///dev/video0", "control": "serial:///dev/ttyACM0"}
-        for band in ("8-14", "9.5")
-    }
-    changes = {"cameras": cameras, "shape": SHAPE, "frame_rate": RATE, "duration": 1.3}
-    session = Session.load(SESSION, {**changes, "telemetry_rows": telemetry_rows})
+    ports = {"video": "v4l2:///dev/video0", "control": "serial:///dev/ttyACM0"}
+    changes = {"cameras": {"8-14": ports, "9.5": ports}, "shape": SHAPE, "frame_rate": RATE}
+    session = Session.load(SESSION, {**changes, "duration": 1.3, "telemetry_rows": telemetry_rows})
     with open_devices(session) as devices:
-        corrector = _Corrector(devices)
+        task = Task(devices.clock, "corrector", devices.cameras["9.5"].run_ffc)
+
+        def correct(preview: Preview) -> None:
+            if preview.time > 0.3 and task.ident is None:
+                task.start()
+
         limits = Limits(reserve=0, reading_period=0.05, preview_period=0.02)
-        record_scene(devices, path, limits=limits, preview=corrector)
-        assert corrector.task.ended.is_set()
+        record_scene(devices, path, limits=limits, preview=correct)
+        assert task.ended.is_set()
     capture = open_capture(path)
     padded = capture["frame_flags"] & int(FrameFlag.PADDED)
     return capture.isel(time=~padded.any("band").values)
-
-
-class _Corrector:
-    """A preview that runs one correction, some time after the start."""
-
-    def __init__(self, devices: Devices) -> None:
-        self.task = Task(devices.clock, "corrector", devices.cameras["9.5"].run_ffc)
-
-    def __call__(self, preview: Preview) -> None:
-        """Start it once."""
-        if preview.time > 0.3 and self.task.ident is None:
-            self.task.start()
 
 
 @pytest.mark.filterwarnings("ignore:Fixed pattern")  # of an emulated detector without correction

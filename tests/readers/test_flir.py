@@ -62,20 +62,18 @@ def test_golden_metadata(mirror: Path) -> None:
     printed = {key.strip(): value.strip() for key, _, value in (x.partition(":") for x in lines)}
     for key in ("R1", "R2", "B", "F", "O"):
         assert read[f"file_planck_{key}"] == float(printed[f"Planck {key}"])
-    for key, name in {
-        "Emissivity": "emissivity",
-        "Object Distance": "object_distance",
-        "IR Window Transmission": "window_transmission",
-        "Frame Rate": "frame_rate",
-    }.items():
+    numbers = {"Emissivity": "emissivity", "Object Distance": "object_distance"}
+    numbers |= {"IR Window Transmission": "window_transmission", "Frame Rate": "frame_rate"}
+    for key, name in numbers.items():
         assert_allclose(read[f"file_{name}"], float(printed[key].split()[0]), rtol=0, atol=0.005)
-    for key, name in {
-        "Reflected Apparent Temperature": "reflected_temperature",
-        "Atmospheric Temperature": "atmospheric_temperature",
-        "IR Window Temperature": "window_temperature",
-        "Camera Temperature Range Max": "range_max",
-        "Camera Temperature Range Min": "range_min",
-    }.items():
+    kelvin = {
+        "Reflected Apparent": "reflected",
+        "Atmospheric": "atmospheric",
+        "IR Window": "window",
+    }
+    kelvin = {f"{key} Temperature": f"{name}_temperature" for key, name in kelvin.items()}
+    kelvin |= {f"Camera Temperature Range {end}": f"range_{end.lower()}" for end in ("Max", "Min")}
+    for key, name in kelvin.items():
         celsius = read[f"file_{name}"] - 273.15
         assert_allclose(celsius, float(printed[key].split()[0]), rtol=0, atol=0.05)  # [K]
     assert read["file_camera_model"] == printed["Camera Model"]
@@ -158,10 +156,9 @@ def test_exchanged_images_are_marked(path: Path) -> None:
     size = len(content) // 6
     image = content.index(counts[1].tobytes()) - 32
     other, length = image + size, 32 + counts[0].nbytes
-    swapped = bytearray(content)
-    swapped[image : image + length] = content[other : other + length]
-    swapped[other : other + length] = content[image : image + length]
-    path.write_bytes(swapped)
+    first, second = (content[at : at + length] for at in (image, other))
+    between = content[image + length : other]
+    path.write_bytes(content[:image] + second + between + first + content[other + length :])
     read = readers.flir(path)
     found = schema.has_flag(read.frame_flags, "numbers_differ").values
     assert found.tolist() == [False, True, True, False, False, False]
@@ -170,9 +167,8 @@ def test_exchanged_images_are_marked(path: Path) -> None:
 
 def test_implausible_values_are_named(path: Path) -> None:
     """Kelvin entered for Celsius, a date before the format: named, shown, and not applied."""
-    path.write_bytes(
-        sequence(scene(1), seconds=[946706066.0], values={0x28: 571.15, 0x20: float("nan")})
-    )
+    values = {0x28: 571.15, 0x20: float("nan")}
+    path.write_bytes(sequence(scene(1), seconds=[946706066.0], values=values))
     read = readers.flir(path)
     assert "reflected_temperature 571.15 K (298.0 degrees Celsius)" in read.attrs["implausible"]
     assert "emissivity nan" in read.attrs["implausible"]
@@ -185,9 +181,7 @@ def test_range_must_not_change(path: Path) -> None:
     """Frames of two ranges of the camera are no recording."""
     parts = [sequence(scene(1)), sequence(scene(1), seconds=[1.6e9], values={0x58: 16000.0})]
     path.write_bytes(b"".join(parts))
-    with pytest.raises(
-        ValueError, match=r"planck_R1 16000 of frame 1 of 'a\.seq', 21106\.8 before"
-    ):
+    with pytest.raises(ValueError, match=r"R1 16000 of frame 1 of 'a\.seq', 21106\.8 before"):
         readers.flir(path)
     assert readers.flir(path, frames=slice(1, None)).attrs["file_planck_R1"] == 16000
     assert CONSTANTS[0x58] == readers.flir(path, frames=slice(1)).attrs["file_planck_R1"]
@@ -245,6 +239,7 @@ def test_parts_of_a_recording(path: Path) -> None:
         ("a.ats", b"", "readers.tiff"),
         ("a.mp4", b"", r"8 bits are drawn, not measured"),
         ("a.seq", b"", "Empty file"),
+        ("a.seq", sequence(scene(1) // np.uint16(256)), "one of their two bytes is always 0"),
         ("a.seq", b"RIFF" * 40, r"Invalid header b'RIFF'.*no recording of FLIR\? Then export"),
         ("a.jpg", b"\xff\xd8\xff\xda\0\2", "No thermal data of FLIR .* of another maker"),
         ("a.jpg", b"\xff\xd8\xff\xe1\xff\xff", "Damaged JPEG"),
@@ -255,13 +250,6 @@ def test_refused_with_what_to_do(tmp_path: Path, name: str, content: bytes, rule
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rule):
         readers.flir(tmp_path / name)
-
-
-def test_pictures_of_8_bits(path: Path) -> None:
-    """Counts with one byte empty are pictures."""
-    path.write_bytes(sequence(scene(1) // np.uint16(256)))
-    with pytest.raises(ValueError, match="one of their two bytes is always 0"):
-        readers.flir(path)
 
 
 def test_size_before_memory(path: Path) -> None:

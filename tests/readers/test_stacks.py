@@ -29,10 +29,7 @@ FORMS: dict[str, dict[str, Any]] = {
 HALVES = f"{0.5 * scene()[0].min():g} to {0.5 * scene()[0].max():g}"
 
 
-GDAL = (
-    '<GDALMetadata>\n<Item name="{}" sample="0" role="{}">{}</Item>\n<Item name="a">3</Item>'
-    "</GDALMetadata>"
-)
+GDAL = '<GDALMetadata>\n<Item name="{}" sample="0" role="{}">{}</Item>\n</GDALMetadata>'
 
 
 def write(path: Path, counts: Any, **options: Any) -> None:
@@ -68,6 +65,16 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         read(paths)
 
 
+FOUR = scene(4).reshape(2, 2, 24, 32)
+BANDS: dict[str, Any] = {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None}
+SCALE, OFFSET = GDAL.format("SCALE", "scale", 0.01), GDAL.format("OFFSET", "offset", 9)
+
+
+def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
+    """One tag more."""
+    return {"extratags": [(code, kind, 0 if kind == 2 else 1, value, False)]}
+
+
 @pytest.mark.parametrize(
     ("counts", "options", "message"),
     [
@@ -75,7 +82,7 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         (
             0.5 * scene().astype("f4"),
             {},
-            f"Invalid TIFF 'a.tif': Invalid values of page 0, float32 from {HALVES}",
+            f"Invalid TIFF 'a.tif': .* of page 0, float32 from {HALVES}",
         ),
         (scene().astype("f2") / 9, {}, "Invalid values of page 0, float16 from"),
         (scene().astype("i2"), {}, "Invalid sample format 2 of page 0"),
@@ -83,17 +90,9 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
         (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
         (scene() // np.uint16(256), {}, "one of their two bytes is always 0"),
-        (scene(4).reshape(2, 2, 24, 32), {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
-        (
-            scene(4).reshape(2, 2, 24, 32),
-            {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None},
-            r"Invalid axes of \[2, 2\] images",
-        ),
-        (
-            scene(4).reshape(2, 2, 24, 32),
-            {"ome": True, "metadata": {"axes": "CTYX"}},
-            r"Invalid axes of \[1, 2, 2\] images",
-        ),
+        (FOUR, {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
+        (FOUR, BANDS, r"Invalid axes of \[2, 2\] images"),
+        (FOUR, {"ome": True, "metadata": {"axes": "CTYX"}}, r"Invalid axes of \[1, 2, 2\] images"),
         *(
             (
                 scene(),
@@ -105,14 +104,17 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         (scene(), {"imagej": True}, "Invalid axes CYX of the images"),
         (scene(), {"ome": True}, "Invalid axes CYX of the images"),
         (scene(), {"photometric": "miniswhite"}, "Invalid photometric interpretation 0 of page 0"),
-        *(
-            (scene(), {"extratags": [(code, kind, 0 if kind == 2 else 1, value, False)]}, message)
-            for code, kind, value, message in (
-                (274, 3, 6, "Invalid orientation 6 of page 0. Must be 1: rows from the top"),
-                (42112, 2, GDAL.format("SCALE", "scale", 0.01), "Invalid GDAL scale 0.01 of page"),
-                (42112, 2, GDAL.format("OFFSET", "offset", 9), "Invalid GDAL offset 9 .*Must be 0"),
-                (42113, 2, str(scene()[1, 2, 3]), "Missing counts in 'a.tif'.* Must all be there"),
-            )
+        (
+            scene(),
+            tagged(274, 3, 6),
+            "Invalid orientation 6 of page 0. Must be 1: rows from the top",
+        ),
+        (scene(), tagged(42112, 2, SCALE), "Invalid GDAL scale 0.01 of page"),
+        (scene(), tagged(42112, 2, OFFSET), "Invalid GDAL offset 9 .*Must be 0"),
+        (
+            scene(),
+            tagged(42113, 2, str(scene()[1, 2, 3])),
+            "Missing counts in 'a.tif'.* Must all be",
         ),
     ],
 )
@@ -141,12 +143,8 @@ def test_unit_must_be_stated(tmp_path: Path) -> None:
 )
 def test_unit_of_the_description(tmp_path: Path, unit: str) -> None:
     """A description whose values are temperatures is refused, as of ImageJ or JSON; others not."""
-    forms = [
-        f"ImageJ=1.54f\nunit=micron\nvunit={unit}\n",
-        f'{{"units": "{unit}"}}',
-        f"unit: {unit}",
-    ]
-    for form in forms:
+    image_j = f"ImageJ=1.54f\nunit=micron\nvunit={unit}\n"
+    for form in (image_j, f'{{"units": "{unit}"}}', f"unit: {unit}"):
         write(tmp_path / "a.tif", scene(), description=form.encode())
         with pytest.raises(ValueError, match=r"Invalid unit .* of 'a\.tif'\. Must be 'count'"):
             read(tmp_path / "a.tif")

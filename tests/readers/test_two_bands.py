@@ -1,6 +1,8 @@
 """Two recordings as one capture, with the maker's constants, all the way to temperatures."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,15 +10,7 @@ import xarray as xr
 from flir_files import Values, scene, sequence
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dbthermal import (
-    alignment,
-    calibration,
-    correction,
-    readers,
-    schema,
-    separation,
-    store,
-)
+from dbthermal import alignment, calibration, correction, readers, schema, separation, store
 from dbthermal import response as responses
 from dbthermal.figures import drawing
 
@@ -102,53 +96,50 @@ def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset])
     assert aligned.counts.sel(band="9.5")[~late.values].notnull().all()
 
 
+UNKNOWN = r"Invalid 'exposure_time' of band '9.5' .* Must be known, finite"
+OTHERS: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
+    "unknown": (lambda one: one.assign(exposure_time=one.exposure_time * np.nan), UNKNOWN),
+    "infinite": (lambda one: one.assign(exposure_time=1 / one.exposure_time), UNKNOWN),
+    "resting": (lambda one: one.assign(exposure_time=one.exposure_time * 0 - 1), UNKNOWN),
+    "falling": (lambda one: one.assign_coords(time=-one.time), "Must be known, finite and rise"),
+    "truth": (lambda one: one.astype(bool), "Invalid dtype bool of .* of band '9.5'"),
+    "crop": (lambda one: one.isel(x=slice(1, None)), r"Different sizes \(24, 32\) and \(24, 31\)"),
+    "undated": (lambda one: one.drop_attrs(deep=False), r"Unknown dates .* offset="),
+    "temperatures": (lambda one: one.astype("f4"), "Invalid dtype float32 of .* of band '9.5'"),
+    "picture": (lambda one: one.drop_vars("exposure_time"), "'exposure_time' is nothing"),
+    "timeless": (lambda one: one.drop_vars("time"), "'time' is nothing"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_makes_no_capture(pair: tuple[xr.Dataset, xr.Dataset], name: str) -> None:
+    """Recordings that do not belong together are refused by band and rule."""
+    change, message = OTHERS[name]
+    with np.errstate(divide="ignore"), pytest.raises((ValueError, TypeError), match=message):
+        readers.two_bands(pair[0], change(pair[1]), bands=BANDS)
+
+
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("argument", "value", "message"),
     [
-        ({"offset": 100.0}, r"Invalid offset 100 s: .* do not overlap"),
-        ({"offset": np.nan}, r"Invalid offset nan\. Must be a finite number"),
-        ({"offset": "0"}, r"Invalid offset '0'\. Must be a finite number"),
-        ({"offset": True}, r"Invalid offset True\. Must be a finite number"),
-        ({"bands": "ab"}, "Invalid bands 'ab'. Must be two different names"),
-        ({"bands": (8.0, 9.5)}, "Invalid bands"),
-        ({"bands": ("a", "b", "c")}, "Invalid bands"),
-        ({"bands": ("a", " ")}, "Invalid bands"),
-        ({"bands": None}, "Invalid bands None"),
-        ({"second": "unknown"}, r"Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
-        ({"second": "infinite"}, "Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
-        ({"second": "resting"}, "Invalid 'exposure_time' of band '9.5' .* Must be known, finite"),
-        ({"second": "falling"}, "Invalid 'time' of band '9.5' .* Must be known, finite and rise"),
-        ({"second": "truth"}, "Invalid dtype bool of 'exposure_time' of band '9.5'"),
-        ({"second": "timeless"}, "'time' is nothing"),
-        ({"bands": ("a", "a")}, r"Invalid bands \('a', 'a'\). Must be two different names"),
-        ({"second": "crop"}, r"Different sizes \(24, 32\) and \(24, 31\)"),
-        ({"second": "undated"}, r"Unknown dates .* offset="),
-        ({"second": "temperatures"}, "Invalid dtype float32 of the counts of band '9.5'"),
-        ({"second": "picture"}, "'exposure_time' is nothing"),
+        ("offset", 100.0, r"Invalid offset 100 s: .* do not overlap"),
+        ("offset", np.nan, r"Invalid offset nan\. Must be a finite number"),
+        ("offset", "0", r"Invalid offset '0'\. Must be a finite number"),
+        ("offset", True, r"Invalid offset True\. Must be a finite number"),
+        ("bands", "ab", "Invalid bands 'ab'. Must be two different names"),
+        ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be two different names"),
+        *(
+            ("bands", one, "Invalid bands")
+            for one in ((8.0, 9.5), ("a", "b", "c"), ("a", " "), None)
+        ),
     ],
 )
-def test_what_makes_no_capture(
-    pair: tuple[xr.Dataset, xr.Dataset], changes: dict[str, object], message: str
+def test_arguments_that_make_no_capture(
+    pair: tuple[xr.Dataset, xr.Dataset], argument: str, value: Any, message: str
 ) -> None:
-    """Recordings that do not belong together are refused by band and rule."""
-    first, second = pair
-    seconds = second.exposure_time
-    others = {
-        "unknown": second.assign(exposure_time=seconds * np.nan),
-        "infinite": second.assign(exposure_time=seconds + np.where(seconds == 0, np.inf, 0)),
-        "resting": second.assign(exposure_time=seconds * 0 - 1),
-        "falling": second.assign_coords(time=-second.time),
-        "truth": second.assign(exposure_time=seconds > 0),
-        "crop": second.isel(x=slice(1, None)),
-        "undated": second.drop_attrs(deep=False),
-        "temperatures": second.assign(counts=second.counts.astype("float32")),
-        "picture": second.drop_vars("exposure_time"),
-        "timeless": second.drop_vars("time"),
-    }
-    options = {"bands": BANDS, **changes}
-    other = others.get(str(options.pop("second", "")), second)
+    """Offsets that are no number or lead beyond the recordings, and names that are not two."""
     with pytest.raises((ValueError, TypeError), match=message):
-        readers.two_bands(first, other, **options)  # type: ignore[arg-type]
+        readers.two_bands(*pair, **{"bands": BANDS, argument: value})
 
 
 @pytest.mark.data
@@ -167,13 +158,17 @@ def test_maker_formula(mirror: Path, name: str) -> None:
     assert 240 < expected.min() < expected.max() < 400
 
 
+def constants(f: float = 1.0) -> dict[str, Any]:
+    """Attributes of a camera by its maker."""
+    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": f, "O": -6000}
+    attrs = {f"file_planck_{key}": value for key, value in values.items()}
+    return attrs | {"file_range_min": 233.15, "file_range_max": 423.15}
+
+
 @pytest.mark.parametrize("f", [0.5, 1.0, 1.5, 2.0])
 def test_maker_form(f: float) -> None:
     """For any F the Sakuma-Hattori form is within 0.2 K of the maker's, over the whole range."""
-    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": f, "O": -6000}
-    attrs = {f"file_planck_{key}": value for key, value in values.items()}
-    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
-    made = calibration.maker_response({"8-14": attrs})
+    made = calibration.maker_response({"8-14": constants(f)})
     temperature = np.linspace(233.15, 423.15, 500)
     counts = 16000.0 / (0.0125 * (np.exp(1430.0 / temperature) - f)) + 6000
     error = responses.curve(made, "8-14").inverse(counts) - temperature
@@ -196,13 +191,8 @@ def test_maker_form(f: float) -> None:
 )
 def test_maker_constants_are_checked(key: str, value: float | None, message: str) -> None:
     """A constant that is missing or impossible is named with its band."""
-    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": 1.0, "O": -6000}
-    attrs = {f"file_planck_{name}": number for name, number in values.items()}
-    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
-    if value is None:
-        del attrs[f"file_{key}"]
-    else:
-        attrs[f"file_{key}"] = value
+    attrs = {**constants(), f"file_{key}": value}
+    attrs = {name: number for name, number in attrs.items() if number is not None}
     with pytest.raises(ValueError, match=message):
         calibration.maker_response({"8-14": attrs})
     for kind, files in {"float": attrs, "list": [attrs]}.items():

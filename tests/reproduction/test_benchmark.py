@@ -49,14 +49,6 @@ def test_the_table_says_what_was_measured() -> None:
         assert line in text, text
 
 
-def test_a_series_ends_before_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A size that would take longer than `LONGEST` is left out; bands need a method for them."""
-    monkeypatch.setattr(benchmark, "LONGEST", 5.0)
-    monkeypatch.setattr(benchmark, "seconds_of", lambda _, sizes: sizes["frames"] / 500.0)
-    assert dict(benchmark.series("subspace", "frames")) == {100: 0.2, 300: 0.6, 1000: 2.0}
-    assert dict(benchmark.series("naive", "bands")) == {}
-
-
 @pytest.mark.slow
 def test_a_small_capture_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On disk and in memory: every figure is positive, and the processes' memory holds."""

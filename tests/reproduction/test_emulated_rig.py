@@ -168,26 +168,25 @@ def test_thermocouple_follows_what_it_touches() -> None:
 
 
 def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
-    """Truth is kept and opened by name, and cleared with the emulated recordings."""
-    folder = tmp_path / "made"
-    emulated_rig.clear(folder)
-    assert emulated_rig.truth(folder) == {}
-    emulated_rig.keep_truth(folder, {}, scene=scene(), response=RIG.response())
-    found = emulated_rig.truth(folder)
-    assert set(found) == {"scene", "response"}
-    xr.testing.assert_equal(found["scene"], scene())
-    emulated_rig.clear(folder)
-    assert not folder.exists()
-
-
-@pytest.mark.parametrize("name", ["scene.zarr", "notes.txt"])
-def test_what_was_measured_is_not_cleared(tmp_path: Path, name: str) -> None:
-    """A folder with a recording of hardware or a foreign file is not cleared."""
-    emulated_rig.keep_truth(tmp_path, {}, response=RIG.response())
-    if name.endswith(".zarr"):
-        store.save(RIG.response().assign_attrs(is_simulated=False), tmp_path / name, {})
-    else:
-        (tmp_path / name).write_text("mine", encoding="utf-8")
-    with pytest.raises(FileExistsError, match=name):
-        emulated_rig.clear(tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
+    """Truth is opened by name, and cleared with the emulated recordings; a folder with a recording
+    of hardware or a foreign file is not cleared.
+    """
+    emulated_rig.clear(tmp_path / "none")
+    for name in ("", "scene.zarr", "notes.txt"):
+        folder = tmp_path / f"with {name}"
+        assert emulated_rig.truth(folder) == {}
+        emulated_rig.keep_truth(folder, {}, shown=scene(), response=RIG.response())
+        found = emulated_rig.truth(folder)
+        assert set(found) == {"shown", "response"}
+        xr.testing.assert_equal(found["shown"], scene())
+        if name == "scene.zarr":
+            store.save(RIG.response().assign_attrs(is_simulated=False), folder / name, {})
+        elif name:
+            (folder / name).write_text("mine", encoding="utf-8")
+        if name:
+            with pytest.raises(FileExistsError, match=name):
+                emulated_rig.clear(folder)
+            assert len(list(folder.iterdir())) == 3
+        else:
+            emulated_rig.clear(folder)
+            assert not folder.exists()

@@ -9,7 +9,7 @@ import papermill
 import pytest
 
 from dbthermal import store
-from reproduction import execute, locked, parameters, paths
+from reproduction import execute, locked, parameters
 from reproduction.run import Run
 
 CELL = 'results = "smoke"\nframes = 3\nrecorded = ""\nnoise = [0.1, 1]\ntime_constant = None\n'
@@ -65,74 +65,54 @@ def replaced(monkeypatch: pytest.MonkeyPatch, stand_in: Papermill) -> Papermill:
     return stand_in
 
 
-def test_what_an_earlier_run_left_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While a notebook runs nothing has the name of its results; then all of them are there."""
-    runner = replaced(monkeypatch, Papermill(2))
-    assert execute.execute("full", "03_tiny", {}) == folder / "03_tiny.ipynb"
-    assert runner.seen == [".03_tiny.part.ipynb", "04_other.json"]
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == [".03_tiny.sums", "03_tiny.ipynb", "03_tiny.json", "04_other.json"]
-    assert (folder / "03_tiny.json").read_text() == "new"
-
-
-def test_results_are_on_the_disk_before_the_name_is(
+def test_a_name_stands_for_results_on_the_disk(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A power loss leaves no name of a notebook whose results are only in the system's cache."""
-    replaced(monkeypatch, Papermill(2))
+    """While a notebook runs nothing has the name of its results, nor before they are on the disk:
+    a power loss leaves no name of what is only in the system's cache.
+    """
+    runner = replaced(monkeypatch, Papermill(2))
     synced: list[tuple[Path, bool]] = []
     named = folder / "03_tiny.ipynb"
     monkeypatch.setattr(
         store, "to_disk", lambda places: synced.extend((place, named.exists()) for place in places)
     )
-    execute.execute("full", "03_tiny", {})
+    assert execute.execute("full", "03_tiny", {}) == named
+    assert runner.seen == [".03_tiny.part.ipynb", "04_other.json"]
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [".03_tiny.sums", "03_tiny.ipynb", "03_tiny.json", "04_other.json"]
+    assert (folder / "03_tiny.json").read_text() == "new"
     for name in ("03_tiny.json", ".03_tiny.sums", ".03_tiny.part.ipynb"):
         assert (folder / name, False) in synced
     assert synced[-1] == (folder, True)
 
 
-def test_a_change_while_it_ran_is_newer(
-    folder: Path, project: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A source that changed while the notebook ran is newer than the result."""
+def test_a_change_while_it_ran_is_newer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result is as old as its beginning: a source that changed since is newer."""
     replaced(monkeypatch, Papermill(2))
-    execute.execute("full", "03_tiny", {})
-    source = project / "changed"
-    source.touch()
-    path = folder / "03_tiny.ipynb"
-    assert path.stat().st_mtime < source.stat().st_mtime
     monkeypatch.setattr(time, "time", lambda: 1000.0)
     execute.execute("full", "03_tiny", {})
-    assert path.stat().st_mtime == 1000
+    assert (folder / "03_tiny.ipynb").stat().st_mtime == 1000
 
 
 @pytest.mark.parametrize(
-    ("cells", "error"),
+    "error",
     [
-        (1, papermill.PapermillExecutionError(1, 1, "", "ValueError", "wrong", [])),
-        (1, KeyboardInterrupt()),
-        (1, OSError("no space left")),
-        (1, None),  # papermill takes the end of the kernel by `exit()` for success
+        papermill.PapermillExecutionError(1, 1, "", "ValueError", "wrong", []),
+        KeyboardInterrupt(),
+        OSError("no space left"),
+        None,  # papermill takes the end of the kernel by `exit()` for success
     ],
 )
 def test_an_unfinished_notebook_leaves_nothing_whole(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, cells: int, error: BaseException | None
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException | None
 ) -> None:
     """A notebook that does not reach its end is kept apart, and none of its results is."""
-    replaced(monkeypatch, Papermill(cells, error))
+    replaced(monkeypatch, Papermill(1, error))
     with pytest.raises(type(error) if error else RuntimeError, match=None if error else "cell 1"):
         execute.execute("full", "03_tiny", {})
     assert [path.name for path in folder.iterdir()] == ["04_other.json"]
     assert (folder.parent / "failed/full/03_tiny.ipynb").is_file()
-
-
-def test_results_of_an_unfinished_notebook_are_refused(folder: Path) -> None:
-    """Nothing is read of a notebook that runs, or was killed; its file says which one."""
-    assert paths.finished("full", "03_tiny") == "03_tiny"
-    paths.unfinished("full", "03_tiny").touch()
-    run = Run("03_tiny", {"results": "full", "frames": 3})
-    with pytest.raises(RuntimeError, match=rf"Unfinished notebook '03_tiny'.*'{folder}/\.03_tiny"):
-        run.open("03_tiny")
 
 
 @pytest.mark.parametrize(
@@ -140,10 +120,7 @@ def test_results_of_an_unfinished_notebook_are_refused(folder: Path) -> None:
     [
         ("frmaes: 3", r"Unknown parameter 'frmaes' in '.*a\.yaml'\. Must be one of \['frames',"),
         ("frames: 3\nframes: 4", r"a\.yaml, line 2.*Repeated key 'frames'"),
-        (
-            "frames: '3'",
-            r"Invalid parameter 'frames' in '.*': '3'. Must be a whole number, as 3 is",
-        ),
+        ("frames: '3'", r"Invalid parameter 'frames' in '.*': '3'. Must be a whole number, as 3"),
         ("frames: 3.5", "Must be a whole number"),
         ("frames: true", "Must be a whole number"),
         ("frames: -3", r"Invalid parameter 'frames' = -3 in '.*'. Must be >= 0"),
@@ -157,10 +134,7 @@ def test_results_of_an_unfinished_notebook_are_refused(folder: Path) -> None:
         ("noise: [0.1, x]", "Invalid entry 1 of parameter 'noise' in .*: 'x'. Must be a number"),
         ("plate: [2, 3]", "Must be a mapping"),
         ("plate: {shape: 2}", "Invalid 'shape' of parameter 'plate'.*Must be a list"),
-        (
-            "plate: {shape: [2]}",
-            r"Invalid names \['shape'\] of parameter 'plate' in .* \['shape', 'kind'",
-        ),
+        ("plate: {shape: [2]}", r"Invalid names \['shape'\] of parameter 'plate' in .* 'kind'"),
         ("plate: {shape: [2], kind: a, knid: b}", "Invalid names"),
         ("- frames", "Must be a mapping"),
     ],
@@ -182,19 +156,12 @@ def test_the_full_values_are_complete() -> None:
 
 def test_values_are_taken_in_order(project: Path) -> None:
     """A later file's value replaces an earlier one's, and a text replaces both, once."""
-    for name, text in (
-        ("a", "frames: 4\nrate: 3\nplate: {shape: [], kind: a}"),
-        ("b", "frames: 5"),
-    ):
-        (project / f"{name}.yaml").write_text(text)
     files = [project / "a.yaml", project / "b.yaml"]
+    files[0].write_text("frames: 4\nrate: 3\nplate: {shape: [], kind: a}")
+    files[1].write_text("frames: 5")
     values = parameters.read("03_tiny", files, [("recorded", "there")])
-    assert values == {
-        "frames": 5,
-        "rate": 3,
-        "plate": {"shape": [], "kind": "a"},
-        "recorded": "there",
-    }
+    plate = {"shape": [], "kind": "a"}
+    assert values == {"frames": 5, "rate": 3, "plate": plate, "recorded": "there"}
     with pytest.raises(ValueError, match="Repeated parameter 'recorded' of '03_tiny'"):
         parameters.read("03_tiny", files, [("recorded", "a"), ("recorded", "b")])
     with pytest.raises(ValueError, match="Unknown parameter 'recordings' in the texts"):
@@ -212,10 +179,7 @@ def test_what_papermill_injects_is_checked() -> None:
 
 
 def test_parameters_are_refused_before_the_notebook_runs(
-    folder: Path,
-    project: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    folder: Path, project: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The command says what is wrong, fails, and leaves what is there."""
     (project / "a.yaml").write_text("frmaes: 3")

@@ -69,15 +69,6 @@ def test_border_is_judged_beyond_two_pixels(moved: int | None, right: float, ble
     assert int(kept["bleeding"]) == bleeding
 
 
-def test_lost_frames_are_undone() -> None:
-    """Marked copies of a frame cost at most a quarter of the error, and flag few pixels."""
-    options: dict[str, Any] = {"pixels": {"pixels": 400}, "nuisance": {"share": 0.05}, "seed": 3}
-    measured = nuisances.disturbed("lost frames", **options)
-    rmse, flagged = measured["object_temperature_rmse"].values, measured["flagged"].values
-    assert rmse[1] <= 1.25 * rmse[2]
-    assert flagged[1] < 0.05
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [

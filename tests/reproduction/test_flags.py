@@ -50,13 +50,6 @@ def test_pictures_have_pixels_with_and_without(rates: xr.Dataset) -> None:
     assert float(rows["false_alarms"].max()) < 0.01
 
 
-def test_table_has_the_flags_that_were_expected(rates: xr.Dataset) -> None:
-    """One row for each flag with pixels, and one for all false alarms."""
-    names = [line.split("`")[1] for line in flags.table(rates).splitlines()[2:]]
-    assert {*names} == {*flags.FAULTS, "gray", "completed_from_prior", "no_reflection_pair", "any"}
-    assert names[-1] == "any"
-
-
 def test_every_flag_has_a_scene() -> None:
     """The full table lacks no flag but that of the optimiser, which the default way never sets."""
     listed = readers.read_yaml(paths.params("10_limits"))["cases"]["flags"]

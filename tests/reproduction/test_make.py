@@ -77,9 +77,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def make(*goals: str) -> subprocess.CompletedProcess[str]:
     """Run make to its end."""
-    return subprocess.run(
-        ["make", *goals], capture_output=True, text=True, check=False, timeout=120
-    )
+    return subprocess.run(["make", *goals], capture_output=True, text=True, check=False)
 
 
 @pytest.fixture
@@ -100,15 +98,18 @@ def started() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 
 def wait_for(path: Path) -> None:
     """Wait until a file is there."""
-    end = time.monotonic() + 60
+    end = time.monotonic() + 600  # far beyond any load
     while not path.exists():
         assert time.monotonic() < end, path
         time.sleep(0.01)
 
 
-def numbers(root: Path) -> object:
-    """Headline numbers that the notebook kept."""
-    return json.loads((root / "results/full/01_tiny.json").read_text())["numbers"]
+def assert_goes_on(root: Path) -> None:
+    """Make the notebook, and compare the numbers that it kept."""
+    done = make(TARGET)
+    assert done.returncode == 0, done.stderr
+    kept = json.loads((root / "results/full/01_tiny.json").read_text())
+    assert kept["numbers"] == {"number": 2}
 
 
 Start = Callable[..., subprocess.Popen[bytes]]
@@ -128,14 +129,9 @@ def test_a_killed_notebook_runs_again(checkout: Path, started: Start) -> None:
     assert refused.returncode == 2
     assert "Unfinished notebook '01_tiny' of run 'full'" in refused.stderr
     (checkout / "hold").unlink()
-    again = make(TARGET)
-    assert again.returncode == 0, again.stderr
-    assert numbers(checkout) == {"number": 2}
-    assert sorted(path.name for path in (checkout / "results/full").iterdir()) == [
-        ".01_tiny.sums",
-        "01_tiny.ipynb",
-        "01_tiny.json",
-    ]
+    assert_goes_on(checkout)
+    names = sorted(path.name for path in (checkout / "results/full").iterdir())
+    assert names == [".01_tiny.sums", "01_tiny.ipynb", "01_tiny.json"]
     assert "up to date" in make(TARGET).stdout
 
 
@@ -144,8 +140,8 @@ SIGNALS = {name: getattr(signal, f"SIG{name}") for name in ("TERM", "INT", "HUP"
 
 def wait_for_end(root: Path, process: "subprocess.Popen[bytes]", numbers: list[int]) -> None:
     """Wait until a make and all that it started are no more, and its lock is free."""
-    process.wait(60)
-    end = time.monotonic() + 60
+    process.wait(600)
+    end = time.monotonic() + 600  # far beyond any load
     with (root / locked.LOCK).open() as file:
         while True:
             with suppress(BlockingIOError):
@@ -156,14 +152,21 @@ def wait_for_end(root: Path, process: "subprocess.Popen[bytes]", numbers: list[i
             time.sleep(0.05)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("moment", [".01_tiny.part.ipynb", "01_tiny.json"])
-@pytest.mark.parametrize("victim", [*SIGNALS, "ctrl-c", "group", "kernel"])
+MOMENTS = (".01_tiny.part.ipynb", "01_tiny.json")
+VICTIMS = [(name, moment) for name in (*SIGNALS, "ctrl-c", "group") for moment in MOMENTS]
+FOUR = [("TERM", MOMENTS[1]), ("ctrl-c", MOMENTS[0]), ("KILL", MOMENTS[0]), ("kernel", MOMENTS[1])]
+
+
+@pytest.mark.parametrize(
+    ("victim", "moment"),
+    [pytest.param(*one, marks=pytest.mark.slow) for one in FOUR]
+    + [pytest.param(*one, marks=pytest.mark.long) for one in VICTIMS if one not in FOUR],
+)
 def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment: str) -> None:
     """Without make, the runner or the kernel nothing goes on, and the next make does all anew."""
     (checkout / "hold").touch()
     process = started(TARGET)
-    wait_for(checkout / "results/full" / (moment if victim != "kernel" else "01_tiny.json"))
+    wait_for(checkout / "results/full" / moment)
     running = locked.descendants(process.pid)
     assert len(running) >= 3
     if victim == "kernel":
@@ -176,9 +179,7 @@ def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment:
     assert process.returncode != 0
     (checkout / "hold").unlink()
     assert not (checkout / TARGET).exists()
-    again = make(TARGET)
-    assert again.returncode == 0, again.stderr
-    assert numbers(checkout) == {"number": 2}
+    assert_goes_on(checkout)
 
 
 @pytest.mark.long
@@ -193,9 +194,7 @@ def test_killed_at_any_moment(checkout: Path, started: Start, seed: int) -> None
     start = time.monotonic()
     wait_for_end(checkout, process, running)
     print(f"{name} to {len(running)} processes: all ended after {time.monotonic() - start:.1f} s")
-    again = make(TARGET)
-    assert again.returncode == 0, again.stderr
-    assert numbers(checkout) == {"number": 2}
+    assert_goes_on(checkout)
 
 
 MAKER = """\
@@ -266,22 +265,15 @@ def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) 
     assert not list(checkout.rglob("pwned"))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("JOBS", "2; touch pwned", "Invalid JOBS '2; touch pwned'. Must be a whole number"),
-        ("JOBS", "0", "Invalid JOBS '0'"),
-        ("DBTHERMAL_DATA", "$(touch pwned)", "Invalid DBTHERMAL_DATA '$(touch pwned)'. Must name"),
-    ],
-)
-def test_values_are_refused(
-    checkout: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
-) -> None:
+def test_values_are_refused(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A value that make cannot use is refused before anything runs."""
-    monkeypatch.setenv(name, value)
-    done = make("results/inputs.txt")
-    assert done.returncode == 2
-    assert message in done.stderr
+    values = [("JOBS", "2; touch pwned"), ("JOBS", "0"), ("DBTHERMAL_DATA", "$(touch pwned)")]
+    for name, value in values:
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            done = make("results/inputs.txt")
+        assert done.returncode == 2
+        assert f"Invalid {name} '{value}'. Must" in done.stderr
     assert not list(checkout.rglob("pwned"))
     assert not (checkout / "results").exists()
 
@@ -323,9 +315,7 @@ def test_an_update_that_fails_leaves_the_environment(checkout: Path, python: str
     assert "is up to date" not in make("install", python).stderr
 
 
-def test_an_interrupted_install_is_done_anew(
-    checkout: Path, python: str, started: Callable[..., subprocess.Popen[bytes]]
-) -> None:
+def test_an_interrupted_install_is_done_anew(checkout: Path, python: str, started: Start) -> None:
     """What a killed pip left is put aside until a new environment is whole, then it goes."""
     (checkout / "pip").write_text("mkdir -p .venv/lib/half; touch .venv/lib/half/file; sleep 60")
     os.utime(checkout / ".venv/installed", (1e9, 1e9))

@@ -1,5 +1,6 @@
 """The project's folders are located from inside the project, or through the package."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -38,51 +39,39 @@ def test_missing_root_names_both_starts(tmp_path: Path, monkeypatch: pytest.Monk
         paths.root()
 
 
-def test_one_stem_names_all(project: Path) -> None:
-    """Parameters, results and cached experiments share their stem."""
-    assert paths.params("03_simulation") == project / "params" / "03_simulation.yaml"
-    assert paths.result("full", "03_simulation", "_scene.png") == (
-        project / "results" / "full" / "03_simulation_scene.png"
-    )
-    assert paths.cells("03_simulation") == project / "results" / "cells" / "03_simulation"
-
-
-def test_fixed_places(project: Path) -> None:
-    """The manifest and the fetched files lie at the root."""
-    assert paths.manifest() == project / "data_manifest.yaml"
-    assert paths.data() == project / "data"
-    assert paths.session("scene") == project / "params" / "sessions" / "scene.yaml"
-    with pytest.raises(ValueError, match="Invalid session 'a/b'"):
-        paths.session("a/b")
-
-
-def test_what_was_measured_lies_apart(project: Path) -> None:
-    """Recordings of hardware lie apart from the results that tasks remove."""
-    assert paths.recordings("lab") == project / "recordings" / "lab"
-    made = paths.emulated("full", "00_acquisition")
-    assert made == project / "results" / "full" / "00_acquisition"
-    for run in ("..", "a/b"):
-        with pytest.raises(ValueError, match="Invalid run"):
-            paths.recordings(run)
+def test_places(project: Path) -> None:
+    """All of a stem has its name; recordings of hardware lie apart from what tasks remove."""
+    stem = "03_simulation"
+    places = {
+        "params/03_simulation.yaml": paths.params(stem),
+        "results/full/03_simulation_scene.png": paths.result("full", stem, "_scene.png"),
+        "results/cells/03_simulation": paths.cells(stem),
+        "data_manifest.yaml": paths.manifest(),
+        "data": paths.data(),
+        "params/sessions/scene.yaml": paths.session("scene"),
+        "recordings/lab": paths.recordings("lab"),
+        "results/full/00_acquisition": paths.emulated("full", "00_acquisition"),
+    }
+    assert {project / name: place for name, place in places.items()} == {
+        place: place for place in places.values()
+    }
 
 
 @pytest.mark.usefixtures("project")
-@pytest.mark.parametrize("run", ["", "..", "a/b", "Full"])
-def test_run_is_one_folder_name(run: str) -> None:
-    """A run's name with a path in it raises an error."""
-    with pytest.raises(ValueError, match=f"Invalid run '{run}'. Must be"):
-        paths.results(run)
-
-
-@pytest.mark.parametrize("stem", ["", "simulation", "3_simulation", "03_a/b", "03_simulation.zarr"])
-def test_stem_is_numbered(stem: str) -> None:
-    """A stem starts with the notebook's number and holds no folder or suffix."""
-    with pytest.raises(ValueError, match=f"Invalid stem '{stem}'. Must be two digits"):
-        paths.params(stem)
-
-
-@pytest.mark.parametrize("ending", ["", "zarr", "/../a.json", "_scene"])
-def test_ending_has_a_suffix(ending: str) -> None:
-    """A result's ending has a suffix and no folder."""
-    with pytest.raises(ValueError, match=f"Invalid ending '{ending}'. Must be"):
-        paths.result("full", "03_simulation", ending)
+def test_names_are_no_paths() -> None:
+    """A run is one folder's name, a stem begins with two digits, an ending has a suffix."""
+    table: list[tuple[str, Callable[[str], Path], tuple[str, ...]]] = [
+        ("run", paths.results, ("", "..", "a/b", "Full")),
+        ("run", paths.recordings, ("..", "a/b")),
+        ("session", paths.session, ("a/b",)),
+        ("stem", paths.params, ("", "simulation", "3_simulation", "03_a/b", "03_simulation.zarr")),
+        (
+            "ending",
+            lambda name: paths.result("full", "03_simulation", name),
+            ("", "zarr", "/../a.json", "_scene"),
+        ),
+    ]
+    for kind, place, names in table:
+        for name in names:
+            with pytest.raises(ValueError, match=f"Invalid {kind} '{name}'. Must be"):
+                place(name)

@@ -23,10 +23,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return Run("03_simulation", {"results": "smoke", "seed": 2, "other": object()})
 
 
-@pytest.fixture
-def dataset() -> xr.Dataset:
-    """Dataset of three values."""
-    return xr.Dataset({"value": ("n", np.arange(3.0))})
+DATASET = xr.Dataset({"value": ("n", np.arange(3.0))})
 
 
 def doubled(value: float) -> xr.Dataset:
@@ -41,10 +38,10 @@ def test_parameters_of_the_run(run: Run) -> None:
         Run("03_simulation", {"results": "smoke"})
 
 
-def test_results_lie_under_the_stem(run: Run, dataset: xr.Dataset, tmp_path: Path) -> None:
+def test_results_lie_under_the_stem(run: Run, tmp_path: Path) -> None:
     """Datasets, figures, texts and numbers are saved; figures and numbers are handed back."""
     figure, _ = figures.drawing.canvas(1, 1, (2.0, 2.0))
-    run.save(dataset)
+    run.save(DATASET)
     run.text("# Table", "_table")
     assert run.figure(figure, "_scene") is figure
     assert run.finish({"rmse_K": 0.2}) == {"rmse_K": 0.2}
@@ -55,19 +52,14 @@ def test_results_lie_under_the_stem(run: Run, dataset: xr.Dataset, tmp_path: Pat
     assert saved["provenance"] == run.provenance
 
 
-def test_an_opened_result_is_an_input(run: Run, dataset: xr.Dataset, tmp_path: Path) -> None:
-    """A result of another notebook is noted as an input with its checksum."""
+def test_inputs_are_noted(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result of another notebook by its checksum; a collection that is not available is none."""
     path = tmp_path / "results" / "smoke" / "01_calibration_response.zarr"
-    store.save(dataset, path, {})
-    assert run.open("01_calibration", "_response").equals(dataset)
-    assert run.provenance["inputs"] == {"01_calibration_response": store.checksum(path)}
-
-
-def test_missing_files_are_no_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A collection that is not available is empty, and not noted as an input."""
+    store.save(DATASET, path, {})
+    assert run.open("01_calibration", "_response").equals(DATASET)
     monkeypatch.setattr(manifest, "available", lambda _: False)
     assert run.data("scenes") == {}
-    assert run.provenance["inputs"] == {}
+    assert run.provenance["inputs"] == {"01_calibration_response": store.checksum(path)}
 
 
 def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,12 +35,6 @@ OBJECT, BACKGROUND = "object_temperature", "background_temperature"
 def rng(seed: int = 1) -> np.random.Generator:
     """Seeded random numbers."""
     return np.random.default_rng(seed)
-
-
-@pytest.fixture
-def scan(mirror: Path) -> trimesh.Trimesh:
-    """The Stanford bunny."""
-    return trimesh.load_mesh(mirror / "meshes" / "stanford-bunny.obj", process=False)
 
 
 @pytest.mark.parametrize("name", TWINS)
@@ -84,7 +77,8 @@ def obstructed(stage: Stage, time: np.ndarray) -> bool:
     return False
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) for name in TWINS])
+@pytest.mark.long
+@pytest.mark.parametrize("name", TWINS)
 def test_nothing_comes_before_the_object(name: str) -> None:
     """No actor hides the object from the camera in 35 s, with any of three seeds."""
     for seed in (1, 2, 3):
@@ -110,22 +104,13 @@ def test_a_scan_is_stood_on_the_table() -> None:
     np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
 
 
-@pytest.mark.data
-def test_the_whole_scan_is_seen(scan: trimesh.Trimesh) -> None:
-    """All of the scanned bunny is seen, its head in the left half, and nothing comes before it."""
-    stage = solids.bunny(LONG, rng(), scan=scan)
-    assert inside(stage)
-    head = stage.mesh.vertices[:, 2] > 0.11
-    assert stage.mesh.vertices[head, 0].mean() < -0.01  # m
-    assert not obstructed(stage, LONG.time[::2])
+VESSELS = ["wineglass", pytest.param("coffee_pot", marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize(
-    ("name", "celsius"),
-    [("wineglass", 63.6), pytest.param("coffee_pot", 63.1, marks=pytest.mark.slow)],
-)
-def test_vessels_peak_where_the_paper_s_did(name: str, celsius: float) -> None:
+@pytest.mark.parametrize("name", VESSELS)
+def test_vessels_peak_where_the_paper_s_did(name: str) -> None:
     """The outer wall at the thermocouple peaks at 63.6 and 63.1 degrees Celsius."""
+    celsius = {"wineglass": 63.6, "coffee_pot": 63.1}[name]
     scene = twins.twin(name, SLOW, rng())
     readings = twins.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.0, bead=1)
     np.testing.assert_allclose(float(readings.max()) - 273.15, celsius, rtol=0, atol=0.15)  # K
@@ -221,12 +206,10 @@ def test_parallax_is_that_of_a_mirror_image() -> None:
     np.testing.assert_allclose(shift, stage.project(image) - [row, column], rtol=0, atol=1.0)
 
 
-@pytest.mark.parametrize("name", ["wineglass", pytest.param("coffee_pot", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", VESSELS)
 def test_nothing_aliases(name: str) -> None:
-    """Resampled by the true shift, the second band's reflection is that of the first.
-
-    What is left is a tenth of the change: the bodies are at several distances, and square pixels
-    pass a little of what is finer than they are.
+    """Resampled by the true shift, the second band's reflection is that of the first, but for a
+    tenth of the change: bodies are at several distances, pixels pass what is finer than they are.
     """
     scene = twins.twin(name, LARGE, rng())
     seen = scene.assign(emissivity=0.0 * scene["emissivity"] + 1e-6)

@@ -134,21 +134,6 @@ def test_unknown_displacement() -> None:
     assert parallax.shared_outline(everywhere, unknown).all()
 
 
-@pytest.mark.parametrize("first", [0, 17, 30])
-def test_first_frame(first: int) -> None:
-    """It is found from the change of both and stands out, though what moves is displaced."""
-    scene, reflection = stage(4)
-    theirs = np.abs(reflection - reflection.mean(axis=0))[first : first + 90]
-    theirs = theirs / theirs.max(axis=(1, 2), keepdims=True)
-    movie = labelled(shown(scene))
-    result = xr.DataArray(theirs, dims=("time", "y", "x"))
-    found, margin = published.first_frame(movie, result, outline())
-    assert found == first
-    assert margin > 3
-    with pytest.raises(ValueError, match=r"Invalid results of \(90, 72, 112\).*\(80, 72, 112\)"):
-        published.first_frame(movie[:, :80], result, outline())
-
-
 def test_scene_of_fewer_results(tmp_path: Path) -> None:
     """Videos whose results show fewer frames are read, compared in four ways, and reported."""
     scene, reflection = stage(5)
@@ -161,6 +146,9 @@ def test_scene_of_fewer_results(tmp_path: Path) -> None:
     files = {name: encode(tmp_path / name, frames) for name, frames in paths.items()}
     read = published.scene(files, "toy", "toys")
     assert (read.first, read.movie.sizes["time"]) == (20, 90)
+    assert read.margin > 3
+    with pytest.raises(ValueError, match=r"Invalid results of \(90, 72, 112\).*\(80, 72, 112\)"):
+        published.first_frame(read.movie[:, :80], read.theirs["uncalib"]["value"], read.outline)
     assert float((read.outline == OUTLINE).mean()) > 0.98
     compared, left_out = published.compare_all({"toy": read}, 20)
     assert left_out == {}

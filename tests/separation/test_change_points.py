@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import held
 
 from dbthermal import schema, separation, simulation
 from dbthermal.simulation import Rig
@@ -53,9 +54,7 @@ def test_jump_is_found_and_modelled() -> None:
     flagged = result["status"].values[0] & JUMP != 0
     score = np.abs(errors(scene, result)) / result["object_temperature_std"].values[:, 0]
     beside = score[number, np.arange(400)]  # the frames before and after
-    print(
-        f"{100 * flagged.mean():.1f} % flagged; intervals at the jump {np.mean(beside < 1.96):.3f}"
-    )
+    print(f"{flagged.mean():.3f} flagged; intervals at the jump {np.mean(beside < 1.96):.3f}")
     assert flagged.mean() > 0.98
     assert np.mean(beside < 1.96) > 0.92
     assert np.isfinite(errors(scene, result)).mean() > 0.98
@@ -64,26 +63,9 @@ def test_jump_is_found_and_modelled() -> None:
 def test_what_takes_a_second_is_no_jump() -> None:
     """An object that changes by 6 K in 1 s has true intervals, mostly without a flag."""
     scene, result = experiments.run_case({**GLASS, "jump": SLOW}, RIG, TIME, 400, seed=1)
-    good = result["status"].values[0] == 0
-    within = np.abs(errors(scene, result)) < 1.96 * result["object_temperature_std"].values[:, 0]
-    print(f"{good.mean():.3f} without a flag; intervals hold in {within[:, good].mean():.3f}")
-    assert good.mean() > 0.95
-    assert 0.92 <= within[:, good].mean() <= 0.98
-
-
-@pytest.mark.parametrize(
-    "background",
-    [{}, {"amplitude": 12.0}, {"drift": 5.0}]
-    + [{"kind": "random walk", "correlation_time": time} for time in (0.3, 3.0, 30.0)],
-    ids=str,
-)
-def test_nothing_jumps_where_nothing_jumps(background: dict[str, Any]) -> None:
-    """Fewer than 1 % of clean pixels are flagged as jumping, for any background."""
-    case = {**GLASS, "stop": 60, "background": background}
-    _, result = experiments.run_case(case, Rig(highest=370.0), TIME, 400, seed=3)
-    share = float((result["status"].values & JUMP != 0).mean())
-    print(f"{background}: {100 * share:.2f} % said to jump")
-    assert share < 0.01
+    good = result["status"] == 0
+    assert float(good.mean()) > 0.95
+    assert 0.92 <= held(result, scene, where=good) <= 0.98
 
 
 @settings(max_examples=15)
@@ -112,17 +94,10 @@ def test_jump_beside_a_shutter_event(height: int) -> None:
     capture = simulation.observe(moved, response, np.random.default_rng(6))
     closed = (TIME >= 20.0).astype(int)
     shifted = capture["counts"] + height * xr.DataArray(closed, dims="time")
-    result = separation.solve(
-        capture.assign(
-            counts=shifted.transpose(*capture["counts"].dims), segment=("time", closed)
-        ).assign(counts=lambda c: c["counts"].assign_attrs(capture["counts"].attrs)),
-        response,
-    )
-    error = errors(moved, result)
-    within = np.abs(error) < 1.96 * result["object_temperature_std"].values[:, 0]
-    share = float(within[np.isfinite(error)].mean())
+    counts = capture["counts"].copy(data=shifted.transpose(*capture["counts"].dims))
+    result = separation.solve(capture.assign(counts=counts, segment=("time", closed)), response)
     jumping = result["status"].values[0] & JUMP != 0
-    print(f"camera's step {height} counts: {jumping.mean():.3f} flagged, intervals {share:.3f}")
+    print(f"camera's step {height} counts: {jumping.mean():.3f} flagged")
     assert jumping.mean() > 0.9
-    assert share >= 0.92
-    assert np.isfinite(error).mean() > 0.3
+    assert held(result, moved) >= 0.92
+    assert np.isfinite(errors(moved, result)).mean() > 0.3

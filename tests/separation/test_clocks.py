@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from scenes import held
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
@@ -43,9 +44,8 @@ def seen_at(
     """Scene and capture of glass that warms in the real time, people passing frame by frame."""
     rng = np.random.default_rng(seed)
     since = time - time[0]
-    quick = (
-        not slow and since[-1] > 5.0 and np.sum(since < 20.0) > 150
-    )  # enough frames for rapid warming
+    # Enough frames for rapid warming.
+    quick = not slow and since[-1] > 5.0 and np.sum(since < 20.0) > 150
     constants = (8.0, 20.0) if quick else (0.25 * since[-1], 0.6 * since[-1])  # s
     passing, warming = (
         simulation.independent_pixels(
@@ -60,9 +60,7 @@ def seen_at(
 
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_real_times_are_as_good_as_even_ones(clock: str) -> None:
-    """At any times the object is known as at even ones, no pixel is flagged, and the 95 % intervals
-    hold in 93 to 98 %.
-    """
+    """At any times the object is known as at even ones, no pixel is flagged, intervals hold."""
     errors: list[npt.NDArray[np.float64]] = []
     results: list[xr.Dataset] = []
     for time in (EVEN, CLOCKS[clock]):
@@ -111,31 +109,24 @@ def test_no_real_clock_is_refused() -> None:
 
 @pytest.mark.parametrize("place", [60, 175, 300])
 def test_a_jump_beside_a_pause_is_found(place: int) -> None:
-    """A jump of the object is found at its frame in a recording that pauses for an hour, and what
-    is found has calibrated uncertainty.
-    """
+    """A jump is found at its frame in a recording that pauses for an hour, with true intervals."""
     time = EVEN + 3600.0 * (FRAME >= 175)
     scene, _ = seen_at(time, 100, seed=6, slow=True)
     step = 6.0 * (scene["time"] >= time[place])
     moved = scene.assign(object_temperature=scene["object_temperature"] + step)
     capture = simulation.observe(moved, RIG.response(), np.random.default_rng(7))
     result = separation.solve(capture, RIG.response())
-    error = (result["object_temperature"] - moved["object_temperature"]).values[:, 0]
-    score = np.abs(error) / result["object_temperature_std"].values[:, 0]
-    covered = float(np.mean(score[np.isfinite(error)] < 1.96))
     jumping = result["status"].values[0] & Status.OBJECT_JUMP != 0
-    print(f"jump at {time[place]:.1f} s: cover {covered:.3f}, {100 * jumping.mean():.0f} % flagged")
-    assert covered > 0.92
-    assert np.isfinite(error).mean() > 0.9
+    print(f"jump at {time[place]:.1f} s: {100 * jumping.mean():.0f} % flagged")
+    assert held(result, moved) > 0.92
+    assert float(result["object_temperature"].notnull().mean()) > 0.9
     if place != 175:  # a jump in the pause is not sudden: the object has had an hour
         assert jumping.mean() > 0.95
-        assert np.mean(score[place] < 1.96) > 0.85  # of 100 pixels
+        assert held(result.isel(time=[place]), moved) > 0.85  # of 100 pixels
 
 
 def test_memory_is_that_of_the_frames() -> None:
-    """A clock of nanoseconds, and one with a pause of 30 years, take no more memory than an even
-    one.
-    """
+    """A clock of nanoseconds, or with a pause of 30 years, takes no more memory than another."""
     peaks = []
     for time in (EVEN, CLOCKS["nanoseconds"], CLOCKS["a pause of 30 years"]):
         scene, _ = seen_at(time, 50, seed=1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
-from scenes import field
+from scenes import field, held
 
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation, simulation
@@ -21,12 +21,6 @@ TIME = np.arange(200) / 10.0
 SMALL = Picture(shape=(20, 24))
 NOBODY = replace(SMALL, walkers=1, warmer=(0.0, 0.0))
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
-COMPLETED = (
-    Status.COMPLETED_FROM_MATERIAL
-    | Status.COMPLETED_FROM_PRIOR
-    | Status.COMPLETED_FROM_SURROUNDINGS
-    | Status.COMPLETED_FRAMES
-)
 
 
 def draw(picture: Picture, seed: int, *emissivity: float) -> Case:
@@ -63,15 +57,12 @@ def test_background_behind_a_measured_object_changes_as_it_does(temperature: flo
         for one in (scene, whole)
     )
     share = float((found * true).sum() / (true**2).where(found.notnull()).sum())
-    inside = abs(whole["background_temperature"] - scene["background_temperature"]) < (
-        1.96 * whole["background_temperature_std"]
-    )
-    hold = float(inside.where(constant).mean())
-    print(f"{temperature:g} K: {share:.3f} of the change, intervals hold {hold:.3f}")
+    print(f"{temperature:g} K: {share:.3f} of the change")
     assert 0.9 < share < 1.1
-    assert hold > 0.9
+    assert held(whole, scene, "background_temperature", constant) > 0.9
 
 
+@pytest.mark.slow
 def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
     """Two cameras see two backgrounds there: what one band shows of its own is no emission."""
     picture = Picture(shape=(24, 64), walkers=2, warmer=(10.0, 12.0))
@@ -85,46 +76,32 @@ def test_pixels_without_a_pair_are_completed_from_their_material() -> None:
     whole = separation.separate(capture, RESPONSE, reflection_shift=known, materials=labels)
     beyond = (whole["status"] & int(Status.NO_REFLECTION_PAIR)) != 0
     off = abs(whole["emissivity"] - scene["emissivity"]).where(beyond)[..., :14]
-    error = abs(whole["object_temperature"] - scene["object_temperature"]).where(beyond)
-    cover = float((error < 1.96 * whole["object_temperature_std"]).where(beyond).mean())
-    print(f"emissivities off by {float(off.max()):.3f}, intervals hold {cover:.3f}")
+    print(f"emissivities off by {float(off.max()):.3f}")
     assert float(beyond[:, :14].mean()) > 0.9
     assert float(off.max()) < 0.1
-    assert cover > 0.9
+    assert held(whole, scene, where=beyond) > 0.9
 
 
 def test_known_material_and_surroundings_narrow_the_bars() -> None:
     """The table's glass and a room stated within 0.3 K leave a fraction of the library's bar."""
     scene, capture, alone = draw(NOBODY, 3, 0.86, 0.72)
     wide = separation.complete(alone, capture, RESPONSE)
-    narrow = separation.complete(
-        alone,
-        capture,
-        RESPONSE,
-        surroundings=ROOM,
-        surroundings_std=0.3,
-        prior="plate window glass",
-    )
-    name = "object_temperature"
-    error = abs(narrow[name] - scene[name])
-    assert float(narrow[f"{name}_std"].mean()) < 0.6 * float(wide[f"{name}_std"].mean())
-    assert float((error < 1.96 * narrow[f"{name}_std"]).mean()) > 0.9
+    room: dict[str, Any] = {"surroundings": ROOM, "surroundings_std": 0.3}
+    narrow = separation.complete(alone, capture, RESPONSE, **room, prior="plate window glass")
+    stds = [float(one["object_temperature_std"].mean()) for one in (narrow, wide)]
+    assert stds[0] < 0.6 * stds[1]
+    assert held(narrow, scene) > 0.9
 
 
 @pytest.mark.parametrize("gray", [0.86, 0.92])
 def test_a_gray_scene_tells_little_of_the_room(gray: float) -> None:
-    """The level that gray pixels show is no surer than that of one: they share the prior's error.
-
-    Taken as that of 480 measurements it was up to 10 stated deviations off.
-    """
+    """The level that gray pixels show is no surer than that of one: they share its error."""
     scene, capture, alone = draw(SMALL, 11, gray, gray)
     whole = separation.complete(alone, capture, RESPONSE)
     assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).all())
-    error = abs(whole["background_temperature"] - scene["background_temperature"])
-    within = float((error < 1.96 * whole["background_temperature_std"]).mean())
     apart = whole.attrs["surroundings"] - ROOM
-    print(f"gray {gray}: {within:.2f} hold, {apart:.1f} +- {whole.attrs['surroundings_std']:.1f} K")
-    assert within > 0.8
+    print(f"gray {gray}: {apart:.1f} +- {whole.attrs['surroundings_std']:.1f} K")
+    assert held(whole, scene, "background_temperature") > 0.8
     assert abs(apart) < 3.0 * whole.attrs["surroundings_std"]
 
 
@@ -149,28 +126,11 @@ def test_gaps_of_single_pixels(half: Case) -> None:
     whole = separation.complete(alone, lost, RESPONSE)
     measured = alone["object_temperature"].notnull().any("time")
     gaps = alone["object_temperature"].isnull() & measured
-    error = abs(whole["object_temperature"] - scene["object_temperature"])
-    within = float((error < 1.96 * whole["object_temperature_std"]).where(gaps).mean())
-    print(f"bridged: {float(error.where(gaps).median()):.3f} K, intervals hold {within:.3f}")
     assert bool(whole["object_temperature"].notnull().all())
     assert (whole.attrs["frames_missing"], whole.attrs["frames_bridged"]) == (0, 9)
     xr.testing.assert_equal(whole["bridged"].where(measured), gaps.where(measured))
     assert not bool((whole["status"] & int(Status.COMPLETED_FRAMES)).any())
-    assert within > 0.9
-
-
-def test_frames_that_no_pixel_has(half: Case) -> None:
-    """Frames without data of a camera stay empty, are counted, and leave no flag at a pixel."""
-    _, capture, _ = half
-    frames = [0, 50, 51, 52, 53, 54, 55, 120, 199]
-    lost = capture.copy(deep=True)
-    lost["counts"].values[1, frames] = np.nan
-    alone = separation.solve(lost, RESPONSE)
-    whole = separation.complete(alone, lost, RESPONSE)
-    empty = whole["object_temperature"].isnull()
-    np.testing.assert_array_equal(np.flatnonzero(empty.all(("y", "x"))), frames)
-    assert int(empty.any(("y", "x")).sum()) == whole.attrs["frames_missing"] == len(frames)
-    assert bool((whole["status"].where(alone["status"] == 0, 0) == 0).all())
+    assert held(whole, scene, where=gaps) > 0.9
 
 
 @pytest.mark.parametrize(
@@ -179,23 +139,11 @@ def test_frames_that_no_pixel_has(half: Case) -> None:
         ({"prior": emissivity_of(1.2, 0.9)}, r"Invalid emissivities \[1.2, 0.9\] of the prior"),
         ({"prior": "glas"}, "Unknown prior 'glas'"),
         ({"surroundings": 22.0}, r"Invalid surroundings \[K\] 22.0.* not in degrees Celsius"),
-        (
-            {"surroundings": 2e4},
-            r"Invalid surroundings \[K\] 20000.0. Must lie in",
-        ),
+        ({"surroundings": 2e4}, r"Invalid surroundings \[K\] 20000.0. Must lie in"),
         ({"workers": 0}, "Invalid number of workers 0. Must be a whole number, at least 1"),
-        (
-            {"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})},
-            "Invalid units 'degC' of surroundings",
-        ),
-        (
-            {"surroundings": 295.0, "surroundings_std": 0.0},
-            r"Invalid surroundings_std \[K\] 0.0",
-        ),
-        (
-            {"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))},
-            "Invalid size 3 of 'y' of the pool",
-        ),
+        ({"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})}, "Invalid units 'degC' of"),
+        ({"surroundings": 295.0, "surroundings_std": 0.0}, r"Invalid surroundings_std \[K\] 0.0"),
+        ({"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))}, "Invalid size 3 of"),
     ],
 )
 def test_wrong_knowledge_is_named(half: Case, changes: dict[str, Any], message: str) -> None:
@@ -226,11 +174,7 @@ def test_bands_of_no_library_are_refused_before_the_work() -> None:
 
 @pytest.mark.long
 def test_unknown_materials_hold() -> None:
-    """Nobody walks before materials of the libraries: intervals hold over these, of each or none.
-
-    What completes the pixels of one material, of which nothing is measured, is one prior: its error
-    is that of all of them.
-    """
+    """Nobody walks before materials of the libraries: one prior completes all pixels of each."""
     mixture, rng = emissivity_module.library_mixture(list(RIG.bands)), np.random.default_rng(31)
     parts = mixture["weight"].values, mixture["mean"].values, mixture["covariance"].values
     covers, errors = list[float](), list[list[float]]()
@@ -242,20 +186,14 @@ def test_unknown_materials_hold() -> None:
         scene, capture, alone = draw(replace(NOBODY, shape=(4, 6)), len(covers), *material)
         whole = separation.complete(alone, capture, RESPONSE)
         reading = separation.solve(capture, RESPONSE, "apparent")
-        off = [
-            abs(one["object_temperature"] - scene["object_temperature"]) for one in (whole, reading)
-        ]
+        truth = scene["object_temperature"]
+        off = [abs(one["object_temperature"] - truth) for one in (whole, reading)]
         assert bool(off[0].notnull().all())
         covers.append(float((off[0] < 1.96 * whole["object_temperature_std"]).mean()))
         errors.append([float(one.median()) for one in off])
     worse = np.array([completed > read for completed, read in errors])
     median = np.median(errors, axis=0)
-    more = max(completed / read for completed, read in errors)
-    print(
-        f"{len(covers)} materials: intervals hold {np.mean(covers):.3f}; {median[0]:.3f} K, "
-        f"reading {median[1]:.3f} K; farther off than that in {worse.mean():.3f}, "
-        f"at most {more:.2f} times"
-    )
+    print(f"intervals hold {np.mean(covers):.3f}; {median} K; worse in {worse.mean():.3f}")
     assert 0.9 <= np.mean(covers) <= 0.99
     # A prior is wrong of one material in twenty.
     assert worse.mean() <= 0.1

@@ -1,10 +1,8 @@
 """Path of the data from `solve` to the object temperature: few modules, few returns.
 
-A reader follows the calls of one solve and reads every function when it is first called. A room is
-a module of the package. A return is a step back into a room of `separation` that was left before,
-to read another function of it. The methods of the records that are handed along (`Tile`,
-`Estimate`) are read where the record is met, and the modules below `separation` are looked up from
-anywhere: neither counts as a return.
+A reader reads every function when it is first called. A room is a module; a return is a step back
+into a room of `separation` that was left before. Methods of records that are handed along, and
+modules below `separation`, which are looked up from anywhere, do not count.
 """
 
 import sys

@@ -25,9 +25,8 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
     counts[1, :, 8, 20] = np.nan
     counts[1, 100:103, 12, 30] = np.nan
     counts[0, 50, 14, 40] = np.nan
-    result = separation.solve(
-        capture.assign(counts=counts), RIG.response(), reflection_shift=field(shift)
-    )
+    lossy = capture.assign(counts=counts)
+    result = separation.solve(lossy, RIG.response(), reflection_shift=field(shift))
     lost = np.argwhere((result["status"] & int(Status.INVALID_SAMPLES)).values != 0)
     # The two pixels whose samples of the second camera lie half on it.
     assert lost.tolist() == [[8, 22], [8, 23]]
@@ -48,8 +47,7 @@ def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     noisy = counts + np.random.default_rng(1).normal(0.0, 3.0, counts.shape)
     bad = capture.assign(counts=noisy.astype(np.float32), status=(("y", "x"), stuck))
     result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
-    error = abs(result["object_temperature"] - scene.truth["object_temperature"])
-    error = error.mean("time")
+    error = abs(result["object_temperature"] - scene.truth["object_temperature"]).mean("time")
     error = error.where(result["status"] == 0)
     print(f"without a flag {float(error.notnull().mean()):.2f}, largest error {error.max():.2f} K")
     assert float(error.notnull().mean()) > 0.75
@@ -63,10 +61,8 @@ def test_known_emissivities_and_rapid_heating() -> None:
     options: dict[str, Any] = {"method": "calibrated", "emissivity": emissivity_of(*GLASS)}
     for name, moved in (("apart", shift), ("one place", np.zeros_like(shift))):
         scene = painted(4, picture=picture, time=TIME, shift=moved)
-        result = separation.solve(
-            scene.capture, scene.response, reflection_shift=field(moved), **options
-        )
-        got[name] = judged(scene, result)
+        options["reflection_shift"] = field(moved)
+        got[name] = judged(scene, separation.solve(scene.capture, scene.response, **options))
     print(got)
     assert got["apart"]["measured"] > 0.85
     assert got["apart"]["typical"] < 0.8 * got["one place"]["typical"]
@@ -110,9 +106,8 @@ def test_bad_field_is_a_clear_error(what: str) -> None:
     bad, message = BAD[what]
     rng = np.random.default_rng(1)
     flat = np.full((TIME.size, *SMALL.shape), 300.0)
-    capture = simulation.observe(
-        simulation.scene(TIME, flat, flat, emissivity_of(*GLASS)), RIG.response(), rng
-    )
+    scene = simulation.scene(TIME, flat, flat, emissivity_of(*GLASS))
+    capture = simulation.observe(scene, RIG.response(), rng)
     capture = capture.assign_coords(x=np.arange(48.0))
     with pytest.raises(ValueError, match=message):
         separation.solve(capture, RIG.response(), reflection_shift=bad)

@@ -1,10 +1,13 @@
 """Gray and nearly gray bodies: what cannot be separated has a flag, or an honest error bar."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
 from attack.scenes import counts_of
+from scenes import held
 
 from dbthermal import calibration, separation, simulation
 from dbthermal.schema import Status
@@ -62,11 +65,8 @@ def independent(noise: tuple[float, ...], emissivity: Floats, seed: int, frames:
     ]
     label = {"band": list(names)}
     grid = np.linspace(263.15, 353.15, 19)
-    blackbody = xr.DataArray(
-        [counts_of(name, grid) for name in names],
-        dims=("band", "temperature"),
-        coords=label | {"temperature": grid},
-    )
+    seen = [counts_of(name, grid) for name in names]
+    blackbody = xr.DataArray(seen, label | {"temperature": grid}, ("band", "temperature"))
     levels = xr.DataArray(np.array(noise) * steps, dims="band", coords=label)
     response = calibration.fit_response(blackbody, levels)
     value = xr.DataArray(emissivity[:, np.newaxis], dims=("band", "y", "x"), coords=label)
@@ -83,15 +83,9 @@ def simulated(noise: tuple[float, ...], emissivity: Floats, seed: int, frames: i
     """The same of `simulation`, of the first pixel's emissivities; people walking by."""
     rig, rng = Rig(bands=BANDS[: len(noise)], noise=noise), np.random.default_rng(seed)
     value = xr.DataArray(emissivity[:, 0], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.independent_pixels(
-        np.arange(frames) * 35.0 / frames,
-        value,
-        Background(),
-        emissivity.shape[1],
-        rng,
-        start=293.15,
-        stop=333.15,
-    )
+    time, pixels = np.arange(frames) * 35.0 / frames, emissivity.shape[1]
+    ends: dict[str, Any] = {"start": 293.15, "stop": 333.15}
+    scene = simulation.independent_pixels(time, value, Background(), pixels, rng, **ends)
     return scene, simulation.observe(scene, rig.response(), rng), rig.response()
 
 
@@ -112,7 +106,11 @@ def judge(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("generator", GENERATORS)
-@pytest.mark.parametrize("noise", [(0.03, 0.03), (0.03, 0.1, 0.1), (0.03,) * 5], ids=str)
+@pytest.mark.parametrize(
+    "noise",
+    [(0.03, 0.03), pytest.param((0.03, 0.1, 0.1), marks=pytest.mark.slow), (0.03,) * 5],
+    ids=str,
+)
 def test_gray_bodies_have_a_flag(noise: tuple[float, ...], generator: str) -> None:
     """At most one gray pixel in a thousand is wrong without a flag, in quiet and in many bands."""
     scene, capture, response = GENERATORS[generator](noise, gray(len(noise), 500, 1), seed=2)
@@ -122,10 +120,17 @@ def test_gray_bodies_have_a_flag(noise: tuple[float, ...], generator: str) -> No
     assert good <= PROMISED
 
 
-@pytest.mark.parametrize("values", [(0.80, 0.78, 0.80, 0.80, 0.80), (0.86, 0.85, 0.86, 0.85, 0.86)])
-def test_nearly_gray_bodies_have_honest_bars(values: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    ("values", "pixels"),
+    [
+        ((0.80, 0.78, 0.80, 0.80, 0.80), 400),
+        pytest.param((0.80, 0.78, 0.80, 0.80, 0.80), 1000, marks=pytest.mark.slow),
+        pytest.param((0.86, 0.85, 0.86, 0.85, 0.86), 1000, marks=pytest.mark.slow),
+    ],
+)
+def test_nearly_gray_bodies_have_honest_bars(values: tuple[float, ...], pixels: int) -> None:
     """Of differences of 0.01 and 0.02 in five quiet bands at most 1 % are wrong without a flag."""
-    emissivity = np.tile(np.array(values)[:, np.newaxis], (1, 1000))
+    emissivity = np.tile(np.array(values)[:, np.newaxis], (1, pixels))
     scene, capture, response = independent((0.03,) * 5, emissivity, seed=3)
     good, wrong = judge(scene, separation.solve(capture, response))
     print(f"{values}: {100 * good:.1f} % no flag, {100 * wrong:.2f} % wrong")
@@ -145,10 +150,7 @@ def test_gray_bodies_in_any_bands_and_noise(generator: str) -> None:
                 emissivity = gray(bands, pixels, seed=seen)
                 case = GENERATORS[generator](noise, emissivity, seed=seen + 1, frames=frames)
                 good, wrong = judge(case[0], separation.solve(*case[1:]))
-                print(
-                    f"{generator}, {bands} bands, {quietest} K 1:{ratio}, {frames} frames: "
-                    f"{100 * good:.2f} % no flag, {100 * wrong:.2f} % wrong"
-                )
+                print(f"{bands} bands, {noise} K, {frames} frames: {good:.4f}, {wrong:.4f} wrong")
                 assert wrong <= 0.005
                 seen, failed = seen + pixels, failed + wrong * pixels
     print(f"{generator}: {failed:.0f} of {seen} gray pixels wrong without a flag")
@@ -167,11 +169,8 @@ def test_clean_bodies_keep_bars_and_pixels(values: tuple[float, ...], quiet: boo
     scene, capture, response = simulated(noise, emissivity, seed=4)
     result = separation.solve(capture, response)
     wrong = judge(scene, result)[1]
-    error = abs(result["object_temperature"] - scene["object_temperature"])
-    held = (error < 1.96 * result["object_temperature_std"]).where(result["status"] == 0)
-    covered = float(held.sum() / (result["status"] == 0).sum() / result.sizes["time"])
     flagged = float(((result["status"] & Status.GRAY) != 0).mean())
-    print(f"{values}, {noise} K: {100 * flagged:.2f} % gray, intervals {covered:.3f}")
+    print(f"{values}, {noise} K: {100 * flagged:.2f} % gray")
     assert flagged <= 0.01
     assert wrong <= PROMISED
-    assert 0.92 <= covered <= 0.98
+    assert 0.92 <= held(result, scene, where=result["status"] == 0) <= 0.98

@@ -1,5 +1,6 @@
 """Contract of all methods: properties of `solve` that hold for every registered method."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,7 @@ QUICK: dict[str, Any] = {
 """Settings for a small image and little time, where the defaults are for more of both."""
 
 Pair = tuple[xr.Dataset, xr.Dataset]
+Plain = Callable[[str], xr.Dataset]
 every_method = pytest.mark.parametrize("method", separation.METHODS)
 
 
@@ -32,10 +34,7 @@ GLASS = emissivity_of(0.86, 0.72)
 
 
 def capture_of(
-    shape: tuple[int, int],
-    time: np.ndarray = TIME,
-    emissivity: xr.DataArray = GLASS,
-    rig: Rig = RIG,
+    shape: tuple[int, int], time: np.ndarray = TIME, emissivity: Any = GLASS, rig: Rig = RIG
 ) -> xr.Dataset:
     """Capture of a surface that warms up by 30 K, each pixel before a background of its own."""
     rng, frames = np.random.default_rng(1), time.size
@@ -72,24 +71,30 @@ def estimated(result: xr.Dataset) -> set[str]:
     return schema.STAGES["separated"].keys() - {"status", *missing}
 
 
+@pytest.fixture(scope="module")
+def plain(pair: Pair) -> Plain:
+    """Result of the pair by a method, made once."""
+    return functools.cache(lambda method: solve(*pair, method))
+
+
 @every_method
 def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
-    """The result satisfies the glossary, names its method, and leaves the capture unchanged."""
-    before = pair[0].copy(deep=True)
-    result = solve(*pair, method)
+    """The result satisfies the glossary, and leaves the capture unchanged; what has no value is
+    named in `not_estimated`; a saturated pixel keeps the flag that the correction gave it.
+    """
+    status = np.zeros((4, 6), dtype=np.uint32)
+    status[0, 0] = Status.SATURATED
+    capture = pair[0].assign(status=(("y", "x"), status))
+    before = capture.copy(deep=True)
+    result = solve(capture, pair[1], method)
     schema.check(result, "separated")
+    np.testing.assert_array_equal(result["status"].values & Status.SATURATED, status)
     for name, variable in schema.STAGES["separated"].items():
         assert result[name].dtype == variable.dtype
-    xr.testing.assert_identical(pair[0], before)
+        if name != "status":
+            assert bool(result[name].notnull().any()) == (name in estimated(result)), name
+    xr.testing.assert_identical(capture, before)
     assert result.attrs["origin"] == "simulated"
-
-
-@every_method
-def test_only_the_estimated_has_values(pair: Pair, method: str) -> None:
-    """A variable has values somewhere, or is named in `not_estimated` and is NaN everywhere."""
-    result = solve(*pair, method)
-    for name in schema.STAGES["separated"].keys() - {"status"}:
-        assert bool(result[name].notnull().any()) == (name in estimated(result)), name
 
 
 @settings(max_examples=35)
@@ -139,7 +144,7 @@ def test_slightly_uneven_times(method: str) -> None:
 
 @every_method
 @pytest.mark.parametrize("gap", ["times", "nan"])
-def test_lost_frames(pair: Pair, method: str, gap: str) -> None:
+def test_lost_frames(pair: Pair, plain: Plain, method: str, gap: str) -> None:
     """Lost frames are NaN and the others solved; methods that need even times say so."""
     capture, response = pair
     kept = np.ones(TIME.size, dtype=bool)
@@ -151,8 +156,7 @@ def test_lost_frames(pair: Pair, method: str, gap: str) -> None:
         with pytest.raises(ValueError, match=rf"Invalid interval .* method '{method}'. Must be"):
             solve(lossy, response, method)
         return
-    result = solve(lossy, response, method)
-    whole = solve(capture, response, method)
+    result, whole = solve(lossy, response, method), plain(method)
     solved = result["object_temperature"].notnull().any("time").values
     np.testing.assert_array_equal(solved, whole["object_temperature"].notnull().any("time").values)
     if gap == "nan":
@@ -161,12 +165,12 @@ def test_lost_frames(pair: Pair, method: str, gap: str) -> None:
 
 
 @every_method
-def test_one_lost_sample_costs_its_frame_alone(pair: Pair, method: str) -> None:
+def test_one_lost_sample_costs_its_frame_alone(pair: Pair, plain: Plain, method: str) -> None:
     """A frame that one pixel lacks is NaN there; the pixel's other frames have their values."""
     spoilt = pair[0].copy(deep=True)
     spoilt["counts"].values[0, 30, 0, 2] = np.nan
     found = solve(spoilt, pair[1], method)["object_temperature"].values[:, 0, 2]
-    whole = solve(*pair, method)["object_temperature"].values[:, 0, 2]
+    whole = plain(method)["object_temperature"].values[:, 0, 2]
     assert np.isnan(found[30])
     np.testing.assert_array_equal(np.isfinite(np.delete(found, 30)), np.isfinite(whole)[1:])
 
@@ -184,43 +188,27 @@ def test_pixel_that_lacks_frames(pair: Pair, method: str) -> None:
     assert np.all(np.isnan(result["object_temperature"].values[:, lacking]))
 
 
-def mark_dead(capture: xr.Dataset) -> xr.Dataset:
-    """Mark a hot pixel as dead in the status."""
-    capture["counts"].values[:, :, 1, 2] = 60000.0
-    status = np.zeros((4, 6), dtype=np.uint32)
-    status[1, 2] = Status.DEAD_PIXEL
+def spoilt(capture: xr.Dataset, bit: Status) -> xr.Dataset:
+    """Make a pixel dead by the status, lacking three frames in five, or constant in a band."""
+    capture = capture.copy(deep=True)
+    counts, status = capture["counts"].values[..., 1, 2], np.zeros((4, 6), dtype=np.uint32)
+    if bit == Status.DEAD_PIXEL:
+        counts[:] = 60000.0
+        status[1, 2] = bit
+    elif bit == Status.INVALID_SAMPLES:
+        counts[0, :72] = np.nan
+    else:
+        counts[1] = 16000.0
     return capture.assign(status=(("y", "x"), status))
 
 
-def lose_samples(capture: xr.Dataset) -> xr.Dataset:
-    """Set three frames in five of a pixel to NaN, in one band."""
-    capture["counts"].values[0, :72, 1, 2] = np.nan
-    return capture
-
-
-def stop_changing(capture: xr.Dataset) -> xr.Dataset:
-    """Set one pixel of one band to a constant."""
-    capture["counts"].values[1, :, 1, 2] = 16000.0
-    return capture
-
-
 @every_method
-@pytest.mark.parametrize(
-    ("spoil", "bit"),
-    [
-        (mark_dead, Status.DEAD_PIXEL),
-        (lose_samples, Status.INVALID_SAMPLES),
-        (stop_changing, Status.CONSTANT_SIGNAL),
-    ],
-)
-def test_bad_pixel_is_flagged_and_alone(
-    pair: Pair, method: str, spoil: Callable[[xr.Dataset], xr.Dataset], bit: Status
-) -> None:
-    """An unusable pixel is NaN with its flag, and no other pixel has the flag.
-
-    The others keep their values, unless the method looks at neighbours or draws random starts.
+@pytest.mark.parametrize("bit", [Status.DEAD_PIXEL, Status.INVALID_SAMPLES, Status.CONSTANT_SIGNAL])
+def test_bad_pixel_is_flagged_and_alone(pair: Pair, plain: Plain, method: str, bit: Status) -> None:
+    """An unusable pixel is NaN with its flag, which no other has; the others keep their values,
+    unless the method looks at neighbours or draws random starts.
     """
-    whole, result = solve(*pair, method), solve(spoil(pair[0].copy(deep=True)), pair[1], method)
+    whole, result = plain(method), solve(spoilt(pair[0], bit), pair[1], method)
     assert result["status"].values[1, 2] & bit
     for name in schema.STAGES["separated"].keys() - {"status"}:
         assert np.all(np.isnan(result[name].values[..., 1, 2]))
@@ -235,17 +223,7 @@ def test_bad_pixel_is_flagged_and_alone(
 
 
 @every_method
-def test_status_of_the_correction_is_kept(pair: Pair, method: str) -> None:
-    """A saturated pixel keeps the flag that the correction gave it, and is solved."""
-    status = np.zeros((4, 6), dtype=np.uint32)
-    status[0, 0] = Status.SATURATED
-    result = solve(pair[0].assign(status=(("y", "x"), status)), pair[1], method)
-    flagged = result["status"].values & Status.SATURATED != 0
-    np.testing.assert_array_equal(flagged, status != 0)
-
-
-@every_method
-@pytest.mark.parametrize("value", [0.0, -1e6, 1e9, np.inf, np.nan])
+@pytest.mark.parametrize("value", [0.0, 1e9, np.inf, np.nan])
 def test_hostile_counts_are_no_error(pair: Pair, method: str, value: float) -> None:
     """Impossible counts, in one pixel or in all, give a flag and no exception."""
     capture, response = pair

@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dbthermal import schema, separation
 from dbthermal.simulation import Rig
@@ -29,9 +27,8 @@ def case() -> Case:
 
 def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:
     """The capture with NaN in place of missing samples (..., time, y, x), in all bands."""
-    return capture.assign(
-        counts=capture["counts"].where(xr.DataArray(there, dims=("time", "y", "x")))
-    )
+    used = xr.DataArray(there, dims=("time", "y", "x"))
+    return capture.assign(counts=capture["counts"].where(used))
 
 
 def assert_agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) -> None:
@@ -51,8 +48,9 @@ def lost(fraction: float, seed: int = 0) -> np.ndarray:
     return np.asarray(there)
 
 
-@pytest.mark.parametrize("band", [[0], [1], [0, 1]])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize(
+    ("band", "value"), [([0], np.nan), ([1], np.inf), ([0, 1], -np.inf), ([0, 1], np.nan)]
+)
 def test_missing_frames_are_as_if_never_taken(case: Case, band: list[int], value: float) -> None:
     """Missing frames, in one band or both, leave all other frames' results as they are."""
     _, capture, response = case
@@ -115,42 +113,6 @@ def test_half_of_the_frames_must_be_there(case: Case, missing: int, good: bool) 
     assert not np.any(np.delete(result["status"].values[0], 3))
 
 
-@pytest.mark.parametrize("events", [(200,), (90, 210, 300)])
-def test_shutter_steps_are_undone(events: tuple[int, ...]) -> None:
-    """Steps of 40 counts, another for each pixel and band, cost 20 % with `segment`; without it
-    the result is useless or flagged.
-    """
-    scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 300, seed=6)
-    segment = np.searchsorted(events, np.arange(350), side="right")
-    rng = np.random.default_rng(7)
-    offsets = np.concatenate(
-        [np.zeros((2, 1, 1, 300)), rng.normal(0, 40, (2, len(events), 1, 300))], 1
-    )
-    stepped = capture.assign(counts=capture["counts"] + offsets[:, segment].astype(np.float32))
-    stepped["counts"].attrs.update(capture["counts"].attrs)
-    results = [
-        separation.solve(c, response)
-        for c in (capture, stepped.assign(segment=("time", segment)), stepped)
-    ]
-    rmse, good = [], []
-    for result in results:
-        error = result["object_temperature"] - scene["object_temperature"]
-        of_pixel = (error**2).mean("time") ** 0.5
-        rmse.append(float(of_pixel.median()))
-        right = (result["status"] == 0) & (of_pixel < 3 * rmse[0])
-        good.append(float(right.mean()))
-    within = abs(results[1]["object_temperature"] - scene["object_temperature"]) < (
-        1.96 * results[1]["object_temperature_std"]
-    )
-    print(
-        f"{events}: whole {rmse[0]:.3f} K, undone {rmse[1]:.3f} K, not undone {rmse[2]:.3f} K; "
-        f"right and unflagged {np.round(good, 3)}; intervals {float(within.mean()):.3f}"
-    )
-    assert rmse[1] < 1.2 * rmse[0] if len(events) == 1 else rmse[1] < 1.6 * rmse[0]
-    assert 0.92 <= float(within.mean()) <= 0.98
-    assert good[2] < 0.3
-
-
 def test_a_segment_without_a_step_costs_little(case: Case) -> None:
     """An event without a step changes the object by less than 0.15 K, and sets no flag."""
     _, capture, response = case
@@ -164,12 +126,7 @@ def test_a_segment_without_a_step_costs_little(case: Case) -> None:
 
 
 BAD: dict[str, tuple[dict[str, Any], Any, type[Exception], str]] = {
-    "mask of numbers": (
-        {},
-        xr.DataArray(np.ones(350), dims="time"),
-        TypeError,
-        "Invalid dtype float64 of the mask",
-    ),
+    "mask of numbers": ({}, xr.DataArray(np.ones(350), dims="time"), TypeError, "dtype float64 of"),
     "mask of a list": ({}, [True] * 350, TypeError, "Invalid mask of type list"),
     "mask too short": ({}, xr.DataArray(np.ones(9, bool), dims="time"), ValueError, "of the mask"),
     "mask of bands": ({}, xr.DataArray([True, True], dims="band"), ValueError, "of the mask"),
@@ -186,38 +143,6 @@ def test_bad_masks_and_segments(case: Case, what: str) -> None:
     _, capture, response = case
     with pytest.raises(error, match=message):
         separation.solve(capture.assign(new), response, mask=mask)
-
-
-@settings(max_examples=20)
-@given(
-    seed=st.integers(0, 10_000),
-    frames=st.integers(32, 120),
-    share=st.floats(0.0, 0.7),
-    common=st.booleans(),
-    events=st.integers(0, 3),
-    materials=st.integers(0, 4),
-)
-def test_nothing_missing_raises(
-    seed: int, frames: int, share: float, common: bool, events: int, materials: int
-) -> None:
-    """Random gaps, events and labels raise no error; good pixels are finite at valid samples."""
-    rng = np.random.default_rng(seed)
-    _, capture, response = experiments.simulate(GLASS, RIG, TIME[:frames], 12, seed)
-    there = rng.random((frames, 1, 1 if common else 12)) >= share
-    there = np.broadcast_to(there, (frames, 1, 12))
-    segment = np.searchsorted(np.sort(rng.integers(1, frames, events)), np.arange(frames), "right")
-    labels = xr.DataArray(rng.integers(-1, max(materials, 1), (1, 12)), dims=("y", "x"))
-    result = separation.solve(
-        without(capture, there).assign(segment=("time", segment)),
-        response,
-        pool=labels if materials else None,
-    )
-    good = result["status"].values == 0
-    for name in schema.STAGES["separated"]:
-        known = good & there if name.startswith(FRAMES) else good
-        values = result[name].values
-        assert np.all(np.isfinite(values[np.broadcast_to(known, values.shape)]))
-    assert np.all(np.isnan(result["object_temperature"].values[~there]))
 
 
 def test_unequal_gaps_need_a_known_noise(case: Case) -> None:

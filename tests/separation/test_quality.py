@@ -81,10 +81,10 @@ def test_copies_of_a_frame_are_left_out(copies: int, flag: int) -> None:
     np.testing.assert_array_equal(np.flatnonzero(empty), 7 + np.arange(copies))
 
 
-@pytest.mark.parametrize("noise", [0.05, 0.3, 0.8, 1.2, 3.4, 30.0])
-def test_whole_counts_repeat_by_chance(noise: float) -> None:
+def test_whole_counts_repeat_by_chance() -> None:
     """Rounded counts that rest, rise and step stay without a flag, from 0.05 to 30 counts."""
-    assert flags_of_whole_counts(noise, range(2)) == 0
+    for noise in (0.05, 0.3, 0.8, 1.2, 3.4, 30.0):
+        assert flags_of_whole_counts(noise, range(2)) == 0, noise
 
 
 @pytest.mark.long

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from scenes import held
 
 from dbthermal import correction, separation, simulation
 from dbthermal.simulation import Rig
@@ -75,16 +76,9 @@ def cover(seed: int) -> dict[str, float]:
     raw = simulation.capture(simulation.observe(scene, response, rng), detector)
     corrected = correction.correct_capture(raw, fitted)
     shares = {}
-    for name, capture in {
-        "with": corrected,
-        "without": corrected.drop_vars("pattern_std"),
-    }.items():
+    for name, capture in {"with": corrected, "without": corrected.drop_vars("pattern_std")}.items():
         result = separation.solve(capture, response)
-        good = result["status"] == 0
-        error = result["object_temperature"] - scene["object_temperature"]
-        inside = abs(error) < 1.96 * result["object_temperature_std"]
-        shares[name] = float(inside.where(good & error.notnull()).mean())
-    print({name: round(share, 3) for name, share in shares.items()})
+        shares[name] = held(result, scene, where=result["status"] == 0)
     return shares
 
 

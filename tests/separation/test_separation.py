@@ -1,9 +1,12 @@
 """Separation of simulated captures: accuracy at the bound, and calibrated uncertainty."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from scenes import held
 
 from dbthermal import schema, separation, simulation
 from dbthermal.simulation import Background, Rig
@@ -27,12 +30,13 @@ def glass_case(**changes: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("pair", PROTOTYPE, ids=str)
-@pytest.mark.parametrize("stop", [45, 60])
-@pytest.mark.parametrize("noise_known", [True, False])
+@pytest.mark.parametrize(("stop", "noise_known"), [(45, True), (60, True), (60, False)])
 def test_subspace_reaches_the_design(
     pair: tuple[float, float], stop: int, noise_known: bool
 ) -> None:
-    """Object and emissivities are as good as the prototype's, noise known or not."""
+    """Object and emissivities are as good as the prototype's, noise known or not; 95 % intervals of
+    the object hold in 92 to 98 % of the samples.
+    """
     case = glass_case(emissivity=list(pair), stop=stop, noise_known=noise_known)
     scene, result = experiments.run_case(case, RIG, TIME, 1600, seed=7)
     score = experiments.score(scene, result)
@@ -43,16 +47,12 @@ def test_subspace_reaches_the_design(
     limit = to_45 if stop == 45 else to_60
     assert limit is None or rmse <= limit
     assert np.all(errors <= of_emissivity)
-    print(f"with a temperature: {float(score['with_temperature']):.4f}")
     assert float(score["with_temperature"]) > 0.99
-
-
-def test_ratio_scatters_as_the_bound_allows() -> None:
-    """The reflection ratio's scatter is the Cramer-Rao bound's within 10 %."""
-    scene, result = experiments.run_case(glass_case(), RIG, TIME, 1000, seed=3)
-    efficiency = experiments.efficiency(scene, result, (0.03, 0.35), order=5)
-    print(f"scatter of the ratio over its bound: {efficiency:.3f}")
-    assert efficiency == pytest.approx(1.0, abs=0.1)
+    # Low emissivities are also those of an object and a background that are exchanged.
+    good = (result["status"] & ~np.uint32(schema.Status.ROLES_MAY_BE_SWAPPED)) == 0
+    assert 0.92 <= held(result, scene, where=good) <= 0.98
+    if pair == (0.86, 0.72):
+        assert float((result["status"] != 0).mean()) < 0.02
 
 
 @pytest.mark.parametrize("pair", [(0.95, 0.85), (0.86, 0.72), (0.3, 0.5)], ids=str)
@@ -71,20 +71,6 @@ def test_error_bars_are_true(pair: tuple[float, float]) -> None:
     assert spread["object_temperature"] == pytest.approx(1.0, abs=0.2)
     assert 0.35 < spread["emissivity"] < 1.2
     assert 0.2 < spread["background_temperature"] < 1.2
-
-
-@pytest.mark.parametrize("noise_known", [True, False])
-def test_intervals_of_the_object_hold(noise_known: bool) -> None:
-    """95 % intervals of the object temperature hold in 92 to 98 % of the samples."""
-    case = glass_case(noise_known=noise_known)
-    scene, result = experiments.run_case(case, RIG, TIME, 1000, seed=6)
-    within = abs(result["object_temperature"] - scene["object_temperature"]) < (
-        1.96 * result["object_temperature_std"]
-    )
-    share = float(within.where(result["status"] == 0).mean())
-    print(f"noise known {noise_known}: {100 * share:.1f} % of 95 % intervals hold")
-    assert 0.92 <= share <= 0.98
-    assert float((result["status"] != 0).mean()) < 0.02
 
 
 def test_constant_object_keeps_its_temperature() -> None:
@@ -110,28 +96,14 @@ def test_fast_object_is_as_true_as_a_slow_one() -> None:
     """An object that heats within 0.2-0.4 s or 8-20 s has no flag, and true 95 % intervals."""
     for constant in ((0.2, 0.4), (8.0, 20.0)):
         rng = np.random.default_rng(2)
-        scene = simulation.independent_pixels(
-            TIME,
-            emissivity_of(0.86, 0.72),
-            Background(),
-            300,
-            rng,
-            start=293.15,
-            stop=333.15,
-            time_constant=constant,
-        )
+        ends: dict[str, Any] = {"start": 293.15, "stop": 333.15, "time_constant": constant}
+        parts = (TIME, emissivity_of(0.86, 0.72), Background(), 300, rng)
+        scene = simulation.independent_pixels(*parts, **ends)
         result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
-        error = abs(result["object_temperature"] - scene["object_temperature"])
         good = result["status"] == 0
-        within = (error < 1.96 * result["object_temperature_std"]).where(good)
-        start = float(within.isel(time=slice(0, 10)).mean())
-        share = float(good.mean())
-        print(
-            f"{constant} s: good {share:.3f}, cover {float(within.mean()):.3f}, start {start:.3f}"
-        )
-        assert share > 0.95
-        assert 0.92 <= within.mean() <= 0.98
-        assert start > 0.9
+        assert float(good.mean()) > 0.95
+        assert 0.92 <= held(result, scene, where=good) <= 0.98
+        assert held(result.isel(time=slice(0, 10)), scene, where=good) > 0.9
 
 
 def test_linear_response_costs_kelvins() -> None:
@@ -154,10 +126,8 @@ def test_large_changes_of_the_background_do_not_bias() -> None:
     for name in ("object_temperature", "emissivity", "reflection_ratio"):
         truth = scene[name] if name in scene else xr.DataArray([1.0, 2.0], dims="band")
         scores = (result[name] - truth) / result[f"{name}_std"].where(result[f"{name}_std"] > 0)
-        bias, spread[name] = (
-            float(np.nanmedian(scores)),
-            1.4826 * float(np.nanmedian(np.abs(scores))),
-        )
+        bias = float(np.nanmedian(scores))
+        spread[name] = 1.4826 * float(np.nanmedian(np.abs(scores)))
         print(f"12 K pulses, {name}: bias {bias:.2f}, spread {spread[name]:.2f} deviations")
         assert abs(bias) < 0.2
     for name in ("object_temperature", "reflection_ratio"):

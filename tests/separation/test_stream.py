@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from scenes import field
+from scenes import field, held
 
 from dbthermal import schema, simulation
 from dbthermal.schema import Status
@@ -33,30 +33,13 @@ def live(
     counts, time = capture["counts"].values, capture["time"].values
     parts = [stream.update(time[i], counts[:, i]) for i in np.arange(time.size)[frames]]
     films = [part[["object_temperature", "object_temperature_std"]] for part in parts]
-    whole = xr.concat(films, "time").assign(parts[-1].drop_dims("time").data_vars)
-    whole["background_temperature"] = xr.concat(
-        [p["background_temperature"] for p in parts], "time"
-    )
-    return stream, whole
+    return stream, xr.concat(films, "time").assign(parts[-1].drop_dims("time").data_vars)
 
 
 @pytest.fixture(scope="module")
 def glass() -> Data:
     """Half a minute of glass."""
     return walkers(3, 30.0)
-
-
-def test_without_noise_the_truth_comes_back() -> None:
-    """Nearly noiseless, object and background of every frame are right."""
-    scene, capture, response = walkers(4, 30.0, noise=(1e-3, 1e-2))
-    result = live(capture, response)[1]
-    good = result["status"] == 0
-    for name, most in (("object_temperature", 0.05), ("background_temperature", 0.2)):
-        error = abs(result[name] - scene[name]).where(good)
-        high = float(error.quantile(0.99))
-        print(f"{name}: median {float(error.median()):.4f} K, 99 % {high:.3f} K")
-        assert high < most  # K
-    assert float(good.mean()) > 0.7
 
 
 def test_frames_together_are_frames_one_by_one(glass: Data) -> None:
@@ -75,13 +58,9 @@ def test_a_long_gap_is_not_smoothed_over(glass: Data) -> None:
     """After five seconds without a frame the object is that of the frames since."""
     scene, capture, response = glass
     stream, result = live(capture, response, np.r_[0:180, 230:300])
-    error = (result["object_temperature"] - scene["object_temperature"]).where(
-        result["status"] == 0
-    )
-    after = error.where(result["time"] > 23.0, drop=True)
-    std = result["object_temperature_std"].where(result["time"] > 23.0, drop=True)
     assert stream.lost_frames == 50
-    assert float((abs(after) < 1.96 * std).where(after.notnull()).mean()) > 0.90
+    after = result.sel(time=result["time"] > 23.0)
+    assert held(after, scene, where=result["status"] == 0) > 0.90
 
 
 def test_samples_that_are_nan_stay_nan(glass: Data) -> None:
@@ -208,16 +187,12 @@ def test_rate_of_full_frames() -> None:
     steady = slice(1500 - 15 * 15, None)
     cost, wall = np.mean(used[steady]), np.mean(passed[steady])
     good = float((stream.result()["status"] == 0).mean())
-    print(
-        f"{1e3 * cost:.1f} ms of processor, {1e3 * wall:.1f} ms, a pair of frames; {good:.2f} good"
-    )
+    print(f"{1e3 * cost:.1f} ms of processor, {1e3 * wall:.1f} ms, a pair; {good:.2f} good")
     print(f"{stream.nbytes / 1e6:.0f} MB, latency {stream.latency} s")
     assert cost < 2.0 / 60.0  # s, on two cores
 
 
-def test_frames_are_taken_by_the_names_of_their_bands_and_without_what_is_masked(
-    glass: Data,
-) -> None:
+def test_bands_come_by_name_and_masked_samples_are_missing(glass: Data) -> None:
     """Frames whose bands stand the other way, and masked samples, which are as if missing."""
     _, capture, response = glass
     counts, time = capture["counts"].values, capture["time"].values

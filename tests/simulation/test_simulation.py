@@ -1,6 +1,8 @@
 """Simulation: scenes with closed-form truth, and a rig with its stated errors."""
 
 import re
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,42 +11,42 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import bands, response, schema, simulation
-from dbthermal.correction import blackbody_statistics, correct, fit_correction
-from dbthermal.simulation import Background, Rig, heating
+from dbthermal.simulation import Background, Rig, capture, heating, observe
 
 TIME = np.arange(120) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
 SHAPE = (12, 16)
 
 
+RIG = Rig(bad_fraction=0.02)
+KNOWN = RIG.response()
+
+
+@dataclass(frozen=True)
+class Made:
+    """A plate in which people are reflected, the fixed pattern of the cameras, random numbers."""
+
+    rng: np.random.Generator
+    twin: xr.Dataset
+    detector: xr.Dataset
+
+    def seen(self, **changes: Any) -> xr.Dataset:
+        """Counts of the plate."""
+        return observe(self.twin.assign(changes), KNOWN, self.rng)
+
+
+@pytest.fixture
+def made() -> Made:
+    """Of one seed."""
+    rng = np.random.default_rng(11)
+    detector = simulation.pattern(RIG, SHAPE, rng)
+    return Made(rng, simulation.walkers(TIME, SHAPE, GLASS, rng), detector)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     """Seeded random numbers."""
     return np.random.default_rng(11)
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """The default rig with 2 % of dead pixels."""
-    return Rig(bad_fraction=0.02)
-
-
-@pytest.fixture(scope="module")
-def known(rig: Rig) -> xr.Dataset:
-    """Response of the rig."""
-    return rig.response()
-
-
-@pytest.fixture
-def detector(rig: Rig, rng: np.random.Generator) -> xr.Dataset:
-    """Fixed pattern of the rig."""
-    return simulation.pattern(rig, SHAPE, rng)
-
-
-@pytest.fixture
-def twin(rng: np.random.Generator) -> xr.Dataset:
-    """A plate in which people are reflected."""
-    return simulation.walkers(TIME, SHAPE, GLASS, rng)
 
 
 @given(
@@ -91,25 +93,26 @@ def test_random_walk(rng: np.random.Generator) -> None:
         assert found == pytest.approx(np.exp(-lag / 30.0), abs=0.02)
 
 
-@pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]])
-def test_times_that_are_no_capture(times: list[float], rng: np.random.Generator) -> None:
-    """A single time, a repeated one and a NaN raise a ValueError in backgrounds and heatings."""
-    rule = r"Must be (two or more|finite, and increase)"
-    with pytest.raises(ValueError, match=rule):
-        Background("still").draw(np.array(times), 3, rng)
-    with pytest.raises(ValueError, match=rule):
-        heating(np.array(times), 300.0, 320.0, 5.0)
+BAD_TIMES: list[Any] = [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]]
 
 
-@pytest.mark.parametrize("constant", [0.0, -1.0, np.nan])
-def test_time_constants_are_positive(constant: float) -> None:
-    """A time constant that is not positive raises a ValueError."""
-    with pytest.raises(ValueError, match=r"Invalid time_constant \[s\]"):
-        heating(TIME, 300.0, 320.0, constant)
+@pytest.mark.parametrize(
+    ("time", "constant", "message"),
+    [(np.array(times), 5.0, r"Must be (two or more|finite, and increase)") for times in BAD_TIMES]
+    + [(TIME, constant, r"Invalid time_constant \[s\]") for constant in (0.0, -1.0, np.nan)],
+)
+def test_times_that_are_no_capture(time: Any, constant: float, message: str) -> None:
+    """A single time, a repeated one, a NaN, and no time constant are refused by name."""
+    with pytest.raises(ValueError, match=message):
+        heating(time, 300.0, 320.0, constant)
+    if time is not TIME:
+        with pytest.raises(ValueError, match=message):
+            Background("still").draw(time, 3, np.random.default_rng(0))
 
 
-def test_walkers(twin: xr.Dataset) -> None:
+def test_walkers(made: Made) -> None:
     """The room is reflected but where someone walks by; the plate's middle heats up."""
+    twin = made.twin
     background = twin["background_temperature"]
     assert set(np.unique(background)) == {295.15, 305.15}
     assert (background.isel(y=0) == 295.15).all()  # above all heads
@@ -132,16 +135,16 @@ def test_independent_pixels(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(made["emissivity"].isel(y=0, x=7), GLASS)
 
 
-def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
+def test_response_is_planck_s() -> None:
     """The rig's counts are the band's radiance, within 0.05 mK from -10 to 80 C."""
     temperature = np.linspace(263.15, 353.15, 451)
     unit = 115.0 / float(bands.FILTERS["8-14"].slope(300.0))
-    for name, netd in zip(rig.bands, rig.noise, strict=True):
+    for name, netd in zip(RIG.bands, RIG.noise, strict=True):
         counts = 15500.0 + unit * bands.FILTERS[name].radiance(temperature)
-        found = response.curve(known, name).inverse(counts)
+        found = response.curve(KNOWN, name).inverse(counts)
         np.testing.assert_allclose(found, temperature, rtol=0, atol=5e-5)  # K
-        assert float(known["netd"].sel(band=name)) == pytest.approx(netd, rel=1e-9)
-    assert known.attrs["origin"] == "simulated"
+        assert float(KNOWN["netd"].sel(band=name)) == pytest.approx(netd, rel=1e-9)
+    assert KNOWN.attrs["origin"] == "simulated"
 
 
 @pytest.mark.parametrize(
@@ -162,71 +165,53 @@ def test_bad_rig(change: dict[str, object], error: type[Exception], message: str
         Rig(**change)  # type: ignore[arg-type]
 
 
-def test_observed_counts(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator) -> None:
+QUIET = KNOWN.assign(noise=1e-9 * KNOWN["noise"])
+
+
+def test_observed_counts(made: Made) -> None:
     """Without noise the counts are e U(x) + (1 - e) U(y), whatever the order of the bands."""
-    quiet = known.assign(noise=1e-9 * known["noise"])
-    seen = simulation.observe(twin.isel(band=[1, 0]), quiet, rng, dtype="float64")
-    emitted, reflected = (
-        response.counts(known, twin[name])
-        for name in ("object_temperature", "background_temperature")
-    )
+    seen = observe(made.twin.isel(band=[1, 0]), QUIET, made.rng, dtype="float64")
+    names = ("object_temperature", "background_temperature")
+    emitted, reflected = (response.counts(KNOWN, made.twin[name]) for name in names)
     expected = GLASS * emitted + (1 - GLASS) * reflected
     np.testing.assert_allclose(seen["counts"], expected, rtol=0, atol=1e-6)  # count
     assert schema.check(seen, "corrected").attrs["origin"] == "simulated"
 
 
-def test_counts_say_of_what_they_are_a_twin(
-    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
-) -> None:
+def test_counts_say_of_what_they_are_a_twin(made: Made) -> None:
     """Observed and raw counts keep the name of their twin; other scenes have none."""
-    seen = simulation.observe(twin.assign_attrs(twin="bulb"), known, rng)
-    assert seen.attrs["twin"] == simulation.capture(seen, detector).attrs["twin"] == "bulb"
-    assert "twin" not in simulation.observe(twin, known, rng).attrs
+    seen = observe(made.twin.assign_attrs(twin="bulb"), KNOWN, made.rng)
+    assert seen.attrs["twin"] == capture(seen, made.detector).attrs["twin"] == "bulb"
+    assert "twin" not in made.seen().attrs
 
 
-def test_noise_of_observed_counts(
-    twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator
-) -> None:
+def test_noise_of_observed_counts(made: Made) -> None:
     """The noise has the response's deviation within 2 %, no mean, and no autocorrelation."""
-    quiet = known.assign(noise=1e-9 * known["noise"])
-    noise = (simulation.observe(twin, known, rng) - simulation.observe(twin, quiet, rng))["counts"]
+    noise = (made.seen() - observe(made.twin, QUIET, made.rng))["counts"]
     pixels = ("time", "y", "x")
-    np.testing.assert_allclose(noise.std(pixels) / known["noise"], 1.0, rtol=0, atol=0.02)
+    np.testing.assert_allclose(noise.std(pixels) / KNOWN["noise"], 1.0, rtol=0, atol=0.02)
     np.testing.assert_allclose(noise.mean(pixels), 0.0, rtol=0, atol=0.1)  # count
     covariance = (noise.values[:, 1:] * noise.values[:, :-1]).mean(axis=(1, 2, 3))
-    autocorrelation = covariance / known["noise"] ** 2
-    np.testing.assert_allclose(autocorrelation, 0.0, rtol=0, atol=0.03)
+    np.testing.assert_allclose(covariance / KNOWN["noise"] ** 2, 0.0, rtol=0, atol=0.03)
     assert abs(float(xr.corr(*noise))) < 0.03
 
 
-def test_observe_refuses(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator) -> None:
-    """A temperature outside the response, and a band without emissivity, raise an error."""
-    with pytest.raises(ValueError, match=r"Invalid object_temperature .*the response's range"):
-        simulation.observe(
-            twin.assign(object_temperature=twin["object_temperature"] + 30), known, rng
-        )
-    with pytest.raises(ValueError, match=r"Missing band '9.5' in the scene. Has .'8-14'."):
-        simulation.observe(twin.isel(band=[0]), known, rng)
-
-
-def test_pattern(rig: Rig) -> None:
+def test_pattern() -> None:
     """Over live pixels the gain has mean 1 and the offset 0; the deviations are the rig's."""
-    made = simulation.pattern(rig, (80, 90), np.random.default_rng(5))
+    made = simulation.pattern(RIG, (80, 90), np.random.default_rng(5))
     live = made.where(~made["dead"])
     np.testing.assert_allclose(live["gain"].mean(("y", "x")), 1.0, rtol=0, atol=1e-12)
     np.testing.assert_allclose(live["offset"].mean(("y", "x")), 0.0, rtol=0, atol=1e-10)  # count
     assert float(made["dead"].mean()) == pytest.approx(0.02, abs=0.005)
     rough = made[["gain", "offset"]].diff("x").std() / 2**0.5  # the vignette is smooth
-    assert float(rough["gain"]) == pytest.approx(rig.gain_std, rel=0.05)
-    assert float(rough["offset"]) == pytest.approx(rig.offset_std, rel=0.05)
+    assert float(rough["gain"]) == pytest.approx(RIG.gain_std, rel=0.05)
+    assert float(rough["offset"]) == pytest.approx(RIG.offset_std, rel=0.05)
 
 
-def test_capture(
-    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
-) -> None:
+def test_capture(made: Made) -> None:
     """Raw counts are gain times signal and offset, rounded, and 0 where a pixel is dead."""
-    seen = simulation.observe(twin, known, rng)
-    raw = simulation.capture(seen, detector.isel(band=[1, 0]))  # by name, not by place
+    seen, detector = made.seen(), made.detector
+    raw = capture(seen, detector.isel(band=[1, 0]))  # by name, not by place
     assert raw["counts"].dtype == np.uint16
     assert (raw["counts"].where(detector["dead"], 0) == 0).all()
     exact = detector["gain"] * seen["counts"] + detector["offset"]
@@ -235,83 +220,57 @@ def test_capture(
     assert schema.check(raw, "capture").attrs["origin"] == "simulated"
 
 
-def test_capture_that_does_not_fit(
-    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
-) -> None:
-    """Counts outside 16 bits, NaN, and a missing band raise an error."""
-    seen = simulation.observe(twin, known, rng)
-    for wrong in (seen + 50000.0, seen - 40000.0, seen.where(seen["time"] > 1)):
-        with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
-            simulation.capture(wrong, detector)
-    with pytest.raises(ValueError, match=r"Missing band '9.5' in the detector"):
-        simulation.capture(seen, detector.isel(band=[0]))
-    with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
-        simulation.blackbody_movies(Rig(offset=60000.0), np.array([290.0, 330.0]), 2, detector, rng)
+RANGE = r"band '8-14'. Must lie in \[0, 65535\]"
+HOT, ENDS = Rig(offset=60000.0), np.array([290.0, 330.0])
 
 
-def test_calibration_undoes_the_detector(
-    rig: Rig, twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
-) -> None:
-    """Movies, correction, corrected capture: what is left is rounding and the movies' noise."""
-    temperatures = np.linspace(283.15, 343.15, 5)
-    movies = simulation.blackbody_movies(rig, temperatures, 40, detector, rng)
-    statistics = blackbody_statistics(movies)
-    correction = fit_correction(statistics)
-    seen = simulation.observe(twin, known, rng)
-    corrected = correct(simulation.capture(seen, detector), correction)
-    np.testing.assert_array_equal(correction["bad"], detector["dead"])
-    np.testing.assert_allclose(statistics["noise"] / known["noise"], 1.0, rtol=0, atol=0.02)
-    error = (corrected["counts"] - seen["counts"]).where(~detector["dead"])
-    spread = (error**2).mean(("time", "y", "x")) ** 0.5
-    assert float(spread.min()) > 0.28  # count; rounding alone is 12**-0.5
-    assert float(spread.max()) < 0.5
-    np.testing.assert_allclose(error.mean(("time", "y", "x")), 0.0, rtol=0, atol=0.05)
+def one_dead(detector: xr.Dataset) -> xr.Dataset:
+    """The detector with dead pixels of one band alone."""
+    return detector.drop_vars("dead").assign(dead=detector["dead"].isel(band=slice(0, 1)))
 
 
-def test_contact_measurements(known: xr.Dataset, rng: np.random.Generator) -> None:
-    """Counts follow the true temperatures; readings scatter by their deviations."""
-    warm, cold = np.full(4000, 320.0), np.full(4000, 295.0)
-    made = simulation.contact_measurements(known, GLASS, warm, cold, (0.1, 0.05), rng)
-    for name, level, std in (("object", 320.0, 0.1), ("background", 295.0, 0.05)):
-        read = made[f"{name}_temperature"]
-        assert float(read.mean()) == pytest.approx(level, abs=4 * std / 4000**0.5)
-        assert float(read.std()) == pytest.approx(std, rel=0.05)
-    levels = xr.DataArray([320.0, 295.0], dims="part")
-    expected = (response.counts(known, levels) * [1, -1]).sum("part") * GLASS
-    expected = expected + response.counts(known, levels).isel(part=1)
-    np.testing.assert_allclose(made["counts"].mean("measurement"), expected, rtol=0, atol=0.25)
-    np.testing.assert_allclose(made["counts"].std("measurement"), known["noise"], rtol=0.05)
+def warmer(made: Made) -> xr.Dataset:
+    """Counts of the plate when it is 30 K warmer."""
+    return made.seen(object_temperature=made.twin["object_temperature"] + 30)
 
 
-def test_same_seed_same_data(rig: Rig, known: xr.Dataset) -> None:
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (warmer, "the response's range"),
+        (lambda m: m.seen(emissivity=100 * m.twin["emissivity"]), "emissivity of the scene 86"),
+        (lambda m: observe(m.twin.isel(band=[0]), KNOWN, m.rng), "Missing band '9.5' in the scene"),
+        (lambda m: observe(m.twin[["emissivity"]], KNOWN, m.rng), "'object_temperature'"),
+        (lambda m: observe(m.twin, KELVIN, m.rng), "Invalid units 'K' of 'noise'"),
+        (lambda m: capture(m.seen() + 50000.0, m.detector), RANGE),
+        (lambda m: capture(m.seen() - 40000.0, m.detector), RANGE),
+        (lambda m: capture(m.seen().where(m.twin["time"] > 1), m.detector), RANGE),
+        (lambda m: capture(m.seen().rename(band="b"), m.detector), "'counts' of the corrected"),
+        (lambda m: capture(m.seen(), m.detector.isel(band=[0])), "band '9.5' in the detector"),
+        (lambda m: capture(m.seen(), one_dead(m.detector)), "'dead' of the detector. Must be bool"),
+        (lambda m: simulation.blackbody_movies(HOT, ENDS, 2, m.detector, m.rng), RANGE),
+    ],
+)
+def test_what_is_not_recorded(made: Made, call: Any, message: str) -> None:
+    """What the response, 16 bits or the detector do not hold, and missing variables, are named."""
+    with pytest.raises((TypeError, ValueError), match=message):
+        call(made)
+
+
+KELVIN = KNOWN.assign(noise=KNOWN["netd"])
+
+
+def test_same_seed_same_data() -> None:
     """The same seed gives the same data, and another seed gives others."""
 
     def record(seed: int) -> xr.Dataset:
         rng = np.random.default_rng(seed)
-        detector = simulation.pattern(rig, SHAPE, rng)
+        detector = simulation.pattern(RIG, SHAPE, rng)
         scene = simulation.walkers(TIME, SHAPE, GLASS, rng)
-        return simulation.capture(simulation.observe(scene, known, rng), detector)
+        return capture(observe(scene, KNOWN, rng), detector)
 
     xr.testing.assert_identical(record(1), record(1))
     assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9
-
-
-def test_detector_of_other_bands_is_refused(
-    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
-) -> None:
-    """Dead pixels of one band, and a capture without the bands, raise an error with the name."""
-    seen, dead = simulation.observe(twin, known, rng), detector["dead"].isel(band=slice(0, 1))
-    with pytest.raises(TypeError, match=r"of 'dead' of the detector. Must be bool"):
-        simulation.capture(seen, detector.drop_vars("dead").assign(dead=dead))
-    with pytest.raises(ValueError, match="of 'counts' of the corrected"):
-        simulation.capture(seen.rename(band="b"), detector)
-    for name in ("object_temperature", "background_temperature"):
-        with pytest.raises((TypeError, ValueError), match=f"'{name}'"):
-            simulation.observe(twin.drop_vars(name), known, rng)
-    with pytest.raises(ValueError, match="Invalid emissivity of the scene 86"):
-        simulation.observe(twin.assign(emissivity=100 * twin["emissivity"]), known, rng)
-    with pytest.raises(ValueError, match="Invalid units 'K' of 'noise'"):
-        simulation.observe(twin, known.assign(noise=known["netd"]), rng)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore
 
 from dbthermal import store
 from dbthermal.schema import Variable
@@ -164,6 +162,7 @@ def no_array(path: Path) -> Path:
     return path / "band"
 
 
+FILL = rb'("fill_value": )[^,]+'
 FAULTS: dict[str, Callable[[Path], Path]] = {
     "a chunk cut": spoilt("", lambda content: content[:-1]),
     "a chunk emptied": spoilt("", lambda _: b""),
@@ -171,6 +170,17 @@ FAULTS: dict[str, Callable[[Path], Path]] = {
     "no attributes": spoilt("zarr.json", lambda _: None),
     "no checksums": spoilt("checksums.sfv", lambda _: None),
     "checksums cut": spoilt("checksums.sfv", lambda content: content[: len(content) // 2]),
+    "a chunk of noise": spoilt("", lambda content: bytes(reversed(content)) + b"x"),
+    "metadata of an array lost": spoilt("band/zarr.json", lambda _: None),
+    "metadata of an array cut": spoilt("counts/zarr.json", lambda content: content[:-20]),
+    "metadata of another text": spoilt("counts/zarr.json", lambda _: b"[1, 2]\xff"),
+    "another type": spoilt("counts/zarr.json", lambda c: re.sub(rb"uint16|float32", b"int8", c)),
+    "another shape": spoilt("counts/zarr.json", lambda c: re.sub(rb"\d+,", b"1000000000,", c)),
+    "another fill value": spoilt("counts/zarr.json", lambda c: re.sub(FILL, rb"\g<1>7", c)),
+    "other attributes": spoilt(
+        "zarr.json", lambda c: c.replace(b'"attributes": {', b'"attributes": {"x": 1,')
+    ),
+    "an array renamed": lambda path: (path / "band").rename(path / "band2").with_name("band"),
     "no array": no_array,
     "an array of an earlier state": spoilt(
         "band/zarr.json", lambda content: content.replace(b'"shape"', b'"shape" ')
@@ -229,27 +239,6 @@ def test_recording_is_read_while_it_grows(tmp_path: Path) -> None:
     recording.append_log({"log_time": np.array([9.0]), "log_value": np.array([9.0])})
     recording.close()
     assert opened["log_value"].values.tolist() == [0.0, 0.0, 0.0]
-
-
-@pytest.mark.parametrize("stop", ["time/zarr.json", "time/c/0"])
-@pytest.mark.parametrize("late", [False, True])
-def test_recording_killed_while_its_time_is_written_opens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: str, *, late: bool
-) -> None:
-    """Until a recording is closed, what is there of its time is passed over."""
-    recording = record(tmp_path / "a.zarr", close=False)
-    write = LocalStore.set_sync
-
-    def killed(self: LocalStore, key: str, value: Buffer) -> None:
-        if late or key != stop:
-            write(self, key, value)
-        if key == stop:
-            raise OSError("killed")
-
-    monkeypatch.setattr(LocalStore, "set_sync", killed)
-    with pytest.raises(OSError, match="killed"):
-        recording.close(time=np.arange(6) / 60)
-    assert store.open_dataset(tmp_path / "a.zarr").load().sizes["time"] == 5
 
 
 def test_result_of_a_recording_cut_short_is_whole(stores: dict[str, Path], tmp_path: Path) -> None:

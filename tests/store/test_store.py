@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, cast
 
 import av
 import numpy as np
@@ -20,6 +20,7 @@ from PIL import Image
 from dbthermal import store
 
 RECORD: dict[str, Any] = {"parameters": {"frames": 3}, "commit": "unknown", "inputs": {}}
+CODED = ("_FillValue", "missing_value", "scale_factor", "add_offset")
 DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
 
 
@@ -48,12 +49,6 @@ def capture() -> xr.Dataset:
     )
 
 
-def contents(folder: Path) -> dict[Path, bytes]:
-    """Relative name and bytes of every file below a folder."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    return {path.relative_to(folder): path.read_bytes() for path in files}
-
-
 def test_dataset_comes_back_identical(capture: xr.Dataset, tmp_path: Path) -> None:
     """Values, dtypes, dims, coordinates and attributes survive, gaps and zeros included."""
     before = capture.copy(deep=True)
@@ -78,36 +73,18 @@ def test_any_array_comes_back(
     np.testing.assert_array_equal(store.open_dataset(path)["value"], values, strict=True)
 
 
-def test_opened_dataset_can_be_saved_again(capture: xr.Dataset, tmp_path: Path) -> None:
-    """Reading and writing a second time gives the same bytes, also onto the folder that is open."""
-    store.save(capture, tmp_path / "a.zarr", RECORD)
-    first = contents(tmp_path / "a.zarr")
-    store.save(store.open_dataset(tmp_path / "a.zarr"), tmp_path / "a.zarr", RECORD)
-    assert contents(tmp_path / "a.zarr") == first
-
-
 def test_a_save_replaces_all_or_nothing(capture: xr.Dataset, tmp_path: Path) -> None:
     """A failed one leaves the earlier result, and nothing beside it; a later one none of it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
-    first = contents(tmp_path)
+    first = store.checksum(tmp_path / "a.zarr")
     broken = capture.assign(material=("band", np.array([object(), object()])))
     with pytest.raises((TypeError, ValueError)):
         store.save(broken, tmp_path / "a.zarr", RECORD)
-    assert contents(tmp_path) == first
+    assert store.checksum(tmp_path / "a.zarr") == first
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
     store.save(capture[["valid"]], tmp_path / "a.zarr", RECORD)
     assert list(store.open_dataset(tmp_path / "a.zarr").data_vars) == ["valid"]
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
-
-
-@pytest.mark.parametrize("name", ["_FillValue", "missing_value", "scale_factor", "add_offset"])
-def test_attributes_that_change_numbers(capture: xr.Dataset, tmp_path: Path, name: str) -> None:
-    """What would open as other numbers than were saved is refused."""
-    changed = capture.assign(counts=capture["counts"].assign_attrs({name: 2}))
-    with pytest.raises(ValueError, match=f"Invalid attribute '{name}' of 'counts'"):
-        store.save(changed, tmp_path / "a.zarr", RECORD)
-    assert not (tmp_path / "a.zarr").exists()
-    with pytest.raises(TypeError, match="Invalid dataset of type DataArray"):
-        store.save(capture["counts"], tmp_path / "a.zarr", RECORD)  # type: ignore[arg-type]
 
 
 def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) -> None:
@@ -118,6 +95,8 @@ def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) ->
     with pytest.raises(ValueError, match=r"Invalid path .*n\.json', inside a store"):
         store.save_numbers({"a": 1}, tmp_path / "a.zarr" / "counts" / "n.json", RECORD)
     store.open_dataset(tmp_path / "a.zarr").load()
+    with pytest.raises(TypeError, match="Invalid dataset of type DataArray"):
+        store.save(capture["counts"], tmp_path / "c.zarr", RECORD)  # type: ignore[arg-type]
 
 
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
@@ -129,27 +108,6 @@ def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
         opened.load()
     with pytest.raises(FileNotFoundError, match=r"No dataset '.*b\.zarr'"):
         store.open_dataset(tmp_path / "b.zarr")
-
-
-@pytest.mark.parametrize(
-    ("shape", "dtype", "expected"),
-    [
-        ((2, 350, 4, 640), "uint16", (2, 350, 2, 640)),
-        ((512, 640), "uint16", (512, 640)),
-        ((30000, 2, 40), "float32", (30000, 1, 10)),
-        ((350, 1, 640), "float32", (350, 1, 640)),
-        ((350, 640, 8), "float32", (350, 94, 8)),
-        ((0, 8, 10), "float64", (1, 8, 10)),
-    ],
-)
-def test_chunks(
-    tmp_path: Path, shape: tuple[int, ...], dtype: str, expected: tuple[int, ...]
-) -> None:
-    """All frames of the fewest whole rows that have 1 MiB, or of parts of a row that do."""
-    values = xr.Variable(("band", "time", "y", "x")[-len(shape) :], np.zeros(shape, dtype))
-    store.save(xr.Dataset({"counts": values}), tmp_path / "a.zarr", RECORD)
-    content = json.loads((tmp_path / "a.zarr" / "counts" / "zarr.json").read_text())
-    assert tuple(content["chunk_grid"]["configuration"]["chunk_shape"]) == expected
 
 
 def test_numbers_come_back_sorted(tmp_path: Path) -> None:
@@ -196,20 +154,18 @@ def test_damaged_numbers_are_refused(text: str, rule: str, tmp_path: Path) -> No
 
 def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
     """Any bit that flips in a file of numbers is an error that names it, or changes no number."""
-    numbers: dict[str, store.Number] = {"rmse_K": 0.21, "frames": 350, "method": "subspace"}
-    store.save_numbers(numbers, tmp_path / "a.json", RECORD)
-    whole, refused = (tmp_path / "a.json").read_bytes(), 0
-    bits = range(0, 8 * len(whole), 13)
-    for bit in bits:
+    store.save_numbers({"rmse_K": 0.21, "method": "subspace"}, path := tmp_path / "a.json", RECORD)
+    whole, numbers, refused = path.read_bytes(), store.read_numbers(path), 0
+    for bit in range(0, 8 * len(whole), 13):
         content = bytearray(whole)
         content[bit // 8] ^= 1 << bit % 8
-        (tmp_path / "a.json").write_bytes(content)
+        path.write_bytes(content)
         try:
-            assert store.read_numbers(tmp_path / "a.json") == numbers, bit
+            assert store.read_numbers(path) == numbers, bit
         except ValueError as error:
             assert "a.json" in str(error)  # noqa: PT017
             refused += 1
-    assert refused > 0.97 * len(bits)
+    assert refused > 0.97 * len(whole) * 8 / 13
 
 
 def test_numbers_without_a_checksum_are_read_with_a_warning(tmp_path: Path) -> None:
@@ -282,14 +238,13 @@ def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
     return [np.full((*shape, 3), 40 * index, np.uint8) for index, shape in enumerate(shapes, 1)]
 
 
-Codec = Literal["vp9", "h264"]
-
-
-@pytest.mark.parametrize("codec", get_args(Codec))
-def test_video_comes_back(tmp_path: Path, codec: Codec) -> None:
-    """A video has its frames, rate and nearly its colours, and the provenance as a comment."""
-    frames = film((64, 96), (64, 96), (64, 96))
-    store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0, codec=codec)
+@pytest.mark.parametrize("options", [{}, {"codec": "h264"}])
+def test_video_comes_back(tmp_path: Path, options: Any) -> None:
+    """A video, VP9 unless asked for, has its frames, rate, nearly its colours, and provenance."""
+    codec, frames = options.get("codec", "vp9"), film((64, 96), (64, 96), (64, 96))
+    for name in ("a.mp4", "b.mp4"):
+        store.save_video(frames, tmp_path / name, RECORD, rate=10.0, **options)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
     with av.open(tmp_path / "a.mp4") as video:
         assert video.streams.video[0].codec_context.codec.canonical_name == codec
         assert video.streams.video[0].average_rate == 10
@@ -310,19 +265,11 @@ def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message:
     """Frames that cannot be a video raise a ValueError, and no file is left behind."""
     with pytest.raises(ValueError, match=message):
         store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
-    assert not any(tmp_path.iterdir())
-
-
-def test_h264_is_a_choice(tmp_path: Path) -> None:
-    """Unless asked for, a video is VP9, the same bytes each time; an unknown codec is refused."""
-    frames = film((32, 48), (32, 48))
-    for name in ("a.mp4", "b.mp4"):
-        store.save_video(frames, tmp_path / name, RECORD, rate=10.0)
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
-    with av.open(tmp_path / "a.mp4") as video:
-        assert video.streams.video[0].codec_context.codec.canonical_name == "vp9"
     with pytest.raises(ValueError, match=r"Invalid codec 'gif'. Must be one of \['h264', 'vp9'"):
-        store.save_video(frames, tmp_path / "c.mp4", RECORD, rate=10.0, codec=cast("Codec", "gif"))
+        store.save_video(
+            film((32, 48)), tmp_path / "c.mp4", RECORD, rate=10.0, codec=cast(Any, "gif")
+        )
+    assert not any(tmp_path.iterdir())
 
 
 def test_text_keeps_its_record(tmp_path: Path) -> None:
@@ -360,14 +307,14 @@ def test_rows_keep_the_attributes(tmp_path: Path, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("change", "named"),
-    {
-        "bands": (lambda one: one.isel(band=[1, 0]), "'band' of rows 1"),
-        "times": (lambda one: one.assign_coords(time=one.time + 1.0), "'time' of rows 1"),
-        "unit": (lambda one: one.assign(counts=one.counts.assign_attrs(units="K")), "'counts'"),
-        "type": (lambda one: one.astype(np.float64), "'counts' of rows 1"),
-        "frames": (lambda one: one.isel(time=slice(2)), "of rows 1"),
-        "name": (lambda one: one.rename(counts="c"), "with, or without"),
-    }.values(),
+    [
+        (lambda one: one.isel(band=[1, 0]), "'band' of rows 1"),
+        (lambda one: one.assign_coords(time=one.time + 1.0), "'time' of rows 1"),
+        (lambda one: one.assign(counts=one.counts.assign_attrs(units="K")), "'counts'"),
+        (lambda one: one.astype(np.float64), "'counts' of rows 1"),
+        (lambda one: one.isel(time=slice(2)), "of rows 1"),
+        (lambda one: one.rename(counts="c"), "with, or without"),
+    ],
 )
 def test_rows_of_another_kind_are_refused(
     tmp_path: Path, change: Callable[[xr.Dataset], xr.Dataset], named: str
@@ -384,23 +331,21 @@ def test_rows_of_another_kind_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("dataset", "error", "named"),
-    {
-        "none": (xr.Dataset({"a": ("x", np.array(["a", None], object))}), TypeError, "of 'a'"),
-        "long": (xr.Dataset({"a": ("x", np.ones(2, np.longdouble))}), TypeError, "of 'a'"),
-        "bytes": (xr.Dataset({"a": 1.0}, attrs={"z": b"x"}), TypeError, "'z' of the dataset"),
-        "dtype": (xr.Dataset({"a": ("x", [0.5], {"dtype": "bool"})}), ValueError, "'dtype' of 'a'"),
-        "since": (
-            xr.Dataset({"a": ("x", [0.5], {"units": "seconds since 2000-01-01"})}),
-            ValueError,
-            "'units' of 'a'",
-        ),
-        "names": (xr.Dataset({"a": ("x", [0.5], {"coordinates": "b"})}), ValueError, "'coordin"),
-    }.values(),
+    ("values", "attrs", "named"),
+    [
+        (np.array(["a", None], object), {}, "of 'a'"),
+        (np.ones(2, np.longdouble), {}, "of 'a'"),
+        ([0.5], {"z": b"x"}, "'z' of 'a'"),
+        ([0.5], {"dtype": "bool"}, "'dtype' of 'a'"),
+        ([0.5], {"units": "seconds since 2000-01-01"}, "'units' of 'a'"),
+        ([0.5], {"coordinates": "b"}, "'coordin"),
+        *(([2], {name: 2}, f"Invalid attribute '{name}' of 'a'") for name in CODED),
+    ],
 )
 def test_what_would_open_as_other_values_is_refused(
-    tmp_path: Path, dataset: xr.Dataset, error: type[Exception], named: str
+    tmp_path: Path, values: Any, attrs: dict[str, Any], named: str
 ) -> None:
     """Values that zarr cannot hold, and attributes that it would decode by, are named."""
-    with pytest.raises(error, match=named):
-        store.save(dataset, tmp_path / "a.zarr", store.provenance({}))
+    with pytest.raises((TypeError, ValueError), match=named):
+        store.save(xr.Dataset({"a": ("x", values, attrs)}), tmp_path / "a.zarr", RECORD)
+    assert not (tmp_path / "a.zarr").exists()
