@@ -22,6 +22,7 @@ from dbthermal import (
     separation,
     simulation,
 )
+from reproduction import scales
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -121,7 +122,7 @@ STD = (0.1, 0.1)
 CALLS: dict[str, Callable[[xr.Dataset], Any]] = {
     **{f"solve {method}": partial(solved, method) for method in METHODS},
     "separated": separated,
-    "uncalibrated_reflection": lambda it: separation.uncalibrated_reflection(it["counts"]),
+    "uncalibrated_reflection": lambda it: scales.uncalibrated_reflection(it["counts"]),
     "correlation": lambda it: metrics.correlation(it["counts"][0], it["counts"][1]),
     "noise": lambda it: noise.estimate_bands(films(it), TIME),
     "second_difference": lambda it: noise.second_difference(films(it)[0], TIME),

@@ -9,7 +9,6 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 
 from dbthermal.figures import drawing
 from dbthermal.figures._calibration import (
-    condition_matrix,
     emissivity_bars,
     emissivity_by_contact,
     gain_offset_maps,
@@ -33,7 +32,6 @@ __all__ = [
     "FilmPanel",
     "LiveFigure",
     "Panel",
-    "condition_matrix",
     "drawing",
     "emissivity_bars",
     "emissivity_by_contact",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection, unscaled
+from dbthermal.separation._reflection import reflected_change
 from dbthermal.separation._run import run
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
@@ -39,8 +39,6 @@ __all__ = [
     "run",
     "separate",
     "solve",
-    "uncalibrated_reflection",
-    "unscaled",
 ]
 __dir__ = __all__.copy
 

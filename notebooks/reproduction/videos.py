@@ -16,8 +16,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from dbthermal import metrics, separation
-from reproduction import palettes, parallax
+from dbthermal import metrics
+from reproduction import palettes, parallax, scales
 
 Array = npt.NDArray[np.float64]
 
@@ -188,7 +188,7 @@ class Comparison:
     """A scene separated in several ways, each beside the authors' maps."""
 
     undone: xr.DataArray  # inputs (band, time, y, x) without the frames' scale, where it allows
-    separated: xr.Dataset  # from `separation.uncalibrated_reflection` of that
+    separated: xr.Dataset  # from `scales.uncalibrated_reflection` of that
     scores: xr.DataArray  # its agreement (time) [1] with the authors' first map
     edges: xr.Dataset  # from `parallax.edges_shift`
     reflections: xr.Dataset  # from `parallax.reflections_shift`
@@ -204,7 +204,7 @@ def compare(scene: Scene, number: int) -> Comparison:
     change together (correlation above 0.5), by the separation with the scale undone. A way in which
     the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
     """
-    undone = separation.unscaled(scene.movie, still(scene.outline))
+    undone = scales.unscaled(scene.movie, still(scene.outline))
     reflections = parallax.reflections_shift(undone, scene.outline)
     shared = parallax.shared_outline(scene.outline, reflections)
     found: dict[str, xr.Dataset] = {}
@@ -214,7 +214,7 @@ def compare(scene: Scene, number: int) -> Comparison:
         movie = undone if of_scale else scene.movie
         try:
             movie = parallax.moved(movie, reflections) if of_reflections else movie
-            parts = separation.uncalibrated_reflection(movie)
+            parts = scales.uncalibrated_reflection(movie)
         except ValueError as error:
             left_out[way] = str(error)
         else:

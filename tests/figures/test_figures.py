@@ -81,12 +81,6 @@ def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.truth_and_estimate(separated().assign_attrs(attrs), separated(fill), (1, 2))
 
 
-def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
-    """Draw the condition number of a pair of bands, infinite on the diagonal."""
-    matrix = fill * array("first second", 2, 2, **attrs)
-    return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
-
-
 def draw_plan(**attrs: object) -> Figure:
     """Draw the expected accuracy of two materials by filter and by length of the film."""
     names = {"material": ["glass", "slate"], "filter": ["9.5", "10.6"]}
@@ -125,7 +119,6 @@ DRAWN: dict[str, tuple[Callable[..., Figure], tuple[str, ...]]] = {
     ),
     "emissivity_by_contact": (draw_contact, ("emissivity [1]",)),
     "emissivity_bars": (draw_bars, ("band emissivity [1]",)),
-    "condition_matrix": (draw_condition, ("condition number [1]",)),
     "truth_and_estimate": (draw_truth, CELSIUS),
     "separated_frames": (draw_frames, LABELS),
     "separated_temperatures": (draw_temperatures, KELVINS),
@@ -154,9 +147,7 @@ def test_figure(name: str) -> None:
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
 
-@pytest.mark.parametrize(
-    "name", ["gain_offset_maps", "separated_frames", "truth_and_estimate", "condition_matrix"]
-)
+@pytest.mark.parametrize("name", ["gain_offset_maps", "separated_frames", "truth_and_estimate"])
 def test_nothing_but_nan(name: str) -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
     figure = DRAWN[name][0](fill=np.nan)

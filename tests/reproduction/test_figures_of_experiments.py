@@ -30,6 +30,12 @@ def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.compared_reflections(movie, movie, array("time", 2) - 300.5)
 
 
+def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the condition number of a pair of bands, infinite on the diagonal."""
+    matrix = fill * array("first second", 2, 2, **attrs)
+    return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
+
+
 def draw_scores(**attrs: object) -> Figure:
     """Draw the scores of two quantities."""
     parts = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
@@ -139,10 +145,18 @@ def draw_offsets(**attrs: object) -> Figure:
 
 def test_nothing_but_nan() -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
-    for draw in (draw_compared, draw_pooled):
+    for draw in (draw_compared, draw_condition, draw_pooled):
         figure = draw(fill=np.nan)
         figure.draw_without_rendering()
         assert figure.axes
+
+
+def test_condition_numbers_of_pairs() -> None:
+    """Each pair of different bands has its number, and the bar says what it is."""
+    matrix, bar = draw_condition().axes
+    expected = array("first second", 2, 2).values[[0, 1], [1, 0]]
+    assert [text.get_text() for text in matrix.texts] == [f"{value:.0f}" for value in expected]
+    assert bar.get_ylabel() == "condition number [1]"
 
 
 def test_errors_are_in_units_of_their_bound() -> None:
@@ -157,6 +171,7 @@ DRAWN: dict[str, Callable[..., Figure]] = {
     "accuracy": draw_accuracy,
     "error_bar_calibration": draw_scores,
     "compared_reflections": draw_compared,
+    "condition_matrix": draw_condition,
     "error_over_noise": draw_noise,
     "emissivity_errors": draw_emissivity,
     "reductions": lambda **attrs: figures.reductions(two("term", **attrs), [90.0, 5.0]),

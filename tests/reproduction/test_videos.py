@@ -9,8 +9,7 @@ import pytest
 import xarray as xr
 from matplotlib import colormaps
 
-from dbthermal import separation
-from reproduction import parallax
+from reproduction import parallax, scales
 from reproduction import videos as published
 
 Floats = npt.NDArray[np.float64]
@@ -113,7 +112,7 @@ def outline() -> xr.DataArray:
 def test_displacement_of_the_reflections(apart: tuple[float, float]) -> None:
     """It is right to 0.3 pixel, whatever the still edges say, and undone there is none."""
     scene, _ = stage(3, apart)
-    undone = separation.unscaled(labelled(shown(scene)), published.still(outline()))
+    undone = scales.unscaled(labelled(shown(scene)), published.still(outline()))
     found = parallax.reflections_shift(undone, outline())
     np.testing.assert_allclose(found["shift"], apart, rtol=0, atol=0.3)
     assert (found["low"] <= np.array(apart) + 0.5).all()

@@ -1,4 +1,4 @@
-"""Figures of the experiments: accuracy, error bars, limits, comparisons, nuisances, twins."""
+"""Figures of the experiments: accuracy, filters, limits, comparisons, nuisances, twins."""
 
 from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
 from reproduction.figures.comparison import (
@@ -9,6 +9,7 @@ from reproduction.figures.comparison import (
     reductions,
     sensitivity,
 )
+from reproduction.figures.filters import condition_matrix
 from reproduction.figures.limits import (
     error_over_bands,
     error_over_bound,
@@ -21,6 +22,7 @@ from reproduction.figures.twins import error_maps, thermocouples
 __all__ = [
     "accuracy",
     "compared_reflections",
+    "condition_matrix",
     "disturbances",
     "emissivity_errors",
     "emissivity_procedures",

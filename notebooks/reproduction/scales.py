@@ -1,0 +1,267 @@
+"""Pictures that are scaled anew in each frame, as the published videos are.
+
+Their scale is undone, and reflections are separated without a calibration.
+"""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import limits, schema
+from dbthermal._coordinates import laid_on
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+_FEWEST_STILL: Final = 200  # still pixels
+# Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
+_UNCORRELATED: Final = 0.1
+_FEWEST: Final = 100
+# Share of the variance of still surroundings over time that their scale must explain.
+_EXPLAINED: Final = 0.9
+_ROUNDS: Final = 20
+_TINY: Final = np.finfo(np.float64).tiny
+
+
+def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
+    r"""Undo the scale of each frame of two pictures, from surroundings that do not change.
+
+    A picture that is scaled anew in each frame shows still surroundings :math:`s(p)` as
+    :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's weights [1]_ by
+    each pixel's residual over time. A band where they explain less than 90 % of the weighted
+    variance over time stays as it is.
+
+    Parameters
+    ----------
+    signal : DataArray
+        (band, time, y, x), two bands in units of their own.
+    still : DataArray of bool
+        Pixels (y, x) off the object; a third of them may change after all.
+
+    Returns
+    -------
+    DataArray
+        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
+        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
+        that are, and `scale_explained`, each band's explained share.
+
+    Raises
+    ------
+    ValueError
+        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+
+    References
+    ----------
+    .. [1] Holland, Welsch (1977), doi:10.1080/03610927708827533
+
+    Examples
+    --------
+    A still picture whose contrast is scaled down to a tenth:
+
+    >>> gain, wall = np.linspace(1, 0.1, 50)[:, np.newaxis, np.newaxis], np.ones((20, 40))
+    >>> wall[:, :20] = 2.0
+    >>> signal = xr.DataArray([gain * wall] * 2, dims=("band", "time", "y", "x"))
+    >>> undone = unscaled(signal, xr.ones_like(signal[0, 0], dtype=bool))
+    >>> bool(undone.std("time").max() < 1e-9)
+    True
+    """
+    _check_signal(signal)
+    chosen = _pixels(still, signal, "the still pixels")
+    if chosen.sum() < _FEWEST_STILL:
+        raise ValueError(
+            f"Invalid still pixels: {chosen.sum()} of them. Must be at least {_FEWEST_STILL}."
+        )
+    result = signal.astype(np.promote_types(signal.dtype, np.float32))
+    gains, shares, bands = np.ones(signal.shape[:2]), [], []
+    for place, picture in enumerate(signal.values):
+        offset, gain, explained = _scale(picture.reshape(len(picture), -1)[:, chosen].astype(float))
+        shares.append(round(explained, 4))
+        if explained >= _EXPLAINED and gain.min() > 0:
+            gains[place] = gain
+            bands.append(str(signal["band"].values[place]))
+            result[place] = ((picture.T - offset) / gain).T
+    result = result.assign_coords(gain=(("band", "time"), gains, {"units": "1"}))
+    return result.assign_attrs(scale_undone=bands, scale_explained=shares)
+
+
+def uncalibrated_reflection(
+    signal: xr.DataArray,
+    *,
+    mask: xr.DataArray | None = None,
+    order: int = 9,
+    correlated: float = 0.5,
+) -> xr.Dataset:
+    r"""Separate rapid, correlated changes from slow ones in two bands of any unit.
+
+    Without a response there are no temperatures, but rapid changes are still the background's.
+    Smooth functions of time, which hold the object's change, are projected out of both bands. Gain
+    and offset errors of each frame, rapid and small, are fitted to the uncorrelated pixels
+    (correlation below 0.1) and subtracted; where large or slow ones were undone before, a `gain`
+    weights the frames by their noise. With :math:`\lambda` the noise variance of the second band
+    over that of the first there, the ratio k of a pixel is that of Deming's regression [2]_, the
+    pooled ratio is its median over the correlated pixels, and the reflection in the first band's
+    unit is the best linear estimate
+
+    .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
+
+    Parameters
+    ----------
+    signal : DataArray
+        (band, time, y, x), two bands in units of their own, `time` [s]; the coordinate `gain`
+        (band, time) [1], if it has one, is what the noise of each frame was divided by.
+    mask : DataArray, optional
+        Pixels (y, x) of the object; all if not given.
+    order : int
+        Number of smooth functions.
+    correlated : float
+        Correlation from which a pixel enters the pooled ratio.
+
+    Returns
+    -------
+    Dataset
+        `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission` (time, y, x),
+        the first band less the reflection, in the first band's unit; attributes `pooled_ratio`,
+        `noise_ratio`, `correlated_pixels`, `order`, and those of the signal.
+
+    Raises
+    ------
+    ValueError
+        If dims or bands are wrong, a value is not finite, the correlation is not in (0, 1), or
+        fewer than 100 pixels are uncorrelated or correlated.
+
+    References
+    ----------
+    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334, equation 22
+    .. [2] Fuller (1987), Measurement Error Models, doi:10.1002/9780470316665
+
+    Examples
+    --------
+    A warming object whose left half reflects a flicker, twice as strong in the second band:
+
+    >>> rng, time = np.random.default_rng(1), np.arange(200) / 10
+    >>> warming = np.arange(10)[:, np.newaxis] + time[:, np.newaxis, np.newaxis] / 4
+    >>> flicker = rng.integers(0, 2, (200, 1, 1)) * (np.arange(30) < 15)
+    >>> movies = [warming + k * flicker + rng.normal(0, 0.1, (200, 10, 30)) for k in (0.6, 1.2)]
+    >>> signal = xr.DataArray(movies, dims=("band", "time", "y", "x"), coords={"time": time})
+    >>> reflection = uncalibrated_reflection(signal)
+    >>> round(reflection.attrs["pooled_ratio"], 1), reflection.attrs["correlated_pixels"]
+    (2.0, 150)
+    """
+    _check_signal(signal)
+    if not 0 < correlated < 1:
+        raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
+    everywhere = np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
+    inside = everywhere if mask is None else _pixels(mask, signal, "the mask")
+    frames, image = signal.sizes["time"], signal.shape[2:]
+    values = signal.values.reshape(2, frames, -1).astype(np.float64)
+    weight = _frame_weight(signal)
+    functions, _ = np.linalg.qr(weight * limits.polynomial_basis(signal["time"].values, order))
+    rapid = weight * values
+    rapid -= [functions @ (functions.T @ part) for part in rapid]
+    quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
+    _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
+    for band, mean in enumerate(values.mean(axis=1)):
+        offset, gain = _frame_errors(rapid[band], mean, quiet)
+        rapid[band] -= offset[:, np.newaxis] + gain[:, np.newaxis] * mean
+    correlation = _correlation(rapid)
+    quiet = inside & (np.abs(correlation) < _UNCORRELATED)
+    moving = inside & (correlation > correlated)
+    _require(moving, f"correlation above {correlated}")
+    # lambda = s_2^2 / s_1^2
+    power = np.einsum("btp,btp->bp", rapid, rapid)
+    noise_ratio = float(power[1, quiet].mean() / power[0, quiet].mean())
+    # Principal axis of the scatter S whitened by the noise: k = sqrt(lambda) tan(phi),
+    # tan(2 phi) = 2 sqrt(lambda) S_12 / (lambda S_11 - S_22).
+    cross = 2.0 * np.einsum("tp,tp->p", *rapid) * np.sqrt(noise_ratio)
+    angle = 0.5 * np.arctan2(cross, noise_ratio * power[0] - power[1])
+    ratio = np.sqrt(noise_ratio) * np.tan(angle)
+    pooled = float(np.median(ratio[moving]))
+    # r = (r_1 / s_1^2 + k r_2 / s_2^2) / (1 / s_1^2 + k^2 / s_2^2)
+    reflection = rapid[0] + pooled / noise_ratio * rapid[1]
+    reflection /= weight * (1.0 + pooled**2 / noise_ratio)
+    units = {"units": signal.attrs["units"]} if "units" in signal.attrs else {}
+    result = xr.Dataset(
+        coords={name: signal[name] for name in ("time", "y", "x") if name in signal.coords},
+        attrs={
+            **signal.attrs,
+            "pooled_ratio": pooled,
+            "noise_ratio": noise_ratio,
+            "correlated_pixels": int(moving.sum()),
+            "order": order,
+        },
+    )
+    for name, part in (("ratio", ratio), ("correlation", correlation)):
+        result[name] = ("y", "x"), part.reshape(image), {"units": "1"}
+    for name, part in (("reflection", reflection), ("emission", values[0] - reflection)):
+        result[name] = ("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units
+    return result
+
+
+def _scale(values: Array) -> tuple[Array, Array, float]:
+    """Offset (time), gain (time) and explained share of still pixels (time, pixel)."""
+    mean = values.mean(axis=0)
+    change = values - mean
+    squares = np.einsum("tp,tp->p", change, change)
+    weight = np.ones(mean.size)
+    for _ in range(_ROUNDS):
+        # Exact: o + g s - mean is linear in the mean, as mean = mean(o) + mean(g) s.
+        offset, error = _frame_errors(change, mean, weight)
+        # sum_t (c - o - e m)^2, from products over time alone
+        power = squares - 2.0 * (offset @ change + mean * (error @ change))
+        power += offset @ offset + mean * (2.0 * (offset @ error) + mean * (error @ error))
+        weight = 1.0 / (1.0 + np.maximum(power, 0.0) / max(np.median(power), _TINY))
+    explained = 1.0 - float(weight @ power) / max(float(weight @ squares), _TINY)
+    return offset, 1.0 + error, explained
+
+
+def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:
+    """Offset and gain error (2, time) of frames that are the change (time, pixel) of some."""
+    centre = weight @ mean / weight.sum()
+    contrast = weight * (mean - centre)
+    gain = change @ contrast / max(contrast @ (mean - centre), _TINY)
+    return np.stack([change @ weight / weight.sum() - gain * centre, gain])
+
+
+def _check_signal(signal: xr.DataArray) -> None:
+    if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
+        raise ValueError(
+            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
+        )
+    if not np.all(schema.measured(signal.values)):
+        raise ValueError(
+            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
+        )
+
+
+def _pixels(mask: xr.DataArray, signal: xr.DataArray, label: str) -> Mask:
+    """Pixels (pixel) of a map of the signal's."""
+    if mask.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {mask.dims} of {label}. Must be ('y', 'x').")
+    return np.asarray(laid_on(mask, signal, label, "the signal").values.astype(bool).ravel())
+
+
+def _frame_weight(signal: xr.DataArray) -> Array:
+    """Weight (time, 1) of frames, inverse to the geometric mean of the bands' noise; mean 1."""
+    if "gain" not in signal.coords:
+        return np.ones((signal.sizes["time"], 1))
+    gain = schema.check_numbers(signal["gain"], "the gain", "1").transpose("band", "time").values
+    if not np.all(schema.measured(gain) & (gain > 0)):
+        raise ValueError(f"Invalid gain {np.min(gain)} of a frame. Must be finite and > 0.")
+    weight = np.exp(np.log(gain).mean(axis=0))
+    return np.asarray(weight / weight.mean())[:, np.newaxis]
+
+
+def _require(pixels: Mask, rule: str) -> None:
+    if pixels.sum() < _FEWEST:
+        raise ValueError(
+            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
+        )
+
+
+def _correlation(rapid: Array) -> Array:
+    """Correlation (pixel) of the two bands; 0 where a band does not change."""
+    cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
+    size = np.sqrt(np.prod(np.einsum("btp,btp->bp", rapid, rapid), axis=0))
+    return np.asarray(np.divide(cross, size, out=np.zeros_like(cross), where=size > 0))
