@@ -227,8 +227,8 @@ def test_intervals_hold_after_an_alignment(delay: float, kind: str, seeds: tuple
         result = separation.solve(align(capture), RIG.response())
         truth = warm["object_temperature"].interp(time=result["time"])
         score = abs(result["object_temperature"] - truth) / result["object_temperature_std"]
-        score = score.values[:, result["status"].values == 0]
-        scores.append(score[np.isfinite(score)])
+        unflagged = score.values[:, result["status"].values == 0]
+        scores.append(unflagged[np.isfinite(unflagged)])
     covered = float(np.mean(np.concatenate(scores) < 1.96))
     print(f"{delay} frames late, {kind}: cover {covered:.3f}")
     assert 0.93 <= covered <= 0.97
@@ -411,6 +411,9 @@ def half_lost(scene: xr.Dataset) -> xr.Dataset:
     return capture
 
 
+TEXT: Any = "0.1"
+HALF: Any = 2.5
+NOTHING: Any = None
 MILLISECONDS = xr.DataArray([0.0, 20.0], {"band": ["b0", "b1"]}, "band", attrs={"units": "ms"})
 
 
@@ -423,15 +426,15 @@ MILLISECONDS = xr.DataArray([0.0, 20.0], {"band": ["b0", "b1"]}, "band", attrs={
         (lambda s: recorded(s, 20), "Must increase and lie in"),
         (lambda _: align(unordered(), offset=0.0), r"exposure times of band 'b1': 0\.4 s"),
         (lambda _: align(ramp(), offset=np.nan), r"Invalid offset \[0\.0, nan\] s"),
-        (lambda _: align(ramp(), offset="0.1"), r"Invalid offset \[s\] '0.1'"),
+        (lambda _: align(ramp(), offset=TEXT), r"Invalid offset \[s\] '0.1'"),
         (lambda _: align(ramp(), offset=MILLISECONDS), "Invalid units 'ms' of the time offset"),
         (lambda _: align(ramp(), offset=0.1, clock="7"), r"Unknown clock '7'\. Must be one of"),
         (lambda _: align(ramp(3), offset=0.1), "Must be one for each"),
         (lambda _: time_offset(ramp(), band="b0"), r"band 'b0'\. Must be another than the fi"),
         (lambda _: time_offset(ramp(), search=11), r"Invalid search \[frame\] 11"),
-        (lambda _: time_offset(ramp(), search=2.5), r"search \[frame\] 2.5. Must be a whole num"),
+        (lambda _: time_offset(ramp(), search=HALF), r"search \[frame\] 2.5. Must be a whole num"),
         (lambda _: exposure_times(ramp().drop_vars("counts")), "Missing variable 'counts'"),
-        (lambda _: fill_times(None), r"Invalid exposure times \[s\] None"),
+        (lambda _: fill_times(NOTHING), r"Invalid exposure times \[s\] None"),
     ],
 )
 def test_what_gives_no_alignment(scene: xr.Dataset, call: Any, message: str) -> None:

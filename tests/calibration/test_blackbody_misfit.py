@@ -57,7 +57,7 @@ def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
     def clipped(counts: Floats, level: float) -> Floats:  # a soft limit: a fiftieth of the slope
         return np.asarray(np.where(counts > level, level + (counts - level) / 50.0, counts))
 
-    return {
+    ways: dict[str, Floats] = {
         "top": clipped(c, middle),
         "top, last": clipped(c, 0.5 * (c[-2] + c[-1])),
         "floor": -clipped(-c, -middle),
@@ -74,7 +74,8 @@ def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
         "drift": c + s * 4.0 * np.sin((t - 283.0) / 10.0),
         "swapped": c[[0, 2, 1, *range(3, len(c))]],
         "wrapped": np.where(c > middle, c - 65536.0, c).astype(np.int32),
-    }[bad]
+    }
+    return ways[bad]
 
 
 def refusal(bad: str, name: str, number: int, noise: float | None) -> str:

@@ -167,9 +167,9 @@ def test_bad_counts(change: Change, message: str) -> None:
         calibration.fit_response(change(blackbody()))
 
 
-def at(counts: xr.DataArray, *ends: float) -> xr.DataArray:
+def at(counts: xr.DataArray, first: float, last: float) -> xr.DataArray:
     """The counts at other temperatures."""
-    return counts.assign_coords(temperature=np.linspace(*ends, counts.sizes["temperature"]))
+    return counts.assign_coords(temperature=np.linspace(first, last, counts.sizes["temperature"]))
 
 
 @pytest.mark.parametrize(

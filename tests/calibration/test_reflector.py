@@ -28,8 +28,12 @@ NO_ERRORS = Bench(
     contact=(0.0, 0.0),
     foil_emissivity=0.0,
     mirrored_excess=(0.0, 0.0),
-    **dict.fromkeys(("reading_std", "blackbody_std", "foil_std"), 1e-9),
-    **dict.fromkeys(("probe_tolerance", "logger_tolerance", "blackbody_tolerance"), 0.0),
+    reading_std=1e-9,
+    blackbody_std=1e-9,
+    foil_std=1e-9,
+    probe_tolerance=0.0,
+    logger_tolerance=0.0,
+    blackbody_tolerance=0.0,
 )
 
 

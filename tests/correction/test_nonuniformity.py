@@ -173,7 +173,7 @@ HOLED["counts"][0, 1, 0, 1] = np.nan
     ],
 )
 def test_frames_that_tell_no_gain(
-    counts: xr.Dataset, options: dict[str, float], message: str
+    counts: xr.Dataset, options: dict[str, Any], message: str
 ) -> None:
     """One temperature, too few usable pixels, a wrong label, and no threshold."""
     with pytest.raises(ValueError, match=message):

@@ -1,5 +1,6 @@
 """Drift in time and lag of the detector: each simulated with a known truth, and undone."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 from dbthermal import schema, simulation
 from dbthermal.correction import mark_shutter, undo_drift, undo_lag
 
-ORDERS: tuple[object, ...] = (np.inf, 61, 2.5, "3", True, 1)
-CONSTANTS: tuple[object, ...] = (0.0, "0.01", b"3", True, np.timedelta64(10, "ms"), [0.01], 10.0)
+ORDERS: tuple[Any, ...] = (np.inf, 61, 2.5, "3", True, 1)
+CONSTANTS: tuple[Any, ...] = (0.0, "0.01", b"3", True, np.timedelta64(10, "ms"), [0.01], 10.0)
 
 
 def patch() -> xr.DataArray:
@@ -56,24 +57,25 @@ def test_drift_leaves_the_steps() -> None:
 
 HOLED = still()
 HOLED["counts"][1, 7, 2, 3] = np.nan
+NO_PATCH: Any = {}
 NAMED = xr.DataArray([10.0, 12.0], {"band": ["8-14", "9.5"]}, "band")
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda one=one: undo_drift(still(), patch(), order=one), "Invalid order of the drift")
-        for one in ORDERS
+        (partial(undo_drift, still(), patch(), order=order), "Invalid order of the drift")
+        for order in ORDERS
     ]
     + [
-        (lambda one=one: undo_lag(still(), one), r"Invalid time_constant \[s\]")
-        for one in CONSTANTS
+        (partial(undo_lag, still(), constant), r"Invalid time_constant \[s\]")
+        for constant in CONSTANTS
     ]
     + [
         (lambda: undo_drift(still(), patch() & False), "it marks no good pixel"),
         (lambda: undo_drift(still(), patch()[:, :5]), "Invalid size 5 of 'x' of the reference"),
         (lambda: undo_drift(still(), patch().astype(int)), "Invalid dtype int64 of the reference"),
-        (lambda: undo_drift(still(), {}), "Invalid reference of type dict"),
+        (lambda: undo_drift(still(), NO_PATCH), "Invalid reference of type dict"),
         (lambda: undo_drift(undo_drift(still(), patch()), patch()), "the drift was undone before"),
         (lambda: undo_drift(HOLED, patch()), "NaN in frame 7 of band '9.5'"),
         (lambda: undo_lag(still(), NAMED), r"\[s\] 12.0. Must be at most 1: seconds, not millisec"),

@@ -257,7 +257,7 @@ def test_what_is_not_recorded(made: Made, call: Any, message: str) -> None:
         call(made)
 
 
-KELVIN = KNOWN.assign(noise=KNOWN["netd"])
+KELVIN: xr.Dataset = KNOWN.assign(noise=KNOWN["netd"])
 
 
 def test_same_seed_same_data() -> None:
