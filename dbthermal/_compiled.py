@@ -99,7 +99,8 @@ class _Cache(FunctionCache):
             _LOGGER.debug("Compiled code is kept as '%s'.", path)
         except OSError as error:
             _LOGGER.warning("Compiled code is not kept as '%s': %s.", path, error)
-            part.unlink(missing_ok=True)
+            with suppress(OSError):
+                part.unlink()
 
     def in_turn(self, compile_for: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """Compilation that frees the lock of its file at its end, however it ends."""
@@ -110,7 +111,9 @@ class _Cache(FunctionCache):
             try:
                 return compile_for(sig)
             finally:
-                while len(files) > held:  # closed, a file is free
+                while len(files) > held:
+                    with suppress(OSError):  # explicitly: a forked process may have the file, too
+                        fcntl.flock(files[-1], fcntl.LOCK_UN)
                     os.close(files.pop())
 
         return compile_in_turn
@@ -195,14 +198,17 @@ def _of_function(function: Any, seen: dict[int, int]) -> Iterator[str]:
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     free = dict(zip(function.__code__.co_freevars, cells, strict=True))
     yield from _described(function.__defaults__, seen)
+    yield from _described(sorted((function.__kwdefaults__ or {}).items()), seen)
     yield from _of_code(function.__code__, {**function.__globals__, **free}, seen)
 
 
 def _of_code(code: CodeType, names: Mapping[str, Any], seen: dict[int, int]) -> Iterator[str]:
     """Instructions of code, which depend on no comment, docstring or line."""
-    yield f"arguments {code.co_varnames[: code.co_argcount]}"
+    yield f"arguments {code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]}"
     owner: Any = None  # module or type of which the next instruction may take a name
     for step in dis.get_instructions(code):
+        if step.opname in {"EXTENDED_ARG", "CACHE", "PUSH_NULL"}:  # of the encoding alone
+            continue
         yield step.opname
         loaded = None
         if step.opname == "LOAD_CONST" and isinstance(step.argval, CodeType):

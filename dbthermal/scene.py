@@ -150,7 +150,8 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
         kind = type(options).__name__
         raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
     by_name = [one for one in signature(step).parameters.values() if one.kind is one.KEYWORD_ONLY]
-    known = [one.name for one in by_name if one.name != "lazy"]
+    hidden = {"lazy", "reflection_shift"} if step is align else {"lazy"}
+    known = [one.name for one in by_name if one.name not in hidden]
     for option in options:
         if option not in known:
             raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {known}.")
@@ -166,11 +167,10 @@ def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Capture on one clock, and the shift of its reflections; None where they are not apart."""
-    options = dict(options)
+    options = {name: value for name, value in options.items() if value is not None}
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
     scale = Scale.of_response(response, [str(name) for name in corrected["band"].values])
-    options.pop("reflection_shift", None)
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = joint.apart(corrected, scale, **options)

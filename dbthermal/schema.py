@@ -129,7 +129,7 @@ class Status(Flags):
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
-    COMPLETED_FRAMES = 1 << 19, "completed, not measured: over a seventh of the pixel's frames"
+    COMPLETED_FRAMES = 1 << 19, "completed, not measured: 15 % of the pixel's frames or more"
     NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 

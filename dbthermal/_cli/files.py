@@ -173,7 +173,8 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
         f"{name}_s": np.round(one, 6).tolist() for name, one in found.items() if one is not None
     }
     said |= {"frames_lost": dataset.attrs["frames_lost"]} if "frames_lost" in dataset.attrs else {}
-    if "transform" in dataset.attrs and "y" in dataset.sizes:
+    views = len(dataset.attrs.get("transform", ())) / 9  # a matrix each
+    if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
         said["view_shift_pixel"] = _view_shifts(dataset)
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):

@@ -77,12 +77,12 @@ def compare(
         result = _compared(corrected, scale, together, search=search, clock=clock, lazy=lazy)
     else:
         result = _at_one_place(corrected, search)
-    if corrected.attrs.get("offset_by") != "caller" or not np.isfinite(result.std):
+    if corrected.attrs.get("offset_by") != "caller":
         return result
     frame = clocks.frame_period(clocks.exposure_times(corrected)[0])
     off = float(result.offset.values[np.argmax(np.abs(result.offset.values))])
-    if abs(off) <= max(_PRECISION * frame, _SIGMAS * result.std):
-        return replace(result, offset=together)
+    if not abs(off) > max(_PRECISION * frame, _SIGMAS * result.std):  # or of no deviation
+        return replace(result, offset=together, doubts=())
     told = f"by {off:.4f} +- {result.std:.4f} s, {off / frame:.2f} frames"
     doubt = (
         f"The stated offset of the recordings, {corrected.attrs.get('offset')} s, is contradicted "

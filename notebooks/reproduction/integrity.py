@@ -63,7 +63,7 @@ def reading(path: Path) -> Iterator[Path]:
     try:
         _compare(path, files(*made))
         yield path
-    except Exception as error:
+    except (OSError, ValueError) as error:  # others are of the program, or of the machine
         run, stem = made
         withdraw(run, stem)
         raise DamagedError(

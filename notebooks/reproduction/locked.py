@@ -140,12 +140,15 @@ def _processes() -> Iterable[tuple[int, int, bool]]:
 def end_descendants() -> None:
     """End all that this process started: by SIGTERM, and after `_GRACE` by SIGKILL."""
     start = time.monotonic()
-    asked: set[int] = set()
-    while left := descendants(os.getpid()):
+    asked, foreign = set[int](), set[int]()  # foreign: of another user
+    while left := {*descendants(os.getpid())} - foreign:
         killed = time.monotonic() > start + _GRACE
-        for number in left if killed else set(left) - asked:
-            with suppress(ProcessLookupError, PermissionError):
-                os.kill(number, signal.SIGKILL if killed else signal.SIGTERM)
+        for number in left if killed else left - asked:
+            with suppress(ProcessLookupError):
+                try:
+                    os.kill(number, signal.SIGKILL if killed else signal.SIGTERM)
+                except PermissionError:
+                    foreign.add(number)
         asked.update(left)
         time.sleep(0.02)
 

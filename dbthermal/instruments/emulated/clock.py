@@ -73,22 +73,32 @@ class EmulatedClock(Clock):
     @contextmanager
     def hold(self, lock: threading.Lock) -> Iterator[None]:
         """Hold a lock while a block lasts; other threads run until it is free."""
-        self._wait(lambda: lock.acquire(blocking=False))
+        taken = threading.Event()  # by this thread, though another one may look for it
+
+        def take() -> bool:
+            if lock.acquire(blocking=False):
+                taken.set()
+            return taken.is_set()
+
         try:
+            self._wait(take)
             yield
         finally:
-            lock.release()
+            if taken.is_set():
+                lock.release()
 
     @contextmanager
     def joined(self) -> Iterator[None]:
         """Take part in the order while a block lasts, as the thread that runs now."""
         with self._lock:
+            outer = threading.get_ident() in self._members
             self._members.add(threading.get_ident())
             self._running.add(threading.get_ident())
         try:
             yield
         finally:
-            self.leave()
+            if not outer:
+                self.leave()
 
     def enter(self, entered: threading.Event) -> None:
         """Take a place in the order behind all that wait, and wait for the turn."""

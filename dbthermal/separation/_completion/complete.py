@@ -84,12 +84,11 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         The variables of the result, and its values bit for bit where it has any; `status` has the
         bits ``completed_from_material`` or ``completed_from_prior``, and
         ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
-        more than a seventh of a pixel's frames were. Values stay NaN at bad pixels and constant
-        signals, and in frames of which no pixel has data of all bands (attribute `frames_missing`,
-        their number); a sample that a pixel alone lacks is bridged from those around it: `bridged`
-        (time, y, x) says which, and leaves no bit (`frames_bridged`, mean number of
-        them in a pixel that has any). Attributes `surroundings`, `surroundings_std` [K] and
-        `surroundings_source`.
+        15 % of a pixel's frames or more were. Values stay NaN at bad pixels and constant signals,
+        and in frames of which no pixel has data of all bands (attribute `frames_missing`, their
+        number); a sample that a pixel alone lacks is bridged from those around it: `bridged`
+        (time, y, x) says which, and leaves no bit (`frames_bridged`, their mean number).
+        Attributes `surroundings`, `surroundings_std` [K] and `surroundings_source`.
 
     Raises
     ------
