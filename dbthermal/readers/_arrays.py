@@ -109,9 +109,8 @@ def array(
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
-    # Of a file, as after a flipped bit of its header; multiples of 256 tell nothing.
-    filed = isinstance(source, str | Path) and np.any(counts & 0xFF)
-    if filed and recordings.smoother(counts) < 0:
+    filed = isinstance(source, str | Path) and np.any(counts & 0xFF)  # others tell nothing
+    if filed and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
     fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
