@@ -138,7 +138,7 @@ def _compared(
     except ValueError:
         rival = None
     shift = np.inf if rival is None else np.nanmedian(np.hypot(*rival["shift"].values))
-    if shift < _SAME and rival is not None and np.subtract(*_explained(rival, field)) > 0.0:
+    if shift < _SAME and rival is not None and np.diff(_explained(field, rival)) > 0.0:
         return plain
     frame = clocks.frame_period(stamps[0])
     if left <= _PRECISION * frame:
