@@ -141,6 +141,8 @@ def test_videos(tmp_path: Path, ending: str, number: int) -> None:
     assert not [key for key in counts if key.startswith("unclear") or key == "different, cut"]
     different = sum(count for kind, count in counts.items() if "different" in kind)
     assert different <= (0.4 if ending == "webm" else 0.2) * number
+    hidden = counts["different, flip"] + counts["different, zero"]
+    assert hidden <= {"mp4": 0.15, "mkv": 0.15, "webm": 0.4}.get(ending, 0.2) * number
     assert counts["refused"] >= number / 4
 
 
