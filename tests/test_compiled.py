@@ -69,11 +69,10 @@ for state in sys.argv[1:]:
 
 def started(folder: Path, *states: str) -> "subprocess.Popen[str]":
     """Process that calls the functions of a folder, where their compiled code is kept too."""
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{folder}", "NUMBA_CACHE_DIR": f"{folder}/kept"}
+    paths = {"PYTHONPATH": f"{ROOT}:{folder}", "NUMBA_CACHE_DIR": f"{folder}/kept"}
     command = [sys.executable, "-c", CALL, *states]
-    return subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=None, text=True
-    )
+    environment = {**os.environ, **paths}
+    return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def files(folder: Path) -> dict[str, int]:

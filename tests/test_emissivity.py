@@ -220,6 +220,12 @@ def test_tables_that_rank_no_filter(
     """Noise that is no positive kelvin of every band, per cent and an absent band are refused."""
     with pytest.raises(ValueError, match=re.escape(message)):
         emissivity.rank_filters(table(glass=row), noise, **more)
+    with pytest.raises(ValueError, match="Must be at least two"):
+        emissivity.condition_numbers(table(m=[0.9]))
+    with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
+        emissivity.pair_summary(np.ones(3))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):
+        emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]
 
 
 def test_embedded_table_is_whole() -> None:
@@ -318,17 +324,3 @@ def test_gap_is_not_covered() -> None:
     assert float(made["coverage"][0, 0]) == pytest.approx(share, abs=1e-2)
     coarse = emissivity.band_table({"m": sparse(np.arange(7.0, 16.0), np.full(9, 0.5))}, FILTERS)
     np.testing.assert_array_equal(coarse["coverage"], 1.0)
-
-
-def test_tables_that_have_no_pair() -> None:
-    """Emissivities in per cent, one band alone, and no arrays are refused."""
-    for row, message in (
-        ([86.0, 72.0], "Invalid emissivity of the table 86"),
-        ([0.9], "least two"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            emissivity.condition_numbers(table(m=row))
-    with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
-        emissivity.pair_summary(np.ones(3))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):
-        emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]

@@ -64,32 +64,20 @@ def test_optional_packages_have_one_place() -> None:
     assert {pair for pair in places if pair[1] not in PLACES.get(pair[0], {pair[1]})} == set()
 
 
-def test_only_store_opens_zarr() -> None:
-    """Results in zarr's format are opened and written in one module; readers open others."""
-    texts = {
-        path.relative_to(PACKAGE): path.read_text(encoding="utf-8")
-        for path in PACKAGE.rglob("*.py")
-    }
+def test_what_is_named_in_one_place() -> None:
+    """Only the store opens results in zarr's format; no driver imports the emulators."""
+    texts = {path.relative_to(PACKAGE): path.read_text("utf-8") for path in PACKAGE.rglob("*.py")}
     assert {path.parts[0] for path, text in texts.items() if "_zarr(" in text} == {"store"}
+    emulated = re.compile(r"(?m)^\s*(import|from) dbthermal\.instruments\.emulated")
+    users = {path for path, text in texts.items() if emulated.search(text)}
+    assert {path for path in users if path.parts[:1] == ("instruments",)} == {
+        path for path in users if "emulated" in path.parts
+    }
 
 
 def test_importing_the_package_is_light() -> None:
-    """`import dbthermal` loads neither optional nor heavy packages."""
-    heavy = {"torch", "usb", "serial", "matplotlib", "anywidget"}
-    code = f"import sys, dbthermal; print({heavy} & {{*sys.modules}})"
+    """`import dbthermal`, and its readers, load neither optional nor heavy packages."""
+    heavy = {"torch", "usb", "serial", "matplotlib", "anywidget", "av"}
+    code = f"import sys, dbthermal.readers; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
-
-
-def test_drivers_import_no_emulator() -> None:
-    """Emulators are named by their addresses, and imported when one of them is opened."""
-    drivers = (PACKAGE / "instruments").rglob("*.py")
-    texts = {path: path.read_text(encoding="utf-8") for path in drivers}
-    named = ("import dbthermal.instruments.emulated", "from dbthermal.instruments.emulated")
-    found = {
-        path.name
-        for path, text in texts.items()
-        if "emulated" not in path.parts
-        and any(line.strip().startswith(named) for line in text.splitlines())
-    }
-    assert found == set()

@@ -81,13 +81,6 @@ def test_brightness_temperature_inverts(wavelength: float, temperature: float) -
     assert back == pytest.approx(temperature, rel=1e-12)
 
 
-def test_wavelength_and_temperature_broadcast() -> None:
-    """A column of wavelengths and a row of temperatures make a table."""
-    wavelengths = np.array([[8e-6], [10e-6], [12e-6]])
-    for function in (planck.spectral_radiance, planck.spectral_radiance_slope):
-        assert function(wavelengths, [280.0, 300.0]).shape == (3, 2)
-
-
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
 @pytest.mark.parametrize(
     ("name", "function", "arguments"),

@@ -118,7 +118,6 @@ STILL = recorded().isel(time=[0])
 FLAGGED = recorded().assign(frame_flags=("time", np.full(60, 65536)))
 FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
 TURNED = CAPTURE.transpose("time", "band", "y", "x")
-REST = 0.0 * MAPS[0] + 1.0
 SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
     (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
@@ -168,6 +167,7 @@ CASES: list[tuple[Call, str]] = [
     (lambda: alignment.align(CAPTURE, offset=0.0, reflection_shift=cast(Any, 3)), "shift"),
     (lambda: alignment.align(RAW, offset=0.0), "correct_capture, of a camera that corrects itself"),
     (lambda: correction.correct_capture(RAW, CORRECTION, shutter=NOTHING), "shutter"),
+    (lambda: whole(target="all.nc"), r"Must end in '\.zarr'"),
     (lambda: whole(correcting=None), "correct_capture.*mapping"),
     (lambda: whole(aligning={"ofset": 0.0}), "ofset.*offset"),
     (lambda: store.open_dataset(NOTHING), "path"),

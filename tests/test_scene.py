@@ -19,8 +19,8 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 
 RIG = Rig()
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-FRAME, FRAMES = 0.1, 200  # [s]
-STEP = 0.025  # of the simulated scene's clock [s]
+FRAME = 0.1  # [s]
+STEP = 0.004  # of the simulated scene's clock [s]
 INTERVAL = 1.96
 
 
@@ -39,11 +39,11 @@ def recorded(
     """
     rng, every, later = np.random.default_rng(seed), round(FRAME / STEP), round(late / STEP)
     every = every if later else 1
-    time = np.arange((FRAMES - 1) * every + 1 + later) * FRAME / every
+    time = np.arange(199 * every + 1 + later) * FRAME / every
     field = None if shift is None else smooth_shift(shape, *shift)
     truth = Picture(shape=shape, walkers=walkers).draw(time, GLASS, rng, field)
     seen = simulation.expose(
-        truth, RIG.response(), rng, every=every, offsets=(0, later), frames=FRAMES
+        truth, RIG.response(), rng, every=every, offsets=(0, later), frames=200
     )
     seen = seen if stamped else seen.drop_vars("exposure_time")
     detector = simulation.pattern(RIG, shape, rng)
@@ -64,12 +64,12 @@ def accuracy(result: xr.Dataset, truth: xr.Dataset) -> tuple[float, float, float
     return float(good.mean()), rms, float(inside.mean())
 
 
-STAMPED = pytest.param((28, 40), None, 0.05, True, marks=pytest.mark.slow)  # as a wheel's bands
+STAMPED = pytest.param((36, 48), None, 0.048, True, marks=pytest.mark.slow)  # as a wheel's bands
 
 
 @pytest.mark.parametrize(
     ("shape", "shift", "late", "stamped"),
-    [((28, 40), (3.0, 0.0), 0.0, False), ((28, 40), None, 0.025, False), STAMPED],
+    [((28, 40), (3.0, 0.0), 0.0, False), ((36, 48), None, 0.024, False), STAMPED],
     ids=["apart", "one place", "one place, stamped"],
 )
 def test_commands_and_one_call_agree(
@@ -137,12 +137,6 @@ def test_a_target_has_the_same_result(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             lazy[name], at_once[name], rtol=tolerance, atol=1e-5, err_msg=str(name)
         )
-
-
-def test_a_target_is_refused_before_the_work(tmp_path: Path) -> None:
-    """A folder of another end is named before anything is computed."""
-    with pytest.raises(ValueError, match=r"Must end in '\.zarr'"):
-        separate_capture(*[xr.Dataset()] * 3, target=tmp_path / "all.nc")
 
 
 def peak(folder: Path, fitted: xr.Dataset, response: xr.Dataset, options: dict[str, Any]) -> int:

@@ -1,8 +1,6 @@
 """Readers give a file's contents in SI units, and refuse inconsistent files."""
 
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -147,17 +145,3 @@ def test_tables_are_refused(tmp_path: Path, name: str, text: str, message: str) 
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         getattr(readers, name)(path)
-
-
-@pytest.mark.parametrize("read", [readers.ecostress, readers.slum, readers.ucsb])
-def test_missing_file(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    """A missing file is named."""
-    with pytest.raises(FileNotFoundError, match=r"absent\.txt"):
-        read(tmp_path / "absent.txt")
-
-
-def test_readers_load_no_video_codec() -> None:
-    """Reading spectra needs neither the video codec nor the drawing library."""
-    code = "import sys, dbthermal.readers; print({'av', 'matplotlib'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -115,15 +114,6 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"region 'left', \(10, 40, 5, 30\)\. Must be an explorer"):
         dbthermal.report(scene(), tmp_path / "scene.html", regions=regions)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without Jinja2 the error names the extra."""
-    for name in [name for name in sys.modules if name.startswith("dbthermal.reporting")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(ImportError, match=r"dbthermal\[report\]"):
-        dbthermal.report(scene(), "scene.html")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the report is not tried in a browser")

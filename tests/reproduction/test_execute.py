@@ -69,7 +69,8 @@ def test_a_name_stands_for_results_on_the_disk(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While a notebook runs nothing has the name of its results, nor before they are on the disk:
-    a power loss leaves no name of what is only in the system's cache.
+    a power loss leaves no name of what is only in the system's cache. They are as old as its
+    beginning: a source that changed since is newer.
     """
     runner = replaced(monkeypatch, Papermill(2))
     synced: list[tuple[Path, bool]] = []
@@ -77,7 +78,9 @@ def test_a_name_stands_for_results_on_the_disk(
     monkeypatch.setattr(
         store, "to_disk", lambda places: synced.extend((place, named.exists()) for place in places)
     )
+    monkeypatch.setattr(time, "time", lambda: 1000.0)
     assert execute.execute("full", "03_tiny", {}) == named
+    assert named.stat().st_mtime == 1000
     assert runner.seen == [".03_tiny.part.ipynb", "04_other.json"]
     names = sorted(path.name for path in folder.iterdir())
     assert names == [".03_tiny.sums", "03_tiny.ipynb", "03_tiny.json", "04_other.json"]
@@ -85,14 +88,6 @@ def test_a_name_stands_for_results_on_the_disk(
     for name in ("03_tiny.json", ".03_tiny.sums", ".03_tiny.part.ipynb"):
         assert (folder / name, False) in synced
     assert synced[-1] == (folder, True)
-
-
-def test_a_change_while_it_ran_is_newer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result is as old as its beginning: a source that changed since is newer."""
-    replaced(monkeypatch, Papermill(2))
-    monkeypatch.setattr(time, "time", lambda: 1000.0)
-    execute.execute("full", "03_tiny", {})
-    assert (folder / "03_tiny.ipynb").stat().st_mtime == 1000
 
 
 @pytest.mark.parametrize(

@@ -17,25 +17,18 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path.resolve()
 
 
-def test_root_is_found_upwards(project: Path) -> None:
-    """The folder that holds the manifest is the root, from below as from itself."""
+def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: Path) -> None:
+    """The folder of the manifest is the root, from below, or from the package's own folder.
+
+    Without a manifest anywhere the error says where it was sought.
+    """
     assert paths.root() == project
-
-
-def test_root_is_found_through_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: Path
-) -> None:
-    """Outside any project the package's own folder leads to the root."""
     monkeypatch.setattr(paths, "__file__", str(project / "dbthermal" / "paths.py"))
     monkeypatch.chdir(tmp_path.parent)
     assert paths.root() == project
-
-
-def test_missing_root_names_both_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a manifest anywhere the error says where it was sought."""
-    monkeypatch.setattr(paths, "__file__", str(tmp_path / "package" / "paths.py"))
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=f"'{tmp_path}', nor '{tmp_path / 'package'}'"):
+    (project / "data_manifest.yaml").unlink()
+    sought = f"'{tmp_path.parent}', nor '{project / 'dbthermal'}'"
+    with pytest.raises(FileNotFoundError, match=sought):
         paths.root()
 
 

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import av
 import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from matplotlib import colormaps
+from hostile_files import coloured, video, wave
 
 from reproduction import parallax, scales
 from reproduction import videos as published
@@ -15,31 +14,9 @@ from reproduction import videos as published
 Floats = npt.NDArray[np.float64]
 
 
-def encode(path: Path, frames: npt.NDArray[np.uint8]) -> Path:
-    """Encode RGB frames (time, y, x, 3) as the published videos are: H.264, 10 frames a second."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18"})
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = "yuv420p"
-        for frame in np.ascontiguousarray(frames):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
-    return path
-
-
-def coloured(position: Floats, palette: str) -> npt.NDArray[np.uint8]:
-    """Draw positions in a palette."""
-    colours: npt.NDArray[np.uint8] = colormaps[palette](
-        np.rint(position * 255).astype(int), bytes=True
-    )
-    return colours[..., :3]
-
-
 def film(path: Path, width: int = 64) -> Path:
-    """Encode a wave in plasma that moves, of 6 frames."""
-    time, y, x = np.ogrid[:6, :48, :width]
-    wave = 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
-    return encode(path, coloured(wave, "plasma"))
+    """Encode six frames of the wave."""
+    return video(path, coloured(wave()[:6, :, :width], "plasma"))
 
 
 def test_inputs(tmp_path: Path) -> None:
@@ -143,7 +120,7 @@ def test_scene_of_fewer_results(tmp_path: Path) -> None:
     theirs = np.clip(theirs / theirs.max(axis=(1, 2), keepdims=True), 0.05, 1)
     drawn = np.where(OUTLINE[..., np.newaxis], coloured(theirs, "turbo"), np.uint8(60))
     paths |= {f"toys_{kind}_Tbdiff_video.mp4": drawn for kind in published.KINDS}
-    files = {name: encode(tmp_path / name, frames) for name, frames in paths.items()}
+    files = {name: video(tmp_path / name, frames) for name, frames in paths.items()}
     read = published.scene(files, "toy", "toys")
     assert (read.first, read.movie.sizes["time"]) == (20, 90)
     assert read.margin > 3
