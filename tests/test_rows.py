@@ -1,6 +1,7 @@
 """Counts computed when they are read, and films on disk: the values of those in memory."""
 
 import resource
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,22 +47,30 @@ def test_rows_are_read_as_an_array(monkeypatch: pytest.MonkeyPatch, place: dict[
     assert max(rows.stop for rows in computed) <= np.max(wanted) + 1
 
 
-def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Computed by rows, the counts, status and all else are those computed at once."""
-    rng, rig, shape = np.random.default_rng(2), simulation.Rig(bad_fraction=0.01), (24, 28)
+def recorded(
+    frames: int, seed: int, *, bad: float = 0.0, shutter: Sequence[float] = ()
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Raw capture of people before glass, 24 by 28 pixels, and its correction."""
+    rng, rig, shape = np.random.default_rng(seed), simulation.Rig(bad_fraction=bad), (24, 28)
     glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(150) / 10.0, shape, glass, rng)
+    scene = simulation.walkers(np.arange(frames) / 10.0, shape, glass, rng)
     seen = simulation.observe(scene, rig.response(), rng)
-    seen = simulation.fire_shutter(simulation.spoil_pixels(seen, 0.01, rng), [7.0], rng)
+    if shutter:
+        seen = simulation.fire_shutter(simulation.spoil_pixels(seen, bad, rng), shutter, rng)
     detector = simulation.pattern(rig, shape, rng)
     movies = simulation.blackbody_movies(rig, np.array([280.0, 310.0, 340.0]), 16, detector, rng)
     fitted = correction.fit_correction(correction.blackbody_statistics(movies))
-    raw = simulation.capture(seen, detector)
-    patch = xr.DataArray(np.indices(shape).max(axis=0) < 5, dims=("y", "x"))
+    return simulation.capture(seen, detector), fitted
+
+
+def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Computed by rows, the counts, status and all else are those computed at once."""
+    raw, fitted = recorded(150, 2, bad=0.01, shutter=[7.0])
+    patch = xr.DataArray(np.indices((24, 28)).max(axis=0) < 5, dims=("y", "x"))
     transform = xr.DataArray(
         np.stack([np.eye(3), [[1.01, 0.0, 1.5], [0.01, 0.99, -2.25], [0.0, 0.0, 1.0]]]),
         dims=("band", "row", "column"),
-        coords={"band": list(rig.bands)},
+        coords={"band": raw["band"].values},
     )
 
     def process(*, lazy: bool) -> tuple[xr.Dataset, xr.Dataset]:
@@ -85,13 +94,7 @@ def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_rows_without_a_good_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     """A border of one value makes no deviation unknown, and no warning of NumPy, by rows either."""
-    rng, rig, shape = np.random.default_rng(3), simulation.Rig(bad_fraction=0.0), (24, 28)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(60) / 10.0, shape, glass, rng)
-    detector = simulation.pattern(rig, shape, rng)
-    movies = simulation.blackbody_movies(rig, np.array([280.0, 310.0, 340.0]), 16, detector, rng)
-    fitted = correction.fit_correction(correction.blackbody_statistics(movies))
-    raw = simulation.capture(simulation.observe(scene, rig.response(), rng), detector)
+    raw, fitted = recorded(60, 3)
     raw["counts"].values[:, :, :8] = 0
     whole = correction.correct_capture(raw, fitted)["pattern_std"].values
     monkeypatch.setattr(_rows, "_BLOCK", 2 * 60 * 28 * 4)  # four rows

@@ -78,7 +78,6 @@ def test_yaml_of_json_is_read_back(content: dict[str, object]) -> None:
     [
         ("a: 1\nb: 2\na: 3", "line 3, column 1: Repeated key 'a'. Must be listed once"),
         ("a: {1: x, '1': y}", "line 1, column 11: Repeated key '1'"),
-        ("a: {b: 1, c: {d: 1, d: 2}}", "line 1, column 21: Repeated key 'd'"),
         ("null: 1", "line 1, column 1: Invalid key None. Must be text or a number"),
         ("{[1]: 1}", "Invalid key [1]"),
         ("a: on", "line 1, column 4: Invalid value on. Must be a finite decimal number, true"),
@@ -91,7 +90,6 @@ def test_yaml_of_json_is_read_back(content: dict[str, object]) -> None:
         ("- " * 200_000, "Invalid nesting deeper than 50"),
         ("a: 1\n---\nb: 2", "line 2, column 1: Invalid second document. Must be one"),
         ("", "Invalid content None. Must be a mapping"),
-        ("[1, 2]", "Invalid content [1, 2]. Must be a mapping"),
         ("x" * 500, "xxx... (502 characters). Must be a mapping"),
         ("a: [1", "line 2, column 1: Must be YAML"),
         ("a: \t- b: c", "Must be YAML"),

@@ -127,7 +127,7 @@ def gray(rng: Rng) -> Attack:
 
 
 _NUMBERS: Final = ("f4", "f8", ">f4", ">f8")
-_OTHERS: Final = (
+_OTHERS: Final = [
     "u1",
     "u2",
     ">u2",
@@ -141,7 +141,7 @@ _OTHERS: Final = (
     "M8[s]",
     "m8[s]",
     "b1",
-)
+]
 
 
 def dtypes(rng: Rng) -> Attack:

@@ -131,28 +131,3 @@ def test_spectra(tmp_path: Path, library: str, number: int) -> None:
         assert counts[f"{kind}, other"] == 0
     bytes_changed = sum(count for key, count in counts.items() if key.startswith("byte"))
     assert counts["byte, other"] <= at_most(0.04, bytes_changed)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (b"0.9", b"\xff.9", r"brick\.csv, line 2, column \d+: Invalid byte 0xff. Must be text"),
-        (b"0.9", b"nan", r"brick\.csv, line \d+, column \d: Invalid number 'nan"),
-        (b",688,", b",nan,", r"brick\.csv, line 2, column 2: Invalid number 'nan'. Must be finite"),
-        (b",688,", b",750,", r"brick\.csv, line 2: Invalid wavenumber 750.0 1/cm at 14.5349"),
-        (b",688,", b',"688",', ""),
-        (b",688,", b',"6,88",', r"line 2, column 2: Invalid number '6,88'. Must be finite"),
-        (b",688,", b",688;", r"line 2: Invalid row .* Must be 3 numbers"),
-        (b",688,", b",-688,", r"Invalid wavenumber -688.0"),
-        (b",688,", "\uff16\uff18\uff18".encode().join([b",", b","]), r"column 2: Invalid number"),
-    ],
-)
-def test_a_number_is_named_by_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
-    """Bad bytes, numbers that are none and other separators are named by line and column."""
-    path = tmp_path / "brick.csv"
-    path.write_bytes(hostile.tables()["ucsb"].replace(old, new, 1))
-    if not message:
-        assert isinstance(readers.ucsb(path), xr.Dataset)
-        return
-    with pytest.raises(ValueError, match=message):
-        readers.ucsb(path)

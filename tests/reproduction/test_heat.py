@@ -246,46 +246,33 @@ def test_coefficient_that_jumps() -> None:
 TRIANGLE, FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), [[0, 1, 2]]
 
 
-@pytest.mark.parametrize(
-    ("vertices", "faces", "thickness", "message"),
-    [
-        (TRIANGLE[:, :2], FACE, 1e-3, r"Invalid shape \(3, 2\) of vertices"),
-        (TRIANGLE * np.nan, FACE, 1e-3, "Invalid vertex 0"),
-        (TRIANGLE, [[0.0, 1.0, 2.0]], 1e-3, "Invalid type float64 of faces"),
-        (TRIANGLE, [[1, 2, 3]], 1e-3, "Invalid vertex numbers 1 to 3"),
-        (TRIANGLE, [[0, 1, 1]], 1e-3, "Invalid vertex 2: in no face"),
-        (TRIANGLE * (1.0, 0.0, 0.0), FACE, 1e-3, "Invalid face 0 with vertices"),
-        (TRIANGLE, [[0, 1, 2], [2, 1, 0]], 1e-3, "given 2 times"),
-        (TRIANGLE, FACE, 0.0, "Invalid thickness 0.0 m"),
-    ],
-)
-def test_invalid_shell(vertices: Array, faces: object, thickness: float, message: str) -> None:
-    """An invalid mesh or thickness of a shell raises a ValueError with the reason."""
-    with pytest.raises(ValueError, match=message):
-        heat.Shell(vertices, np.array(faces), thickness, heat.GLASS)
+def bent(vertices: Array, faces: object, thickness: float = 1e-3) -> Callable[[], object]:
+    """Shell of some vertices and faces."""
+    return lambda: heat.Shell(vertices, np.array(faces), thickness, heat.GLASS)
 
 
-@pytest.mark.parametrize(
-    ("terms", "message"),
-    [
-        ([heat.Convection(-1.0, 300.0)], "Invalid coefficient of convection -1.0 at 0 s"),
-        ([heat.Convection(1.0, np.ones(2))], r"Invalid shape \(2,\) of the temperature"),
-        ([heat.Convection(lambda t: 1.0 / (t < 0.1) - 1.0, 300.0)], "coefficient .* inf"),
-        ([heat.Radiation(1.2, 300.0)], r"Invalid emissivity 1.2 of radiation.* in \[0, 1\]"),
-        ([heat.Radiation(0.9, lambda t: 300.0 - 4e3 * t)], "temperature of radiation -"),
-        ([heat.Heating(np.nan)], "Invalid flux of heating nan"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:divide by zero")
-def test_invalid_exchange(terms: list[heat.Exchange], message: str) -> None:
-    """An exchange that is not physical, at any time, is an error that says when."""
-    with pytest.raises(ValueError, match=message):
-        spot([0.0, 1.0], AMBIENT, terms)
+def exchanging(term: heat.Exchange) -> Callable[[], object]:
+    """One second of an exchange."""
+    return lambda: spot([0.0, 1.0], AMBIENT, [term])
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (bent(TRIANGLE[:, :2], FACE), r"Invalid shape \(3, 2\) of vertices"),
+        (bent(TRIANGLE * np.nan, FACE), "Invalid vertex 0"),
+        (bent(TRIANGLE, [[0.0, 1.0, 2.0]]), "Invalid type float64 of faces"),
+        (bent(TRIANGLE, [[1, 2, 3]]), "Invalid vertex numbers 1 to 3"),
+        (bent(TRIANGLE, [[0, 1, 1]]), "Invalid vertex 2: in no face"),
+        (bent(TRIANGLE * (1.0, 0.0, 0.0), FACE), "Invalid face 0 with vertices"),
+        (bent(TRIANGLE, [[0, 1, 2], [2, 1, 0]]), "given 2 times"),
+        (bent(TRIANGLE, FACE, 0.0), "Invalid thickness 0.0 m"),
+        (exchanging(heat.Convection(-1.0, 300.0)), "coefficient of convection -1.0 at 0 s"),
+        (exchanging(heat.Convection(1.0, np.ones(2))), r"Invalid shape \(2,\) of the temperature"),
+        (exchanging(heat.Convection(lambda t: 1.0 / (t < 0.1) - 1.0, 300.0)), "coefficient .* inf"),
+        (exchanging(heat.Radiation(1.2, 300.0)), r"emissivity 1.2 of radiation.* in \[0, 1\]"),
+        (exchanging(heat.Radiation(0.9, lambda t: 300.0 - 4e3 * t)), "temperature of radiation -"),
+        (exchanging(heat.Heating(np.nan)), "Invalid flux of heating nan"),
         (lambda: heat.Solid(1.0, -1.0, 1.0), r"Invalid density of a solid -1\.0"),
         (lambda: spot([0.0, 0.0], 300.0, []), "Invalid time 0.0 s"),
         (lambda: spot([], 300.0, []), r"Invalid times of shape \(0,\)"),
@@ -302,7 +289,8 @@ def test_invalid_exchange(terms: list[heat.Exchange], message: str) -> None:
         ),
     ],
 )
-def test_invalid_simulation(call: Callable[[], object], message: str) -> None:
-    """Invalid solids, times, steps and temperatures, and ends that are not physical, are errors."""
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_what_is_not_physical(call: Callable[[], object], message: str) -> None:
+    """Invalid meshes, exchanges, solids, times, steps, temperatures and ends are errors."""
     with pytest.raises((ValueError, ArithmeticError), match=message):
         call()

@@ -173,25 +173,24 @@ def test_a_mirror_with_a_fault(
 
 
 def test_download(served: Path, project: Path) -> None:
-    """Without a mirror, `fetch` alone takes files from their origin, once, into data/."""
+    """Without a mirror, `fetch` alone takes files from their origin, once, into data/.
+
+    One with a wrong checksum raises an error and is removed.
+    """
     assert not manifest.available("notes")
     with pytest.raises(FileNotFoundError, match="Missing 2 of 2 files"):
         manifest.local("notes")
     assert not (project / "data").exists()
+    (served / "two.txt").write_bytes(b"SECOND")
+    with pytest.raises(ValueError, match=rf"two\.txt.*{hashlib.sha256(b'second').hexdigest()}"):
+        manifest.fetch("two.txt", "notes")
+    assert not (project / "data" / "notes" / "two.txt").exists()
+    (served / "two.txt").write_bytes(CONTENT["two.txt"])
     found = manifest.fetch_collection("notes")
     assert {name: path.read_bytes() for name, path in found.items()} == CONTENT
     (served / "one.txt").unlink()
     assert manifest.local("notes") == manifest.fetch_collection("notes") == found
     assert found["one.txt"] == project / "data" / "notes" / "one.txt"
-
-
-def test_download_of_an_altered_file(served: Path, project: Path) -> None:
-    """A download with a wrong checksum raises an error and is removed."""
-    (served / "two.txt").write_bytes(b"SECOND")
-    expected = hashlib.sha256(b"second").hexdigest()
-    with pytest.raises(ValueError, match=rf"two\.txt.*{expected}"):
-        manifest.fetch("two.txt", "notes")
-    assert not (project / "data" / "notes" / "two.txt").exists()
 
 
 @pytest.mark.parametrize(
@@ -227,23 +226,21 @@ def test_a_slow_download_ends(served: Path, project: Path, monkeypatch: pytest.M
         manifest.fetch("two.txt", "notes")
 
 
-def test_main(copies: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command prints one line for a complete collection, and fails for another."""
+@pytest.mark.parametrize("folder", [False, True])
+def test_main(
+    copies: Path, project: Path, capsys: pytest.CaptureFixture[str], folder: bool
+) -> None:
+    """The command prints a line for a complete collection, and fails for one without a file.
+
+    A mirror may lack an optional collection, but no part of one.
+    """
     assert manifest.main() == 0
     assert re.fullmatch(r"notes: 2 files, 0\.0 MB, in .*notes\n", capsys.readouterr().out)
     (copies / "two.txt").unlink()
     assert manifest.main() == 1
     assert capsys.readouterr().err.startswith("notes: ")
-
-
-@pytest.mark.parametrize("folder", [False, True])
-def test_optional_collection(
-    copies: Path, project: Path, capsys: pytest.CaptureFixture[str], folder: bool
-) -> None:
-    """A mirror may lack an optional collection, but no part of one."""
     edit(project, "    terms: free\n", "    terms: free\n    optional: true\n")
-    for path in copies.iterdir():
-        path.unlink()
+    (copies / "one.txt").unlink()
     if not folder:
         copies.rmdir()
     assert manifest.main() == int(folder)
