@@ -48,19 +48,18 @@ def test_ecostress_round_trip(reflectance: list[float], start: float) -> None:
 
 
 def test_ecostress_notes(tmp_path: Path) -> None:
-    """The header's text is kept, also in Latin-1; missing entries are empty."""
-    notes = readers.ecostress(library_file(tmp_path, [8, 9], [5, 5])).attrs
+    """The header's text is kept, also in Latin-1; missing entries are empty.
+
+    Reflectances of -1 % and 116 % are the instrument's calibration, neither clipped nor lost.
+    """
+    spectrum = readers.ecostress(library_file(tmp_path, [8, 9, 10], [-1.0, 50.0, 116.0]))
+    assert_allclose(spectrum["emissivity"], [1.01, 0.5, -0.16], rtol=0, atol=1e-12)
+    notes = spectrum.attrs
+    assert notes["unphysical_values"] == 2
     assert notes["name"] == "Plate Glass"
     assert notes["description"] == "a pane: clear, Na\xb7Ca"
     assert notes["subclass"] == ""
     assert notes["source"] == "glass.spectrum.txt"
-
-
-def test_ecostress_keeps_and_counts_values_outside_the_physical_range(tmp_path: Path) -> None:
-    """Reflectances of -1 % and 116 % are the instrument's calibration, neither clipped nor lost."""
-    spectrum = readers.ecostress(library_file(tmp_path, [8, 9, 10], [-1.0, 50.0, 116.0]))
-    assert_allclose(spectrum["emissivity"], [1.01, 0.5, -0.16], rtol=0, atol=1e-12)
-    assert spectrum.attrs["unphysical_values"] == 2
 
 
 R20 = " 20.0000"

@@ -278,17 +278,6 @@ def test_a_malformed_list_is_refused(project: Path, old: str, new: str, message:
         manifest.load()
 
 
-@pytest.mark.usefixtures("project")
-def test_no_collection_is_listed_twice(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of two collections with one name neither wins, and the command says so."""
-    path = Path("data_manifest.yaml")
-    path.write_text(path.read_text() + path.read_text().removeprefix("collections:\n"))
-    with pytest.raises(ValueError, match=r"data_manifest\.yaml, line 12.*Repeated key 'notes'"):
-        manifest.load()
-    assert manifest.main() == 1
-    assert "Repeated key 'notes'" in capsys.readouterr().err
-
-
 @pytest.mark.data
 @pytest.mark.parametrize("collection", ["ecostress", "slum", "ucsb", "scenes", "meshes"])
 @pytest.mark.usefixtures("mirror")
