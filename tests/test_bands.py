@@ -93,6 +93,13 @@ def test_temperature_inverts_radiance(name: str, temperature: float) -> None:
     assert float(band.radiance(back)) == pytest.approx(float(radiance), rel=1e-12)
 
 
+def test_images_keep_their_shape() -> None:
+    """An image of temperatures gives an image of radiances, and back."""
+    image = np.linspace(280.0, 340.0, 12).reshape(3, 4)
+    band = FILTERS["9.5"]
+    np.testing.assert_allclose(band.temperature(band.radiance(image)), image, rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize("bad", [99.9, 2000.1, np.nan, 25.0, -1.0, 0.0, 1e9])
 def test_values_outside_the_range(bad: float) -> None:
     """A temperature or radiance outside the range is named with band and range, not clipped."""

@@ -374,6 +374,7 @@ ROWS = f"""
 {ONE.replace("a.", "warm.").replace("b.", "cold.")} --offset 0 -o h.zarr -> Warning: The medians
 {ONE.replace("a.", "five.").replace("b.", "few.")} -o 5.zarr --offset 0 -> Warning: .* has 5 frames
 {ONE} -o x.zarr -> Unknown dates of the recordings.* --offset \\[s\\].
+{SWEEP} --at 278C a25.tif b25.tif -> Invalid levels .* Must rise with its temperature
 {ONE} --offset 3 -o later.zarr; correct later.zarr nuc.zarr -o late.zarr; align late.zarr
  --register none -o x.zarr -> Missing time offset .* no rapid change that both bands see
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
@@ -388,6 +389,7 @@ explore response.zarr -o x.ipynb -> Invalid result 'response.zarr' of stage 'res
 explore result.zarr nuc.zarr -o x.ipynb -> Missing variable 'counts' in the capture
 export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
+export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> Must be one for each
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
@@ -396,6 +398,8 @@ export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 info a.tif -> Missing --unit: 'a.tif' does not tell
 seperate a b -> Did you mean 'separate'
 align a.zarr --ofset 0 -o x.zarr -> Did you mean '--offset'
+align a.zarr --register homograph -o x.zarr -> Did you mean 'homography'
+export result.zarr --variable emisivity -o x.tif -> Did you mean 'emissivity'
 plan plate_window_glas --noise 0.03 -> Did you mean 'plate window glass'
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C

@@ -6,17 +6,13 @@ import re
 import resource
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import hostile_files as hostile
 import pytest
-import xarray as xr
 
 from dbthermal import readers
-
-Read = Callable[[Path], xr.Dataset | dict[str, xr.Dataset]]
 
 SIZES = [
     100,

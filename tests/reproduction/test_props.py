@@ -2,10 +2,25 @@
 
 import numpy as np
 
+from reproduction.twins import surfaces
 from reproduction.twins.panes import pointing
 from reproduction.twins.people import FINGERS, Route, imprint, pacing
-from reproduction.twins.props import Writing, cup
-from reproduction.twins.stage import clock
+from reproduction.twins.props import Writing, board, cup
+from reproduction.twins.stage import AMBIENT, clock
+from reproduction.twins.surroundings import Pose
+
+
+def test_writing_appears_and_fades() -> None:
+    """A stroke is as cold as it was written, after it was written, and rewarms by 1/e."""
+    writing = Writing("V", start=2.0, pace=0.1, drop=4.0, drying=10.0)
+    times, path = writing.path()
+    flat = surfaces.plate(0.2, 0.2, 0.002)
+    places = np.asarray(flat.vertices)[:, [0, 2]] - (0.0, 0.1)
+    actor = board(flat, places, writing, AMBIENT, lambda _: Pose())
+    vertex = int(np.argmin(np.linalg.norm(places - path[-1], axis=1)))
+    last = float(times[-1])
+    warmth = [actor.warmth(now)[vertex] for now in (last - 1.0, last, last + 10.0)]
+    np.testing.assert_allclose(warmth, [AMBIENT, AMBIENT - 4, AMBIENT - 4 / np.e], rtol=0, atol=0.1)
 
 
 def test_the_index_writes_the_strokes() -> None:
