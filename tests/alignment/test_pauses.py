@@ -51,7 +51,6 @@ def test_offset_across_a_pause(late: float) -> None:
     stamps = np.stack([PAUSED, PAUSED])
     aligned = alignment.align(filmed(stamps, stamps + np.array([[0.0], [late]])))
     found, time = aligned.attrs["time_offset"][1], aligned["time"].values
-    print(f"{late} s: error {10.0 * (found - late):.3f} frames")
     assert found == pytest.approx(late, abs=0.01)
     before = np.searchsorted(PAUSED, 3600.0) - 1
     np.testing.assert_allclose(aligned.attrs["pauses"], time[[before, before + 1]])
@@ -79,7 +78,6 @@ def test_memory_of_a_pause() -> None:
         alignment.align(capture)
         sizes.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    print(f"without a pause, with one of an hour, of 30 years: {np.array(sizes) / 1e6} MB")
     assert max(sizes) < 1.5 * sizes[0]
 
 

@@ -67,7 +67,6 @@ def test_parts_that_are_late_differently_make_the_delay_uncertain() -> None:
     torn["counts"][1, :, :, middle:] = capture["counts"].values[1, :-2, :, middle:]
     both = [alignment.reflection_shift(one, RESPONSE).attrs for one in (capture, torn)]
     frames = [[10.0 * one[name] for name in ("delay", "delay_std")] for one in both]
-    print(f"delay and deviation {np.round(frames, 3).tolist()} frames")
     assert abs(frames[0][0]) < 0.05
     assert frames[0][1] < 0.05
     assert abs(frames[1][0]) < 3.0 * frames[1][1]
@@ -92,7 +91,10 @@ def test_a_band_between_its_frames() -> None:
     true = smooth_shift(picture.shape, 2.4, 1.2)
     scene = picture.draw(np.arange(720) / 40.0, GLASS, rng, true)
     seen = simulation.expose(scene, RESPONSE, rng, every=2, offsets=(0, 1), frames=359)
-    aligned = alignment.align(seen.drop_vars("exposure_time"), offset=0.025)  # [s]
+    seen = seen.drop_vars("exposure_time")
+    found = alignment.align(seen).attrs["time_offset"][1]
+    assert found == pytest.approx(0.025, abs=0.0025)  # 0.05 of a frame [s]
+    aligned = alignment.align(seen, offset=0.025)
     check(aligned, true, 0.7, 0.1)
 
 
@@ -110,8 +112,7 @@ def test_deviation_of_a_field_finer_than_its_grid() -> None:
     true[1] += np.sin(2.0 * np.pi * np.arange(48) / 9.0)[:, np.newaxis]
     scene = picture.draw(np.arange(200) / 10.0, GLASS, rng, true)
     capture = simulation.observe(scene, RESPONSE, rng)
-    error, score = errors(alignment.reflection_shift(capture, RESPONSE), true)
-    print(f"rms error {np.std(error[1]):.2f} pixel, score {np.sqrt(np.mean(score[1] ** 2)):.1f}")
+    _, score = errors(alignment.reflection_shift(capture, RESPONSE), true)
     assert np.sqrt(np.mean(score[1] ** 2)) < 10.0
 
 
@@ -131,7 +132,6 @@ def test_opened_capture_with_steps_between_segments(tmp_path: Path) -> None:
     assert not field["known"].values[:, : true.shape[2] // 3].any()
     off = field["shift"].notnull().values[1] & ~field["known"].values
     beyond = ((field["shift"] - true) / field["shift_std"]).values[1, off]
-    print(f"rms score {np.sqrt(np.mean(beyond**2)):.2f} beyond what moves")
     assert np.sqrt(np.mean(beyond**2)) < 2.5
 
 
@@ -141,7 +141,6 @@ def test_error_is_what_it_is_said_to_be(shift: tuple[float, float]) -> None:
     made = [drawn(seed, shift) for seed in (41, 42, 43)]
     found = [errors(alignment.reflection_shift(c, RESPONSE), t) for c, t in made]
     error, score = (np.concatenate(part, axis=1) for part in zip(*found, strict=True))
-    print(f"{shift}: median {np.median(np.abs(error[1])):.3f}, score {np.std(score[1]):.2f}")
     assert np.median(np.abs(error[1])) < 0.03
     assert 0.6 < np.sqrt(np.mean(score[1] ** 2)) < 1.6
 

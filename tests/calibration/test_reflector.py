@@ -118,14 +118,12 @@ def table(known: xr.Dataset) -> xr.Dataset:
 
 def test_bench_is_within_three_hundredths(table: xr.Dataset) -> None:
     """Every series of every object on the bench, in both bands, is within 0.03 of its truth."""
-    print(table.sel(procedure="bench")[["mean", "spread", "largest"]].to_dataframe())
     assert float(table["largest"].sel(procedure="bench").max()) < 0.03
 
 
 def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:
     """Coverage is 68 % when the common errors are stated, and far less when they are not."""
     coverage = table["coverage"].mean(("object", "band"))
-    print("coverage", dict(zip(coverage["procedure"].values, coverage.values, strict=True)))
     assert float(coverage.sel(procedure="bench")) == pytest.approx(0.68, abs=0.06)
     assert float(coverage.sel(procedure="bench, plain fit")) < 0.4
 
@@ -133,7 +131,6 @@ def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:
 def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
     """Mirrors seem to emit twice as much or more; paint and glass are right within 0.03."""
     mean = table["mean"].sel(procedure="reflector", band="8-14")
-    print(mean.to_series())
     assert np.all(mean.values[:2] > 1.8 * np.array([0.10, 0.05]))
     np.testing.assert_allclose(mean.values[2:], [0.87, 0.95, 0.95], rtol=0, atol=0.03)
 
@@ -141,7 +138,6 @@ def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
 def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
     """In a uniform room its error is below 0.015; it grows with the mirrored direction's excess."""
     found = reflector_sensitivity(known, np.random.default_rng(1), (0.0, 11.0), repeats=60)
-    print(found["mean"].sel(band="8-14").to_pandas())
     assert found["mean"].dims == ("object", "excess", "band")
     even = found["mean"].sel(excess=0.0)
     np.testing.assert_allclose(even, found["true"], rtol=0, atol=0.015)

@@ -78,7 +78,6 @@ def test_everything_undone_leaves_the_noise(recorded: Recorded) -> None:
     corrected = correct_capture(recorded.raw, recorded.correction, **recorded.options)
     schema.check(corrected, "corrected")
     expected = NOISE * corrected.attrs["lag_noise_amplification"][0]
-    print(f"error {error(recorded):.2f} count, noise {expected:.2f} count")
     assert error(recorded) < 1.2 * expected
     assert (corrected["segment"].diff("time") != 0).sum() == 1
     stuck = (corrected["status"] & np.uint32(Status.DEAD_PIXEL)) != 0
@@ -100,7 +99,6 @@ def test_everything_undone_leaves_the_noise(recorded: Recorded) -> None:
 def test_each_step_matters(recorded: Recorded, step: str, off: object) -> None:
     """Without any one of the steps the error is larger by a quarter at least."""
     without, error_with = error(recorded, **{step: off}), error(recorded)
-    print(f"without {step}: {without:.2f} count, with it {error_with:.2f} count")
     assert without > 1.25 * error_with
 
 

@@ -75,7 +75,6 @@ def test_naive_meets_the_images_and_is_wrong(glass: xr.Dataset, heated: xr.Datas
     errors = found["object_temperature"] - heated["object_temperature"]
     off = float(((errors**2).mean("time") ** 0.5).median())
     of_emissivity = abs(found["emissivity"] - GLASS).median(("y", "x"))
-    print(f"misfit {np.median(misfit):.1e} K, object {off:.1f} K, {of_emissivity.values}")
     assert misfit.max() < 1e-3  # K
     assert off > 3.0  # K
     assert float(of_emissivity.max()) > 0.1
@@ -95,16 +94,12 @@ def test_naive_says_when_it_stopped_early(glass: xr.Dataset) -> None:
     ("settings", "options", "message"),
     [
         (NaiveSettings, {"starts": 0}, "Invalid starts 0 of method 'naive'. Must be at least 1."),
-        (NaiveSettings, {"iterations": 0}, "Invalid iterations 0 of method 'naive'"),
         (NaiveSettings, {"shift_std": -1.0}, r"Invalid shift_std \[K\] of method 'naive' -1.0"),
         (NaiveSettings, {"tolerance": 0.0}, "Invalid tolerance of method 'naive' 0.0"),
         (RatioSettings, {"kind": "wien"}, "Unknown kind 'wien' of method 'ratio'. Must be one of"),
-        (RatioSettings, {"order": 0}, "Invalid order 0 of method 'ratio'. Must be at least 1."),
         (BcpSettings, {"patch": 4}, "Invalid patch 4 of method 'bcp'. Must be odd."),
-        (BcpSettings, {"window": 0}, "Invalid window 0 of method 'bcp'. Must be odd."),
         (BcpSettings, {"percentile": 101.0}, "Invalid percentile 101.0 of method 'bcp'"),
         (BcpSettings, {"least_transmission": 0.0}, "Invalid least_transmission 0.0 of method"),
-        (BcpSettings, {"regularisation": 0.0}, "Invalid regularisation of method 'bcp' 0.0"),
     ],
 )
 def test_settings_outside_their_range(settings: Any, options: dict[str, Any], message: str) -> None:
@@ -146,7 +141,6 @@ def test_ratio_against_wien() -> None:
     wien = planck.SECOND_RADIATION_CONSTANT * (1 / second - 1 / first) / excess
     found = solve(gray_body("narrow", 0.8), "ratio", RatioSettings("narrow", order=None))
     difference = np.abs(wien - found["object_temperature"].values)
-    print("Wien less Planck", difference.min(), difference.max())
     assert 2.0 < difference.min() < difference.max() < 6.0  # K
 
 

@@ -65,7 +65,6 @@ def test_noise_and_rounding_are_in_the_deviations(glass: Glass, step: float) -> 
     result = separation.solve(coarse, response, "calibrated", emissivity=known, settings=FRAMES)
     for name in ("object_temperature", "background_temperature"):
         scores = (result[name] - scene[name]) / result[f"{name}_std"]
-        print(f"steps of {step} counts: scores of standard deviation {float(scores.std()):.3f}")
         assert float(scores.std()) == pytest.approx(1.0, abs=0.05)
     assert not result["status"].any()
 
@@ -134,7 +133,6 @@ def test_smoothed_as_far_as_the_curve_allows(glass: Glass) -> None:
     name = "object_temperature"
     errors = [part[name] - scene[name] for part in (smooth, frames)]
     rmse = [float(np.sqrt((error**2).mean())) for error in errors]
-    print(f"{rmse[0]:.3f} K, frame by frame {rmse[1]:.3f} K")
     assert rmse[0] < 0.25 * rmse[1]
     assert 0.92 <= held(smooth, scene) <= 0.98
     xr.testing.assert_equal(smooth["background_temperature"], frames["background_temperature"])
@@ -154,7 +152,6 @@ def test_a_rapid_object_is_not_smoothed_away(rise: float) -> None:
     score = abs(result["object_temperature"] - warm) / result["object_temperature_std"]
     steep = abs(time - 15.0) < rise
     within = [float((score.isel(time=part) < 1.96).mean()) for part in (slice(None), steep)]
-    print(f"rise {rise} s: intervals hold {within[0]:.3f}, in the rise {within[1]:.3f}")
     assert 0.9 <= within[0] <= 0.99
     assert within[1] >= 0.75
 

@@ -70,7 +70,6 @@ def test_real_times_are_as_good_as_even_ones(clock: str) -> None:
     rmse = [float(np.nanmedian(np.sqrt(np.mean(error**2, axis=0)))) for error in errors]
     score = np.abs(errors[1]) / results[1]["object_temperature_std"].values
     covered, flagged = float(np.mean(score < 1.96)), float((results[1]["status"] != 0).mean())
-    print(f"{clock}: {rmse[1]:.3f} K, even {rmse[0]:.3f} K; cover {covered:.3f}; {flagged:.3f}")
     assert rmse[1] < 1.15 * rmse[0]
     assert 0.93 <= covered <= 0.98
     assert flagged < 0.01
@@ -117,7 +116,6 @@ def test_a_jump_beside_a_pause_is_found(place: int) -> None:
     capture = simulation.observe(moved, RIG.response(), np.random.default_rng(7))
     result = separation.solve(capture, RIG.response())
     jumping = result["status"].values[0] & Status.OBJECT_JUMP != 0
-    print(f"jump at {time[place]:.1f} s: {100 * jumping.mean():.0f} % flagged")
     assert held(result, moved) > 0.92
     assert float(result["object_temperature"].notnull().mean()) > 0.9
     if place != 175:  # a jump in the pause is not sudden: the object has had an hour

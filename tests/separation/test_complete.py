@@ -57,7 +57,6 @@ def test_background_behind_a_measured_object_changes_as_it_does(temperature: flo
         for one in (scene, whole)
     )
     share = float((found * true).sum() / (true**2).where(found.notnull()).sum())
-    print(f"{temperature:g} K: {share:.3f} of the change")
     assert 0.9 < share < 1.1
     assert held(whole, scene, "background_temperature", constant) > 0.9
 
@@ -100,7 +99,6 @@ def test_a_gray_scene_tells_little_of_the_room(gray: float) -> None:
     whole = separation.complete(alone, capture, RESPONSE)
     assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).all())
     apart = whole.attrs["surroundings"] - ROOM
-    print(f"gray {gray}: {apart:.1f} +- {whole.attrs['surroundings_std']:.1f} K")
     assert held(whole, scene, "background_temperature") > 0.8
     assert abs(apart) < 3.0 * whole.attrs["surroundings_std"]
 

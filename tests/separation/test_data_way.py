@@ -56,7 +56,5 @@ def test_way_of_the_data_is_short(jump: float) -> None:
     way = [room for room, name in read if room.startswith("separation") and "." not in name]
     way = [room for place, room in enumerate(way) if room != way[place - 1] or place == 0]
     returns = len(way) - len(set(way))
-    print(f"{len(read)} functions in {len(rooms)} rooms: {', '.join(rooms)}")
-    print(f"{returns} returns: {' > '.join(room.removeprefix('separation/') for room in way)}")
     assert len(rooms) <= MOST_ROOMS
     assert returns <= MOST_RETURNS

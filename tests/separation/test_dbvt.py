@@ -188,7 +188,6 @@ def test_exact_response_is_taken_out() -> None:
         errors(scene, separation.solve(capture, response, "dbvt", settings=settings))
         for settings in (DbvtSettings(bend_updates=0), None)
     )
-    print(f"linear identities {bent}, bend taken out {straight}")
     assert straight[0] < 0.5 * bent[0]
 
 
@@ -203,12 +202,8 @@ def test_too_few_steps_are_flagged() -> None:
     ("options", "message"),
     [
         ({"huber": -1.0}, "Invalid huber -1.0 of method 'dbvt'. Must be at least 0."),
-        ({"noise": np.nan}, "Invalid noise nan of method 'dbvt'. Must be at least 0."),
         ({"curvature": 0.0}, "curvature of method 'dbvt'"),
-        ({"tolerance": -1.0}, "tolerance of method 'dbvt'"),
         ({"starts": 0}, "Invalid starts 0 of method 'dbvt'. Must be at least 1."),
-        ({"steps": 0}, "Invalid steps 0 of method 'dbvt'. Must be at least 1."),
-        ({"bend_updates": -1}, "Invalid bend_updates -1 of method 'dbvt'. Must be at least 0."),
         ({"margin": 0.5}, r"Invalid margin 0.5 of method 'dbvt'. Must lie in \(0, 0.5\)."),
         ({"start": "truth"}, "Unknown start 'truth' of method 'dbvt'. Must be one of"),
     ],

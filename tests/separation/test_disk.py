@@ -186,7 +186,6 @@ def test_chunks_of_dask_are_read_once(path: Path, tmp_path: Path, rows: Any) -> 
     expected = separation.solve(held, RIG.response())
     xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
     times = max(np.unique(read, return_counts=True)[1])
-    print(f"chunks of {rows} rows: {len(read)} reads, a chunk at most {times} times")
     # Twice more for a few pixels: by which the capture is known again, and to check it.
     assert times <= (4 if isinstance(rows, tuple) else 3)
 

@@ -49,7 +49,6 @@ def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
     error = abs(result["object_temperature"] - scene.truth["object_temperature"]).mean("time")
     error = error.where(result["status"] == 0)
-    print(f"without a flag {float(error.notnull().mean()):.2f}, largest error {error.max():.2f} K")
     assert float(error.notnull().mean()) > 0.75
     assert float(error.max()) < 0.5
 
@@ -63,7 +62,6 @@ def test_known_emissivities_and_rapid_heating() -> None:
         scene = painted(4, picture=picture, time=TIME, shift=moved)
         options["reflection_shift"] = field(moved)
         got[name] = judged(scene, separation.solve(scene.capture, scene.response, **options))
-    print(got)
     assert got["apart"]["measured"] > 0.85
     assert got["apart"]["typical"] < 0.8 * got["one place"]["typical"]
     assert 0.92 < got["apart"]["cover"] < 0.98
@@ -78,9 +76,7 @@ def test_nothing_stands_where_no_object_fits(wrong: float) -> None:
     for name in ("object_temperature", "background_temperature"):
         known = result[name].notnull()
         assert bool((known == result[f"{name}_std"].notnull()).all())
-        print(f"{name}: {float(known.mean()):.3f} of the samples")
     impossible = (result["status"] & int(Status.NONPHYSICAL_EMISSIVITY)) != 0
-    print(f"{int(impossible.sum())} pixels of an impossible emissivity")
     assert int(impossible.sum()) > 0
     assert not bool(result["object_temperature"].where(impossible).notnull().any())
 
@@ -123,5 +119,4 @@ def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
     pooled = separation.solve(capture, RIG.response(), pool=labels, reflection_shift=known)
     alone = separation.solve(capture, RIG.response(), reflection_shift=known)
     stds = [float(one["reflection_ratio_std"][1].median()) for one in (pooled, alone)]
-    print(f"deviation of the ratio: pooled {stds[0]:.3f}, alone {stds[1]:.3f}")
     assert stds[0] < 0.5 * stds[1]

@@ -139,7 +139,6 @@ def test_no_picture_is_worse_than_the_reading(shelf: Shelf, name: str) -> None:
         float(abs(shelf.outcome(name, way).result["object_temperature"] - truth).median())
         for way in ("separate", "apparent")
     ]
-    print(f"{name}: {errors[0]:.3f} K, reading {errors[1]:.3f} K")
     assert errors[0] < errors[1]
 
 
@@ -186,11 +185,6 @@ def test_shutter_events_that_nobody_marks_are_flagged(shelf: Shelf) -> None:
     scene = shelf.scene("shutter events")
     result = separation.solve(scene.capture.drop_vars("segment"), scene.response)
     good = result["status"] == 0
-    error = result["object_temperature"] - scene.truth["object_temperature"]
-    off = (error**2).mean("time") ** 0.5
-    print(
-        f"without a flag {float(good.mean()):.3f}, right {float((good & (off < 0.5)).mean()):.3f}"
-    )
     assert float(good.mean()) < 0.3
 
 
@@ -271,7 +265,6 @@ def test_material_elsewhere_completes_within_noise(shelf: Shelf) -> None:
     whole = separation.complete(alone, scene.capture, scene.response, labels)
     missing = alone["object_temperature"].isnull()
     error = abs(whole["object_temperature"] - scene.truth["object_temperature"]).where(missing)
-    print(f"still half by its material: {float(error.median()):.3f} K")
     assert float(error.median()) < 0.1  # K
     assert held(whole, scene.truth, where=missing) > 0.9
     still = whole["status"].where(missing.any("time"), 0).astype(int)
@@ -309,15 +302,6 @@ def assert_same(found: xr.Dataset, expected: xr.Dataset) -> None:
     """Fail if a variable of the separation differs."""
     for name in ("object_temperature", "object_temperature_std", "emissivity", "status"):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, err_msg=name)
-
-
-def test_a_run_on_disk_is_the_separation_of_each_pixel(shelf: Shelf, stores: Path) -> None:
-    """From store to store the result is that of `solve`."""
-    response = shelf.scene("two materials").response
-    separation.run(stores / "capture.zarr", stores / "run.zarr", response)
-    assert_same(
-        store.open_dataset(stores / "run.zarr"), shelf.outcome("two materials", "solve").result
-    )
 
 
 def test_the_command_line_separates_as_the_function_does(

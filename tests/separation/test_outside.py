@@ -165,5 +165,4 @@ def test_pooled_intervals_hold_with_the_noise_of_the_capture(louder: float) -> N
         labels = xr.DataArray((X < 0.5).astype(int), dims=("y", "x"))
         result = separation.solve(capture, response.drop_vars("noise"), pool=labels)
         shares.append(held(result, truth))
-        print(louder, result["noise"].values / response["noise"].values, shares[-1])
     assert np.mean(shares) > 0.85

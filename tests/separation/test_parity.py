@@ -70,7 +70,6 @@ def test_a_capture_on_a_device(case: str, device: str) -> None:
         )
         np.testing.assert_array_equal(np.isfinite(value), np.isfinite(expected))
         error, film = np.abs(value - expected), name.endswith("temperature")
-        print(f"{name}: {np.nanmax(error):.1e}")
         assert not np.any(error > ROUNDING * (std + 0.1 * film))
 
 

@@ -98,7 +98,6 @@ def test_an_offset_moves_the_result_as_stated(band: str) -> None:
     for kind in ("object_temperature", "background_temperature"):
         moved = abs(after[kind] - before[kind]).where(good)
         added = (stated[f"{kind}_std"] ** 2 - before[f"{kind}_std"] ** 2) ** 0.5
-        print(band, kind, float((moved / added).median()))
         assert float((moved / added).median()) == pytest.approx(1.0, abs=0.03)
     np.testing.assert_array_equal(stated["emissivity_std"], before["emissivity_std"])
 

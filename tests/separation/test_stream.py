@@ -93,7 +93,6 @@ def test_memory_does_not_grow_and_the_past_is_forgotten() -> None:
     result = stream.result()
     good = result["status"] == 0
     off = abs(result["emissivity"] - scene["emissivity"]).where(good).median(["y", "x"])
-    print(f"{size / 240:.0f} byte a pixel; after another object, error {off.values}")
     assert stream.nbytes == size
     assert float(off.max()) < 0.05
 
@@ -120,16 +119,13 @@ def test_a_shutter_event_is_told_by_the_segment(glass: Data) -> None:
     told = stream.result()["status"].values == 0
     changed = capture.assign(counts=capture["counts"].copy(data=spoiled))
     hidden = live(changed, response)[0].result()["status"].values == 0
-    print(f"good with the segment {told.mean():.3f}, without it {hidden.mean():.3f}")
     assert told.mean() > max(0.6, hidden.mean())
 
 
 BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"frames": np.zeros((2, 12, 20), np.uint16)}, TypeError, "Invalid dtype uint16 of the frames"),
     ({"frames": np.zeros((2, 12, 21), np.float32)}, ValueError, r"Invalid shape \(2, 12, 21\)"),
-    ({"frames": np.zeros((3, 12, 20), np.float32)}, ValueError, r"Invalid shape \(3, 12, 20\)"),
     ({"time": -1.0}, ValueError, "Invalid time -1.0 s of a frame, after 0.0 s. Must rise"),
-    ({"time": 0.0}, ValueError, "Invalid time 0.0 s"),
     ({"time": np.nan}, ValueError, "Invalid time nan s"),
     ({"segment": -1}, ValueError, "Invalid segment -1 after 0. Must not fall"),
 ]
