@@ -46,7 +46,6 @@ class Faults:
 
     dropped: frozenset[int] = frozenset()  # never come; the sequence number leaps
     corrupt: frozenset[int] = frozenset()  # lower half is not of this image; the driver says so
-    unseen: frozenset[int] = frozenset()  # corrupt, and the driver says nothing
     short: frozenset[int] = frozenset()  # only the first half of the rows comes
     repeated: frozenset[int] = frozenset()  # show the image before once more
     ffc: frozenset[int] = frozenset()  # a flat-field correction starts of the camera's own accord
@@ -119,13 +118,14 @@ class FaultyCamera(EmulatedCamera):
 
     def _damaged(self, number: int, counts: Counts) -> tuple[Counts, FrameFlag]:
         faults, half = self.faults, self.shape[0] // 2
-        if number in faults.corrupt | faults.unseen:
+        if number in faults.corrupt:
             rng = np.random.default_rng([faults.seed, number])
             counts[half:] = rng.integers(0, LIMITS.max, counts[half:].shape, endpoint=True)
+            return counts, FrameFlag.DRIVER_ERROR
         if number in faults.short:
             counts[half:] = 0
             return counts, FrameFlag.WRONG_SIZE
-        return counts, FrameFlag.DRIVER_ERROR if number in faults.corrupt else FrameFlag(0)
+        return counts, FrameFlag(0)
 
 
 def frames(source: FrameSource, number: int) -> Iterator[Frame]:

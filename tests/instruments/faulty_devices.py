@@ -20,7 +20,6 @@ from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
 from dbthermal.instruments.emulated.world import ROOM, World
 
-MESSAGES = frozenset(Id)
 """Identifiers of all messages that a driver of the wheel may send."""
 
 BUSY = 0x283
@@ -43,7 +42,6 @@ class WheelFaults:
     slow: float = 1.0  # factor by which moves take longer
     stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
-    slips: float = 0.0  # way that the wheel loses in every motion, unnoticed [deg]
     deaf_to: str = ""  # name of the message that it ignores
     weak: float = 1.0  # factor of the speeds that it takes
     notice: str = ""  # error that it reports at the next message, once
@@ -152,11 +150,6 @@ class FaultyApt(EmulatedApt):
             return planned
         values = {entry.name: getattr(planned, entry.name) for entry in fields(Drive)}
         return StandingDrive(**values, way=faults.stands_after * degree)
-
-    def finish(self, drive: Drive) -> None:
-        """Lose steps."""
-        self.wheel -= math.copysign(self.faults.slips / 360.0 * self.model.turn, drive.distance)
-        super().finish(drive)
 
     def status(self) -> apt.Status:
         """State with bits that stick."""

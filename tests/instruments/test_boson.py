@@ -220,12 +220,6 @@ def test_the_emulator_refuses_as_a_camera_does(
         assert answer == reply(sequence, command, status=status)
 
 
-@pytest.mark.parametrize("noise", [b"\0\x11", SERIAL_REQUEST[:9], SERIAL_REQUEST[:-2] + b"\0\xae"])
-def test_the_emulator_listens_on_after_noise(bench: BosonBench, noise: bytes) -> None:
-    """Noise, incomplete and damaged frames and text are not answered."""
-    assert bench.exchange(noise + text(5, SERIAL) + SERIAL_REQUEST) == SERIAL_REPLY
-
-
 LINE = [Fault.DROP, Fault.LATE, Fault.HOLD, Fault.BAD_CHECKSUM, Fault.ILLEGAL_ESCAPE, Fault.CUT]
 
 
@@ -241,14 +235,6 @@ def test_a_fault_of_the_line_is_overcome(
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
     assert timeouts <= bench.clock.now - start < timeouts + 1.0  # [s]
     assert bench.camera.serial_number() == 93588
-
-
-def test_a_change_that_is_answered_late_is_done_once(bench: BosonBench) -> None:
-    """A late acknowledgement raises a timeout error, and the change is made once."""
-    bench.spoil(Fault.LATE)
-    with pytest.raises(BosonTimeoutError, match="set gain mode"):
-        bench.camera.set(commands.GAIN_MODE, GainMode.LOW)
-    assert bench.camera.get(commands.GAIN_MODE) is GainMode.LOW
 
 
 @pytest.mark.parametrize("stalls", [False, True])
@@ -279,15 +265,6 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
     ]
     with Dialogue(pairs) as line:
         assert camera_of(line).run_ffc() == 1234
-
-
-def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonBench) -> None:
-    """Replies that a closed shutter delays past their time are not taken for later ones."""
-    bench.device.faults.ffc_stalls = True
-    bench.camera.timeout = 0.1
-    bench.world.start_ffc("boson")
-    assert bench.camera.read(commands.SERIAL_NUMBER, repeats=9) == 93588
-    assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
 
 
 @pytest.mark.parametrize("faults", [[], [None, None, None, *[Fault.DROP] * 99]])

@@ -13,7 +13,6 @@ import xarray as xr
 from faulty_camera import BANDS, two_cameras
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from dbthermal import store
 from dbthermal.instruments import telemetry
@@ -233,12 +232,6 @@ def test_fields_come_back(fields: dict[str, float]) -> None:
     assert found.frame_counter == fields["frame_counter"]
     assert found.last_ffc_frame == fields["last_ffc_frame"]
     assert found.fpa_temperature == pytest.approx(fields["fpa_temperature"], abs=1e-6)
-
-
-@given(words=arrays(np.uint16, (2, 80)))
-def test_anything_is_read(words: npt.NDArray[np.uint16]) -> None:
-    """Any words give a record, as the rows have no checksum."""
-    assert 0 <= telemetry.decode(words)["frame_counter"] < 2**32
 
 
 def test_wrong_telemetry_is_refused() -> None:

@@ -1,6 +1,5 @@
 """Codecs of the wheel (APT) and the Boson (FSLP): public bytes, round trips, damaged input."""
 
-import struct
 from itertools import pairwise
 from typing import Any
 
@@ -299,10 +298,3 @@ def test_sequence_numbers_need_no_escape(sequence: int) -> None:
     assert following > sequence or sequence == (1 << 32) - 1
     numbers = [fslp.next_sequence(n) for n in (0, 0x8D, 0xADFF, 0xFFFFFFFF)]
     assert numbers == [1, 0x8F, 0xAF00, 0]
-
-
-def test_errors_of_a_controller() -> None:
-    """An error of a controller has the message that caused it, a code and a text."""
-    data = struct.pack("<HH64s", 0x0453, 7, b"no motor")
-    message = Message(Id.HW_RICHRESPONSE, 0, 0, apt.HOST, apt.BAY_1, data)
-    assert apt.Notice.parse(decode(apt.encode(message).hex())) == apt.Notice(0x453, 7, "no motor")

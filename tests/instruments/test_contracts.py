@@ -101,7 +101,7 @@ def test_close_is_final(opened: Opened) -> None:
         ask(opened.device)
 
 
-@opens(*CAMERAS[2:], *WHEELS[2:], *LOGGERS)
+@opens(*CAMERAS[1:], *WHEELS[1:], *LOGGERS)
 def test_a_device_has_one_client(opened: Opened) -> None:
     """A second client gets an error with a remedy, and the first is not disturbed."""
     assert opened.again is not None

@@ -1,7 +1,6 @@
 """The devices of a session are opened by their addresses, prepared, and say what they are."""
 
 from collections.abc import Iterator
-from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from device_benches import BosonBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
-from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
+from dbthermal.instruments.boson import Boson, commands
 from dbthermal.instruments.boson.commands import Ir16Mode, Switch
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.devices import (
@@ -167,22 +166,6 @@ def test_one_scan_gives_all_channels_once() -> None:
     assert [thermocouples.read(3), logger.scans] == [303.0, 3]
     with pytest.raises(ReadingError, match=r"No temperature of thermocouple 'room' in channel 2"):
         thermocouples.read(2)
-
-
-def test_instrument_that_fails_is_a_failed_reading(devices: Devices) -> None:
-    """A mute camera and an unplugged logger raise what a recording notes and survives."""
-
-    def mute() -> float:
-        raise BosonTimeoutError("No reply to 'FPA temperature [K]'.")
-
-    camera = SimpleNamespace(fpa_temperature=mute, ffc_status=mute)
-    readings = Devices(devices.session, {}, {"9.5": cast(Boson, camera)}).readings()
-    with pytest.raises(BosonTimeoutError, match="No reply to 'FPA temperature"):
-        readings["fpa 9.5"].read()
-    assert devices.thermocouples is not None
-    devices.thermocouples.logger.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        devices.readings()["plate"].read()
 
 
 def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:

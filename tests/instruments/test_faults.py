@@ -16,14 +16,13 @@ import pytest
 from checked_recording import RATE, SHAPE, CheckedRecording, Read
 from device_benches import BosonBench, LoggerBench, WheelBench
 from faulty_camera import Faults, two_bands
-from faulty_devices import Fault, FaultyBoson
+from faulty_devices import Fault
 
 from dbthermal import store
 from dbthermal.correction import find_shutter
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
-from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
@@ -73,15 +72,6 @@ def test_a_repeated_image(tmp_path: Path) -> None:
     np.testing.assert_array_equal(flagged > 0, repeated)
     assert found["frames"].sum() == np.count_nonzero(repeated) > 0
     assert not found["renewed"].any()
-
-
-def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
-    """A corrupt frame that the driver does not report is not detected."""
-    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(unseen=OFTEN)}).record(0.4)
-    kept = recorded.stored("9.5")
-    corrupt = np.isin(kept["sequence"], [*OFTEN])
-    assert corrupt.any()
-    assert {*kept["frame_flags"].values[corrupt]} <= {0, int(LOST)}
 
 
 def test_an_unplugged_camera(tmp_path: Path) -> None:
@@ -268,29 +258,3 @@ def test_what_is_recorded(name: str, troubled: CheckedRecording) -> None:
         kind, value = "reading_failed", math.nan
     assert troubled.kinds(name) == [kind] * len(found) != []
     np.testing.assert_allclose([read for _, read in found], value, rtol=0, atol=0.05)
-
-
-def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> None:
-    """The camera answers after its shutter opened; its frames say that it was closed."""
-    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
-    device = FaultyBoson(recorded.world, "9.5")
-    device.faults.ffc_stalls = True
-    with Boson(Line(device, device._world.clock), timeout=20) as boson:
-        recorded.record(1.0, {"fpa": read_beside_frames(boson)})
-    assert "shutter_closed" in recorded.kinds("9.5")
-    assert {*recorded.kinds("fpa")} == {"reading"}
-
-
-def test_an_instrument_that_is_pulled_out(tmp_path: Path) -> None:
-    """Readings are valid until the instrument is unplugged, and noted as failed afterwards."""
-    bench = WheelBench()
-    bench.homed().move_to(3)
-    left = iter([True, True])
-
-    def read() -> float:
-        bench.device.plugged = next(left, False)
-        return bench.wheel.position()
-
-    recorded = CheckedRecording(tmp_path / "a.zarr").record(0.5, {"slot": read})
-    assert recorded.noted("slot")[:2] == [("reading", SLOT)] * 2
-    assert {*recorded.kinds("slot")[2:]} == {"reading_failed"}

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from device_benches import FILTERS, WheelBench
 from dialogue import Dialogue, Pair
-from faulty_devices import MESSAGES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,16 +52,8 @@ def test_every_slot_turns_into_the_beam(model: str) -> None:
     assert moves == [SIXTHS[model][slot - 1] for slot in slots]
     speeds = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
     assert speeds == (1, 0, *TURNS[model])
-
-
-def test_no_other_messages() -> None:
-    """The driver sends these messages and no others, and enables the motor before it moves."""
-    bench = WheelBench()
-    bench.homed().move_to(3)
     order = [message.id for message in bench.device.received]
-    assert {*order} <= MESSAGES
-    assert order.index(0x0210) < order.index(0x0443)  # the motor is enabled, then homed
-    assert order.index(0x0440) < order.index(0x0443)
+    assert max(order.index(0x0210), order.index(0x0440)) < order.index(0x0443)  # enabled, then home
 
 
 @pytest.mark.parametrize("turns", [-1, 1])
@@ -365,19 +356,6 @@ def test_moving_bits_that_stick() -> None:
     assert bench.world.wheel_position == 3
     with pytest.raises(WheelError, match="still moving"):
         wheel.move_to(4)
-
-
-def test_lost_steps_are_seen_by_nobody() -> None:
-    """Without an encoder lost steps are not detected; homing restores the position."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    bench.device.faults.slips = 5.0
-    wheel.move_to(3)
-    assert (wheel.position(), bench.world.wheel_position) == (3, None)
-    bench.device.faults.slips = 0.0
-    wheel.home()
-    wheel.move_to(3)
-    assert bench.world.wheel_position == 3
 
 
 def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:

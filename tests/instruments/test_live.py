@@ -1,10 +1,7 @@
 """The live view shows the state of a recording in one figure, without losing frames."""
 
 import math
-import subprocess
-import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -170,16 +167,6 @@ def test_camera_temperature() -> None:
     assert math.isnan(status(preview(shown=damaged)).fpa_temperature)
 
 
-def test_lines() -> None:
-    """Two lines of text give the state in degrees Celsius, and mark unknown values."""
-    expected = f"FPA 35.0 {DEGREE}, FFC complete, last 4 s ago"
-    lines = status(ffc(0.0, ffc=2.0), ffc(4.0, ffc=3.0)).text.splitlines()
-    assert lines == ["60.0 frames/s, 2 lost, 3 refused, 4 damaged", expected]
-    assert status(ffc(ffc=2.0)).text.endswith(f"FPA 35.0 {DEGREE}, FFC in progress")
-    unknown = status(preview()).text.splitlines()
-    assert unknown == ["- frames/s, 2 lost, 3 refused, 4 damaged", "FPA unknown, FFC unknown"]
-
-
 @pytest.mark.parametrize(
     ("value", "pixels", "warning"),
     [
@@ -328,26 +315,3 @@ def test_recording_without_a_notebook(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.fpa_temperature, 308.2, rtol=0, atol=0.06)
     assert texts(view)[-1] == f"plate 30.0 {DEGREE}"
     assert texts(view).count("shutter closed: FFC in progress") == 2
-
-
-def test_import_is_light() -> None:
-    """Neither the package nor the watch loads matplotlib or IPython: the first picture does."""
-    heavy = "{'matplotlib', 'IPython', 'torch'}"
-    code = f"import sys, dbthermal.instruments.live; print({heavy} & {{*sys.modules}})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
-@pytest.mark.bench
-def test_cost_of_an_update() -> None:
-    """An update of two full frames takes less than 1 s of processor time; the queue bridges 2 s."""
-    noise = np.random.default_rng(0).normal(20_000, 15, (8, 512, 640)).astype(np.uint16)
-    view, spent = live.View(Recorder(), is_simulated=True), []
-    for number, counts in enumerate(noise):
-        frames = dict.fromkeys(BANDS, frame(counts))
-        totals = dict.fromkeys(BANDS, preview(number).totals["9.5"])
-        start = time.process_time()
-        view(Preview(float(number), frames, totals, {"plate": 300.0 + number}))
-        spent.append(time.process_time() - start)
-    print(f"first picture {1e3 * spent[0]:.0f} ms, then {1e3 * np.median(spent[1:]):.0f} ms each")
-    assert np.median(spent[1:]) < 1.0

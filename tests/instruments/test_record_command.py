@@ -11,10 +11,8 @@ from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 from dbthermal.__main__ import main
 from dbthermal._cli import record as command
 from dbthermal.instruments import inventory, protocols, recording
-from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording import Preview, open_capture
+from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
 
 ONE = replaced(
@@ -164,14 +162,3 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     real = replace(emulated, simulated=False)
     assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)
-
-
-def test_progress_is_a_line() -> None:
-    """The progress is one line with the losses, temperatures and shutter of each band."""
-    totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
-    readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
-    line = command._progress(Watch(), Preview(1.0, {}, totals, readings))
-    assert line.startswith("\r   1.0 s  9.5: ")
-    for part in ("3 lost", "0 refused", "FPA 35.0 \N{DEGREE SIGN}C", "FFC in progress"):
-        assert part in line
-    assert "\n" not in line

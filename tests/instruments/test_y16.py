@@ -1,12 +1,10 @@
 """A generic 16-bit camera: its frames, and its shutter from repeated images."""
 
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from device_openings import real_video
 from test_v4l2 import BYTES, GOOD, Driver
 
 from dbthermal import correction
@@ -36,18 +34,6 @@ def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch
     assert (frame.sequence, {*source.identity}) == (7, {"device", "model", "bus", "driver"})
     with pytest.raises(ValueError, match=r"Invalid address 'serial:///dev/ttyACM0'\. Must"):
         y16.KIND.open_frames("serial:///dev/ttyACM0", Stream())
-
-
-def test_hardware_is_opened_by_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The environment names address, kind and format of the camera that the contract is held on."""
-    kernel = Driver(rate=9).kernel()
-    monkeypatch.setattr(v4l2, "Kernel", lambda: kernel)
-    monkeypatch.setenv("DBTHERMAL_VIDEO", "v4l2:///dev/video0")
-    for name, value in (("KIND", "y16"), ("SHAPE", "6x8"), ("RATE", "9")):
-        monkeypatch.setenv(f"DBTHERMAL_VIDEO_{name}", value)
-    with ExitStack() as stack:
-        device = real_video(stack).device
-        assert (device.shape, device.frame_rate) == ((6, 8), 9.0)
 
 
 def test_it_has_neither_telemetry_nor_command_port() -> None:
