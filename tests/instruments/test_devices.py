@@ -1,11 +1,9 @@
 """The devices of a session are opened by their addresses, prepared, and say what they are."""
 
 from collections.abc import Iterator
-from typing import cast
 
-import numpy as np
 import pytest
-from device_benches import BosonBench
+from device_benches import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments.boson import Boson, commands
@@ -18,10 +16,8 @@ from dbthermal.instruments.devices import (
     open_devices,
 )
 from dbthermal.instruments.emulated.camera import EmulatedCamera
-from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import emulated_world
 from dbthermal.instruments.filterwheel import NotHomedError
-from dbthermal.instruments.tc08 import TC08, Flag, Scan
 from dbthermal.instruments.transport import TransportError
 
 
@@ -141,29 +137,22 @@ def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
     assert source.read().device_time >= start
 
 
-class Logger:
-    """A logger that counts its scans; channel 2 is open."""
-
-    def __init__(self) -> None:
-        self.scans, self.clock = 0, EmulatedClock()
-
-    def single(self) -> Scan:
-        """Scan once more: each one is a kelvin warmer."""
-        self.scans += 1
-        values = np.full(9, 300.0 + self.scans)
-        flags = np.where(np.arange(9) == 2, Flag.MISSING, Flag.GOOD).astype(np.uint8)
-        return Scan(0.0, values, flags)
-
-
 def test_one_scan_gives_all_channels_once() -> None:
     """One scan of the logger serves all channels, and each value is read once."""
-    logger = Logger()
-    names = {1: "plate", 2: "room", 3: "wall"}
-    thermocouples = Thermocouples(cast(TC08, logger), names)
-    assert [thermocouples.read(1), thermocouples.read(3), logger.scans] == [301.0, 301.0, 1]
-    assert [thermocouples.read(1), logger.scans] == [302.0, 2]
-    logger.clock.sleep(1.1)
-    assert [thermocouples.read(3), logger.scans] == [303.0, 3]
+    bench = LoggerBench()
+    thermocouples = Thermocouples(bench.ready(), {1: "plate", 2: "room"})
+
+    def read(channel: int, rise: float) -> float:
+        """Reading of a channel [K] where the tips are warmer than at first by a rise [K]."""
+        bench.tips = {1: 350.0 + rise, 2: 300.0 + rise}
+        return round(thermocouples.read(channel), 3)
+
+    assert [read(1, 0.0), read(2, 1.0)] == [350.0, 300.0]
+    assert [read(2, 2.0), read(2, 3.0)] == [302.0, 303.0]
+    bench.clock.sleep(1.1)  # the value that was not read yet is too old
+    assert read(1, 4.0) == 354.0
+    bench.unit.faults.open = {2}
+    bench.clock.sleep(1.1)
     with pytest.raises(ReadingError, match=r"No temperature of thermocouple 'room' in channel 2"):
         thermocouples.read(2)
 

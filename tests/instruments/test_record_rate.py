@@ -22,9 +22,6 @@ from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record
 
 SHAPE, RATE, MINUTE = (512, 640), 60.0, 60.0
-FASTER = (90.0, 120.0, 180.0, 240.0, 300.0)  # of two emulated cameras [Hz]; no Boson gives these
-SLOWER = (45.0, 30.0, 20.0, 10.0)
-TRIAL = 5.0  # how long each of these is recorded [s]
 
 
 class Measured(NamedTuple):
@@ -69,15 +66,7 @@ def test_two_full_cameras_for_a_minute(tmp_path: Path) -> None:
     """Two cameras of 640 x 512 at 60 Hz: a minute without a lost frame, in bounded memory."""
     print()
     short, whole = (fresh(RATE, seconds, tmp_path) for seconds in (MINUTE / 3, MINUTE))
-    holds = RATE
-    for rate in FASTER if whole.missing == 0 else SLOWER:
-        missing = fresh(rate, TRIAL, tmp_path).missing
-        if (missing == 0) != (whole.missing == 0):
-            holds = rate if missing == 0 else holds
-            break
-        holds = rate
-    print(f"Highest rate tried that holds: {holds:g} Hz for both cameras")
-    assert whole.missing == 0, f"{holds:g} Hz holds"
+    assert whole.missing == 0
     assert min(whole.frames) >= RATE * MINUTE - 5
     assert whole.peak < short.peak + 50, "memory grows with time"
     assert whole.peak < 1000
