@@ -19,7 +19,7 @@ from dbthermal.instruments.recording import Limits, Preview, open_capture
 
 LIMITS, LIMIT = Limits(chunk=30, reserve=0, queue=3), 600.0
 SWEEP = from_yaml(
-    replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.6"))
+    replaced(("[300.0, 290.0, 310.0]", "[300.0]"), ("duration: 0.15", "duration: 0.6"))
 )
 SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text()))
 

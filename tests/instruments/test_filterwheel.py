@@ -210,17 +210,13 @@ class Babbler(Dialogue):
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
-    """Connecting ends with a documented error for arbitrary answers."""
+    """Connecting ends with a documented error for arbitrary answers, also if they never end."""
     babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
         FilterWheel(babbler, FILTERS).connect()
-
-
-def test_a_device_that_never_ends_is_another_one() -> None:
-    """An endless stream of bytes ends the wait with an error."""
-    line = Babbler([(None, [bytes(256)] * 513)])
+    endless = Babbler([(None, [bytes(256)] * 513)])
     with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
-        FilterWheel(line, {}).connect()
+        FilterWheel(endless, {}).connect()
 
 
 Case = tuple[dict[str, Any], type[WheelError], str]
@@ -274,13 +270,7 @@ def test_harmless_faults(faults: dict[str, object]) -> None:
 
 # Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
 STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
-    (
-        {"stands_after": 20.0},
-        StalledWheelError,
-        r"120.00 deg: .* at 20.00 deg for 2.0 s",
-        True,
-        True,
-    ),
+    ({"stands_after": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
     # It still moves, however near to its target it is seen twice.
     (
         *({"stands_after": 119.95, "unreported": True}, StalledWheelError),

@@ -202,18 +202,6 @@ def test_a_folder_that_is_moved_while_it_is_looked_for(
         folder.place()
 
 
-def test_a_deleted_recording_ends_at_once(tmp_path: Path) -> None:
-    """Deleted while it records, it ends with an error that names it, and is not made anew."""
-    path = tmp_path / "a.zarr"
-
-    def delete(_: Preview) -> None:
-        shutil.rmtree(path, ignore_errors=True)
-
-    with pytest.raises(FileNotFoundError, match=r"a\.zarr' any more"):
-        record(session(60.0), bench(), path, limits=SMALL, preview=delete)
-    assert not path.exists()
-
-
 def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
     """The folder of a sweep, renamed on the way, has all its recordings; the old one is gone."""
     before, after = tmp_path / "before", tmp_path / "after"
