@@ -20,8 +20,6 @@ from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
 from dbthermal.instruments.emulated.world import ROOM, World
 
-"""Identifiers of all messages that a driver of the wheel may send."""
-
 BUSY = 0x283
 
 

@@ -26,8 +26,10 @@ from dbthermal.instruments.boson import (
 from dbthermal.instruments.boson.commands import Reading, Setting
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.clock import SYSTEM
-from dbthermal.instruments.emulated.world import FFC_DURATION
-from dbthermal.instruments.transport import Closing, TransportError
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.line import Line
+from dbthermal.instruments.emulated.world import FFC_DURATION, World
+from dbthermal.instruments.transport import TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
 # the values from 0; the states of a correction; the error numbers.
@@ -286,57 +288,44 @@ def test_each_program_begins_at_another_number() -> None:
     assert sent[0] != sent[1]
 
 
-class Slow(Closing):
-    """A camera that answers late, and counts requests before its answer or after its end."""
+class Slow(Line):
+    """A line that takes its time, and counts requests before an answer or after its end."""
 
-    is_simulated, clock = True, SYSTEM
-
-    def __init__(self) -> None:
-        self.overlaps = 0
-        self.reading = threading.Event()
-        self._answers: list[bytes] = []
-        self._closed = False
+    overlaps, waits = 0, False
 
     def write(self, data: bytes) -> None:
         """Take one request."""
-        if self._closed:
-            raise TransportError("closed")
-        self.overlaps += bool(self._answers)
-        sequence, command = struct.unpack_from(">II", data, 2)  # none of these is escaped
-        self._answers.append(reply(sequence, command, bytes(4 if command == SERIAL else 2)))
+        self.overlaps += self.waits
+        super().write(data)
+        self.waits = True
 
-    def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - as a line has
-        """Answer."""
-        self.reading.set()
+    def read(self, size: int, timeout: float) -> bytes:
+        """Answer late."""
         time.sleep(0.002)
         self.overlaps += self._closed
-        return self._answers.pop(0)
-
-    def close(self) -> None:
-        """End."""
-        self._closed = True
+        self.waits = False
+        return super().read(size, timeout)
 
 
 def test_threads_take_turns_until_the_end() -> None:
     """Exchanges do not overlap, closing waits for one, and the next is a documented error."""
-    line = Slow()
-    camera = Boson(line)
+    world = World(clock=SYSTEM)
+    world.add_camera("boson", 93588)
+    camera = Boson(line := Slow(EmulatedBoson(world, "boson"), SYSTEM))
     errors: list[TransportError] = []
 
     def ask() -> None:
         try:
             while True:
-                assert camera.serial_number() == 0
-                assert camera.fpa_temperature() == pytest.approx(273.15)
+                assert camera.serial_number() == 93588
+                assert camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
         except TransportError as error:
             errors.append(error)
 
     threads = [threading.Thread(target=ask) for _ in range(2)]
     for thread in threads:
         thread.start()
-    for _ in range(20):
-        line.reading.clear()
-        assert line.reading.wait(60.0)
+    time.sleep(0.2)
     for _ in range(2):
         camera.close()
     for thread in threads:

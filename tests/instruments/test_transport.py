@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import pkgutil
 import pty
 import subprocess
 import sys
@@ -13,7 +14,9 @@ import pytest
 import serial
 from device_benches import BosonBench
 
+from dbthermal import instruments
 from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.camera import KINDS
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import SerialTransport, TransportError, open_serial
 
@@ -144,6 +147,16 @@ def test_importing_the_instruments_is_light() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == 3 * ["set()"]
+
+
+def test_every_module_is_on_the_map() -> None:
+    """The package says what each of its modules is for, and offers them for completion."""
+    names = {module.name for module in pkgutil.iter_modules(instruments.__path__)}
+    names -= {module.rpartition(".")[2] for module in KINDS.values()}
+    assert {name for name in names if f"`{name}`" not in (instruments.__doc__ or "")} == set()
+    assert dir(instruments) == sorted(instruments.__all__)
+    with pytest.raises(AttributeError, match="Unknown module 'dialogue'"):
+        _ = instruments.dialogue
 
 
 def test_a_line_in_memory() -> None:
