@@ -20,8 +20,6 @@ from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
 from dbthermal.instruments.emulated.world import ROOM, World
 
-BUSY = 0x283
-
 
 @dataclass
 class WheelFaults:
@@ -180,9 +178,6 @@ class Fault(Enum):
     BAD_CHECKSUM = auto()
     ILLEGAL_ESCAPE = auto()
     CUT = auto()  # its second half is lost
-    WRONG_COMMAND = auto()
-    SHORT = auto()  # its last byte of data is missing, and the checksum is right
-    BUSY = auto()  # it refuses
     DEBUG_TEXT = auto()  # text on another channel comes first
 
 
@@ -232,13 +227,7 @@ class FaultyBoson(EmulatedBoson):
 
     def _spoilt(self, frame: fslp.Frame, fault: Fault | None) -> bytes:
         """Bytes of the reply to a request, with its fault."""
-        spoilt = _misshapen(self.reply(frame), fault)
-        if fault in {Fault.BUSY, Fault.SHORT, Fault.WRONG_COMMAND}:
-            status, data = (BUSY, b"") if fault is Fault.BUSY else self.answer(frame)
-            command = frame.command + (fault is Fault.WRONG_COMMAND)
-            data = data[:-1] if fault is Fault.SHORT else data
-            spoilt = reply(frame.sequence, command, data, status=status)
-        spoilt = self._held + spoilt
+        spoilt = self._held + _misshapen(self.reply(frame), fault)
         self._held = spoilt if fault is Fault.HOLD else b""
         return b"" if fault in {Fault.HOLD, Fault.DROP} else spoilt
 

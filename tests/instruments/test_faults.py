@@ -19,7 +19,7 @@ from faulty_camera import Faults, two_bands
 from faulty_devices import Fault
 
 from dbthermal import store
-from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
+from dbthermal.instruments.boson import Boson, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
 from dbthermal.instruments.filterwheel import (
@@ -163,9 +163,6 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
     "Boson: text on another channel": (lambda: camera(Fault.DEBUG_TEXT), FPA),
     "Boson: stalled by a correction": (correcting_camera, FPA),
     "Boson: mute": (lambda: camera(Fault.DROP), (BosonTimeoutError, "through with booting")),
-    "Boson: busy": (lambda: camera(Fault.BUSY), (BosonStatusError, "0x283, camera busy")),
-    "Boson: short data": (lambda: camera(Fault.SHORT), (BosonReplyError, "1 bytes. Must have 2")),
-    "Boson: another's": (lambda: camera(Fault.WRONG_COMMAND), (BosonReplyError, "0x00050031. M")),
     "Boson: unplugged": (
         lambda: camera(plugged=False),
         (TransportError, "Lost the emulated device"),
