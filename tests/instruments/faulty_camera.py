@@ -1,6 +1,5 @@
-"""An emulated camera with faults, and a movie as its scene."""
+"""An emulated camera with faults."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -22,22 +21,6 @@ from dbthermal.instruments.session import Camera, Session
 
 LIMITS = np.iinfo(np.uint16)
 BANDS = ("8-14", "9.5")
-
-
-@dataclass(frozen=True)
-class Movie:
-    """A picture from frames (time, y, x) [count] that were computed before, at a rate [Hz]."""
-
-    counts: Counts
-    rate: float
-    endless: bool = False
-
-    def __call__(self, time: float) -> Counts:
-        """Frame that is shown at a time of the scene [s]."""
-        # A time on the edge of a frame is that frame's, whatever its last bit.
-        number, frames = math.floor(time * self.rate + 1e-6), self.counts.shape[0]
-        frame: Counts = self.counts[number % frames if self.endless else number]
-        return frame
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ from dbthermal.instruments.devices import (
     Thermocouples,
     open_devices,
 )
-from dbthermal.instruments.emulated.camera import EmulatedCamera
-from dbthermal.instruments.emulated.world import emulated_world
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.transport import TransportError
 
@@ -26,23 +24,6 @@ def devices() -> Iterator[Devices]:
     """Open the whole rig on emulators."""
     with rig(from_yaml(TEXT)) as opened:
         yield opened
-
-
-def test_whole_rig_is_opened_and_closed() -> None:
-    """All devices of the file answer through their drivers, and are closed in the end."""
-    with rig(from_yaml(TEXT)) as devices:
-        assert list(devices.sources) == list(devices.cameras) == ["8-14", "9.5"]
-        assert devices.wheel is not None
-        assert devices.thermocouples is not None
-        devices.wheel.status()
-    for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
-        with pytest.raises(TransportError, match="must stay connected and open"):
-            ask()
-    for source in devices.sources.values():
-        with pytest.raises(ConnectionError, match="it is closed"):
-            source.read()
-    with pytest.raises(RuntimeError, match="closed"):
-        devices.thermocouples.logger.identity()
 
 
 def test_every_device_says_what_it_is(devices: Devices) -> None:
@@ -59,6 +40,21 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
     assert devices.wheel is not None
     with pytest.raises(NotHomedError):
         devices.wheel.position()
+
+
+def test_whole_rig_is_closed() -> None:
+    """All devices of the file are closed in the end."""
+    with rig(from_yaml(TEXT)) as devices:
+        assert devices.wheel is not None
+        assert devices.thermocouples is not None
+    for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
+        with pytest.raises(TransportError, match="must stay connected and open"):
+            ask()
+    for source in devices.sources.values():
+        with pytest.raises(ConnectionError, match="it is closed"):
+            source.read()
+    with pytest.raises(RuntimeError, match="closed"):
+        devices.thermocouples.logger.identity()
 
 
 def test_readings_are_named(devices: Devices) -> None:
@@ -175,16 +171,3 @@ def test_hardware_has_no_emulated_world() -> None:
             open_devices(real, *extra),
         ):
             pass
-
-
-def test_world_of_a_session() -> None:
-    """Cameras, filters and thermocouples of the emulated bench are those of the session."""
-    session = from_yaml(TEXT)
-    world = emulated_world(session, wheel_position=3)
-    assert (list(world.cameras), world.filter_name) == (["8-14", "9.5"], "11")
-    assert world.thermocouples == {1: "blackbody", 4: "plate"}
-    with open_devices(session) as devices:
-        wide, narrow = devices.sources.values()
-    assert isinstance(wide, EmulatedCamera)
-    assert isinstance(narrow, EmulatedCamera)
-    assert (wide.band, narrow.band) == ("8-14", None)

@@ -22,13 +22,7 @@ from dbthermal import store
 from dbthermal.instruments.boson import Boson, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
-from dbthermal.instruments.filterwheel import (
-    FilterWheel,
-    NoReplyError,
-    NotHomedError,
-    StalledWheelError,
-    WheelError,
-)
+from dbthermal.instruments.filterwheel import FilterWheel, NoReplyError
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
@@ -123,26 +117,6 @@ def wheel(*, plugged: bool = True, **knobs: object) -> FilterWheel:
     return bench.wheel
 
 
-def stalled_wheel() -> FilterWheel:
-    """A wheel that stood though it should move, which was an error at once."""
-    bench = WheelBench()
-    bench.homed()
-    bench.device.faults.stands_after = 20.0
-    with pytest.raises(StalledWheelError, match=r"stood at 20\.00 deg for 2\.0 s .* was stopped"):
-        bench.wheel.move_to(3)
-    return bench.wheel
-
-
-def stopped_wheel() -> FilterWheel:
-    """A wheel that was stopped on its way."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    bench.move(200_000)
-    bench.clock.sleep(0.5)
-    wheel.stop()
-    return wheel
-
-
 def logger(**knobs: object) -> TC08:
     """A logger of two tips, with these faults."""
     bench = LoggerBench()
@@ -175,8 +149,6 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
     "wheel: unsolicited reports": (lambda: wheel(stray_completed=True), SLOT),
     "wheel: an unsolicited error": (lambda: wheel(notice="motor hot"), SLOT),
     "wheel: silent": (lambda: wheel(silent=True), (NoReplyError, "must be on and in no other")),
-    "wheel: stalled": (stalled_wheel, (NotHomedError, "has lost steps since. Must be homed")),
-    "wheel: between two slots": (stopped_wheel, (WheelError, "between two slots, at .* deg")),
     "wheel: unplugged": (lambda: wheel(plugged=False), (TransportError, "Lost the emulated dev")),
     "TC-08: open thermocouple": (lambda: logger(open={1}), math.nan),
     "TC-08: open, and reads the room": (lambda: logger(open={1}, reads_ambient=True), ROOM),

@@ -272,10 +272,7 @@ def test_harmless_faults(faults: dict[str, object]) -> None:
 STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
     ({"stands_after": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
     # It still moves, however near to its target it is seen twice.
-    (
-        *({"stands_after": 119.95, "unreported": True}, StalledWheelError),
-        *("stood at 119.95 deg for 2.0 s", True, True),
-    ),
+    ({"stands_after": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
     ({"stops_short": 1.5}, StalledWheelError, "stopped at 118.50 deg. Must arrive", False, True),
     ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
     ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
