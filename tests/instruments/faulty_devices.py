@@ -18,7 +18,7 @@ from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
-from dbthermal.instruments.emulated.world import ROOM, World
+from dbthermal.instruments.emulated.world import World
 
 
 @dataclass
@@ -253,7 +253,6 @@ class LoggerFaults:
     """Faults of the logger and its library; may be changed at any time."""
 
     open: set[int] = field(default_factory=set)  # channels whose thermocouple is open: NaN
-    reads_ambient: bool = False  # it reads as the cold junction instead, as the forum reports
     overflow: set[int] = field(default_factory=set)  # channels whose converter overflows
     errors: dict[str, int] = field(default_factory=dict)  # next error number of a function
     firmware_delay: float = 0.0  # how long opening takes [s]
@@ -295,5 +294,5 @@ class FaultyTC08(EmulatedTC08):
         if channel in self.faults.overflow:
             return 673.15, True
         if channel in self.faults.open:
-            return (ROOM if self.faults.reads_ambient else float("nan")), False
+            return float("nan"), False
         return super().convert(channel)

@@ -63,15 +63,9 @@ def identity(device: Any) -> Mapping[str, object]:
 
 def ask(device: Any) -> object:
     """Ask the simplest question of a device."""
-    match device:
-        case Boson():
-            return device.serial_number()
-        case FilterWheel():
-            return device.status()
-        case TC08():
-            return device.identity()
-        case _:
-            return device.read()
+    if isinstance(device, FilterWheel):
+        return device.status()
+    return identity(device) if isinstance(device, Boson | TC08) else device.read()
 
 
 # What all devices keep.

@@ -180,10 +180,8 @@ def test_answers_of_others() -> None:
 
 
 BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
-
-
-OTHERS: list[Pair] = [(bytes.fromhex(GREETING.format(unit)), None) for unit in (11, 50)]
-OTHERS[0] = (OTHERS[0][0], BANNER)
+GREETINGS = [bytes.fromhex(GREETING.format(unit)) for unit in (11, 50)]
+OTHERS: list[Pair] = [(GREETINGS[0], BANNER), (GREETINGS[1], None)]
 STATES: list[Pair] = [(PAIRS[-1][0], bytes((0x12, 2, 1, state, 1, 0x21))) for state in (0, 3)]
 
 
@@ -391,11 +389,7 @@ def test_unplugging_at_any_step(polls: int) -> None:
     """Unplugging at any step raises the documented error, and closing still works, twice."""
     bench = WheelBench()
     bench.device.faults.polls = polls
-
-    def use() -> None:
-        bench.homed().select("9.5")
-
     with pytest.raises(TransportError, match="Lost the emulated device"):
-        use()
+        bench.homed().select("9.5")
     for _ in range(2):
         bench.wheel.close()

@@ -3,6 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -127,28 +128,19 @@ def test_interrupted(
     assert (tmp_path / "recorded" / "plate.zarr").is_dir()
 
 
-@pytest.mark.parametrize("error", [None, EOFError, NotImplementedError])
-def test_blackbody_is_set_by_the_user(
-    error: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
-    asked: list[str] = []
-
-    def answer(text: str) -> None:
-        asked.append(text)
-        if error:
-            raise error
-
-    monkeypatch.setattr("builtins.input", answer)
-    devices = Devices(from_yaml(TEXT), {})
-    if error:
-        told = r"26\.85 degC\. Must be run in a terminal, or in Jup"
-        with pytest.raises(RuntimeError, match=told):
-            command._set_blackbody(devices, 300.0)
-    else:
-        command._set_blackbody(devices, 300.0)
+    asked, devices = list[str](), Devices(from_yaml(TEXT), {})
+    monkeypatch.setattr("builtins.input", asked.append)
+    command._set_blackbody(devices, 300.0)
     told = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
     assert asked == [told]
+    for error in (EOFError, NotImplementedError):
+        monkeypatch.setattr("builtins.input", Mock(side_effect=error))
+        with pytest.raises(
+            RuntimeError, match=r"26\.85 degC\. Must be run in a terminal, or in Jup"
+        ):
+            command._set_blackbody(devices, 300.0)
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,7 @@ import serial
 from device_benches import BosonBench
 
 from dbthermal import instruments
-from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import KINDS
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import SerialTransport, TransportError, open_serial
 
 AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
@@ -107,15 +105,6 @@ def test_a_wrong_name_is_refused(url: str, message: str) -> None:
     """An unknown part of an address and a missing port raise errors with the rule or the name."""
     with pytest.raises((ValueError, TransportError), match=message):
         open_serial(url, baudrate=115200)
-
-
-def test_the_path_of_an_emulator_is_its_name() -> None:
-    """The address selects one of two emulated cameras by its name."""
-    world = World()
-    for name, number in (("boson", 1), ("wide", 2)):
-        world.add_camera(name, number)
-    with Boson.from_url("sim://boson/wide", world=world) as camera:
-        assert camera.serial_number() == 2
 
 
 class Port:

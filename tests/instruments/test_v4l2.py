@@ -6,7 +6,6 @@ import importlib
 import struct
 import sys
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
@@ -120,10 +119,9 @@ class Driver:
         )
 
 
-def opened(driver: Driver, **changes: Any) -> v4l2.Capture:
+def opened(driver: Driver) -> v4l2.Capture:
     """Open the node of a driver."""
-    stream = Stream(**{**STREAM.__dict__, **changes})
-    return v4l2.Capture("/dev/video0", stream, driver.kernel())
+    return v4l2.Capture("/dev/video0", STREAM, driver.kernel())
 
 
 # Numbers of the calls in `linux/videodev2.h`: direction (1 write, 2 read, 3 both), number, size.
