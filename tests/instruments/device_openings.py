@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from device_benches import FILTERS, QUICK, BosonBench, LoggerBench, WheelBench
+from device_benches import FILTERS, QUICK, LoggerBench
 from faulty_camera import two_cameras
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
@@ -36,11 +36,6 @@ class Opened(NamedTuple):
     again: Callable[[], object] | None = None
 
 
-def loop_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on the emulator, in memory."""
-    return Opened(BosonBench().camera, True)
-
-
 def named_camera(_: ExitStack) -> Opened:
     """A Boson's driver on the emulator, by its address."""
     return Opened(Boson.from_url("sim://boson/wide"), True)
@@ -50,12 +45,6 @@ def real_camera(_: ExitStack) -> Opened:
     """A Boson."""
     url = address("DBTHERMAL_BOSON")
     return Opened(Boson.from_url(url), False, lambda: Boson.from_url(url))
-
-
-def loop_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, in memory."""
-    (wheel := WheelBench().wheel).connect()
-    return Opened(wheel, True)
 
 
 def named_wheel(_: ExitStack) -> Opened:
@@ -114,7 +103,7 @@ def real_video(stack: ExitStack) -> Opened:
 
 Opening = Callable[[ExitStack], Opened]
 
-CAMERAS: list[Opening] = [loop_camera, named_camera, real_camera]
-WHEELS: list[Opening] = [loop_wheel, named_wheel, real_wheel]
+CAMERAS: list[Opening] = [named_camera, real_camera]
+WHEELS: list[Opening] = [named_wheel, real_wheel]
 LOGGERS: list[Opening] = [emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]

@@ -4,7 +4,6 @@ The idea is pymeasure's ``expected_protocol``.
 """
 
 from collections.abc import Iterable, Sequence
-from types import TracebackType
 
 from dbthermal.instruments.clock import Clock
 from dbthermal.instruments.emulated.clock import EmulatedClock
@@ -33,13 +32,12 @@ class Dialogue(Closing):
 
     def write(self, data: bytes) -> None:
         """Compare what a driver sends with what it should."""
-        _must(not self._answers, f"Unread {self._answers!r}, but {data.hex(' ')} was written.")
-        _must(bool(self._pairs), f"Unexpected {data.hex(' ')} was written. Must be nothing more.")
+        assert not self._answers, f"Unread {self._answers!r}, but {data.hex(' ')} was written."
+        assert self._pairs, f"Unexpected {data.hex(' ')} was written. Must be nothing more."
         expected = self._pairs[0][0] or b""
         self._written += data
-        _must(
-            expected.startswith(self._written),
-            f"Unexpected {self._written.hex(' ')} was written. Must be {expected.hex(' ')}.",
+        assert expected.startswith(self._written), (
+            f"Unexpected {self._written.hex(' ')} was written. Must be {expected.hex(' ')}."
         )
         if self._written == expected:
             self._answer()
@@ -58,20 +56,11 @@ class Dialogue(Closing):
     def close(self) -> None:
         """Do nothing, so that a driver's own clean-up does not hide leftovers."""
 
-    def finish(self) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Fail if something was not written or not read."""
-        _must(not self._answers, f"Left unread: {self._answers!r}. Must be nothing.")
-        _must(not self._written, f"Cut short: {self._written.hex(' ')}. Must be whole.")
-        _must(not self._pairs, f"Left unwritten: {self._pairs!r}. Must be nothing.")
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
-            self.finish()
+        if kind is None:
+            rest = (self._answers, self._written, self._pairs)
+            assert not any(rest), f"Left unread, cut short and unwritten: {rest!r}."
 
     def _answer(self) -> None:
         """Make the answer of the first pair ready to be read."""
@@ -85,8 +74,3 @@ class Dialogue(Closing):
         """Let the device send without a request where the dialogue says so."""
         if self._pairs and self._pairs[0][0] is None:
             self._answer()
-
-
-def _must(holds: bool, message: str) -> None:  # like `assert`, which -O removes
-    if not holds:
-        raise AssertionError(message)

@@ -1,6 +1,5 @@
-"""An emulated camera with faults, and a movie as its scene."""
+"""An emulated camera with faults."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -25,28 +24,11 @@ BANDS = ("8-14", "9.5")
 
 
 @dataclass(frozen=True)
-class Movie:
-    """A picture from frames (time, y, x) [count] that were computed before, at a rate [Hz]."""
-
-    counts: Counts
-    rate: float
-    endless: bool = False
-
-    def __call__(self, time: float) -> Counts:
-        """Frame that is shown at a time of the scene [s]."""
-        # A time on the edge of a frame is that frame's, whatever its last bit.
-        number, frames = math.floor(time * self.rate + 1e-6), self.counts.shape[0]
-        frame: Counts = self.counts[number % frames if self.endless else number]
-        return frame
-
-
-@dataclass(frozen=True)
 class Faults:
     """Faults of an emulated camera; frames are counted from 0 at its opening."""
 
     dropped: frozenset[int] = frozenset()  # never come; the sequence number leaps
     corrupt: frozenset[int] = frozenset()  # lower half is not of this image; the driver says so
-    unseen: frozenset[int] = frozenset()  # corrupt, and the driver says nothing
     short: frozenset[int] = frozenset()  # only the first half of the rows comes
     repeated: frozenset[int] = frozenset()  # show the image before once more
     ffc: frozenset[int] = frozenset()  # a flat-field correction starts of the camera's own accord
@@ -119,13 +101,14 @@ class FaultyCamera(EmulatedCamera):
 
     def _damaged(self, number: int, counts: Counts) -> tuple[Counts, FrameFlag]:
         faults, half = self.faults, self.shape[0] // 2
-        if number in faults.corrupt | faults.unseen:
+        if number in faults.corrupt:
             rng = np.random.default_rng([faults.seed, number])
             counts[half:] = rng.integers(0, LIMITS.max, counts[half:].shape, endpoint=True)
+            return counts, FrameFlag.DRIVER_ERROR
         if number in faults.short:
             counts[half:] = 0
             return counts, FrameFlag.WRONG_SIZE
-        return counts, FrameFlag.DRIVER_ERROR if number in faults.corrupt else FrameFlag(0)
+        return counts, FrameFlag(0)
 
 
 def frames(source: FrameSource, number: int) -> Iterator[Frame]:

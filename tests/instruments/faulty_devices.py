@@ -18,12 +18,7 @@ from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
-from dbthermal.instruments.emulated.world import ROOM, World
-
-MESSAGES = frozenset(Id)
-"""Identifiers of all messages that a driver of the wheel may send."""
-
-BUSY = 0x283
+from dbthermal.instruments.emulated.world import World
 
 
 @dataclass
@@ -43,7 +38,6 @@ class WheelFaults:
     slow: float = 1.0  # factor by which moves take longer
     stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
-    slips: float = 0.0  # way that the wheel loses in every motion, unnoticed [deg]
     deaf_to: str = ""  # name of the message that it ignores
     weak: float = 1.0  # factor of the speeds that it takes
     notice: str = ""  # error that it reports at the next message, once
@@ -153,11 +147,6 @@ class FaultyApt(EmulatedApt):
         values = {entry.name: getattr(planned, entry.name) for entry in fields(Drive)}
         return StandingDrive(**values, way=faults.stands_after * degree)
 
-    def finish(self, drive: Drive) -> None:
-        """Lose steps."""
-        self.wheel -= math.copysign(self.faults.slips / 360.0 * self.model.turn, drive.distance)
-        super().finish(drive)
-
     def status(self) -> apt.Status:
         """State with bits that stick."""
         status = super().status()
@@ -189,9 +178,6 @@ class Fault(Enum):
     BAD_CHECKSUM = auto()
     ILLEGAL_ESCAPE = auto()
     CUT = auto()  # its second half is lost
-    WRONG_COMMAND = auto()
-    SHORT = auto()  # its last byte of data is missing, and the checksum is right
-    BUSY = auto()  # it refuses
     DEBUG_TEXT = auto()  # text on another channel comes first
 
 
@@ -241,13 +227,7 @@ class FaultyBoson(EmulatedBoson):
 
     def _spoilt(self, frame: fslp.Frame, fault: Fault | None) -> bytes:
         """Bytes of the reply to a request, with its fault."""
-        spoilt = _misshapen(self.reply(frame), fault)
-        if fault in {Fault.BUSY, Fault.SHORT, Fault.WRONG_COMMAND}:
-            status, data = (BUSY, b"") if fault is Fault.BUSY else self.answer(frame)
-            command = frame.command + (fault is Fault.WRONG_COMMAND)
-            data = data[:-1] if fault is Fault.SHORT else data
-            spoilt = reply(frame.sequence, command, data, status=status)
-        spoilt = self._held + spoilt
+        spoilt = self._held + _misshapen(self.reply(frame), fault)
         self._held = spoilt if fault is Fault.HOLD else b""
         return b"" if fault in {Fault.HOLD, Fault.DROP} else spoilt
 
@@ -273,7 +253,6 @@ class LoggerFaults:
     """Faults of the logger and its library; may be changed at any time."""
 
     open: set[int] = field(default_factory=set)  # channels whose thermocouple is open: NaN
-    reads_ambient: bool = False  # it reads as the cold junction instead, as the forum reports
     overflow: set[int] = field(default_factory=set)  # channels whose converter overflows
     errors: dict[str, int] = field(default_factory=dict)  # next error number of a function
     firmware_delay: float = 0.0  # how long opening takes [s]
@@ -315,5 +294,5 @@ class FaultyTC08(EmulatedTC08):
         if channel in self.faults.overflow:
             return 673.15, True
         if channel in self.faults.open:
-            return (ROOM if self.faults.reads_ambient else float("nan")), False
+            return float("nan"), False
         return super().convert(channel)

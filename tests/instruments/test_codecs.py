@@ -1,6 +1,5 @@
 """Codecs of the wheel (APT) and the Boson (FSLP): public bytes, round trips, damaged input."""
 
-import struct
 from itertools import pairwise
 from typing import Any
 
@@ -264,20 +263,14 @@ def test_the_longest_frame_is_read(size: int) -> None:
 
 UNFIT: list[tuple[Any, str]] = [
     (lambda: apt.encode(Message(0x10000, 0, 0, 1, 1)), "id=65536,.* fields must hold it"),
-    (lambda: apt.encode(Message(1, 256, 0, 1, 1)), "param1=256,.* fields must hold it"),
-    (lambda: apt.encode(Message(1, 0, -1, 1, 1)), "param2=-1,.* fields must hold it"),
     (lambda: apt.encode(Message(1, 0, 0, 0x80, 1)), "destination=128,.* below 128"),
     (lambda: apt.encode(Message(1, 0, 0, 1, 1, bytes(256))), "at most 255 bytes of data"),
     (lambda: apt.encode(Message(1, 0, 1, 1, 1, b"x")), "parameters must be 0"),
-    (lambda: apt.encode(Message(1, float("nan"), 0, 1, 1)), "not an int"),  # type: ignore[arg-type]
     (lambda: apt.Position(1, 2**31).pack(), r"Position\(channel=1, position=2147483648\)"),
-    (lambda: apt.Status(1, 2**31, 0, LIMITS).pack(), "Status.* fields must hold it"),
-    (lambda: apt.Info(1 << 32, "BSC201", "1.0.0").pack(), "Info.* fields must hold it"),
     (lambda: apt.Info(1, "BSC201-LONG", "1.0.0").pack(), "model 'BSC201-LONG'"),
     (lambda: command(Id.MOT_SET_VELPARAMS, destination=1), "0 bytes of MOT_SET_VELPARAMS"),
     (lambda: fslp.encode(1 << 32, 0), "sequence number 4294967296"),
     (lambda: fslp.encode(0, -1), "command -1. Must lie in 0 to 4294967295"),
-    (lambda: fslp.encode(0, 0, channel=256), "channel 256"),
     (lambda: fslp.encode(0, 0, bytes(752)), "data of 752 bytes. Must be at most 751"),
 ]
 
@@ -299,10 +292,3 @@ def test_sequence_numbers_need_no_escape(sequence: int) -> None:
     assert following > sequence or sequence == (1 << 32) - 1
     numbers = [fslp.next_sequence(n) for n in (0, 0x8D, 0xADFF, 0xFFFFFFFF)]
     assert numbers == [1, 0x8F, 0xAF00, 0]
-
-
-def test_errors_of_a_controller() -> None:
-    """An error of a controller has the message that caused it, a code and a text."""
-    data = struct.pack("<HH64s", 0x0453, 7, b"no motor")
-    message = Message(Id.HW_RICHRESPONSE, 0, 0, apt.HOST, apt.BAY_1, data)
-    assert apt.Notice.parse(decode(apt.encode(message).hex())) == apt.Notice(0x453, 7, "no motor")

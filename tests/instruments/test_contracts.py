@@ -63,15 +63,9 @@ def identity(device: Any) -> Mapping[str, object]:
 
 def ask(device: Any) -> object:
     """Ask the simplest question of a device."""
-    match device:
-        case Boson():
-            return device.serial_number()
-        case FilterWheel():
-            return device.status()
-        case TC08():
-            return device.identity()
-        case _:
-            return device.read()
+    if isinstance(device, FilterWheel):
+        return device.status()
+    return identity(device) if isinstance(device, Boson | TC08) else device.read()
 
 
 # What all devices keep.
@@ -101,7 +95,7 @@ def test_close_is_final(opened: Opened) -> None:
         ask(opened.device)
 
 
-@opens(*CAMERAS[2:], *WHEELS[2:], *LOGGERS)
+@opens(*CAMERAS[1:], *WHEELS[1:], *LOGGERS)
 def test_a_device_has_one_client(opened: Opened) -> None:
     """A second client gets an error with a remedy, and the first is not disturbed."""
     assert opened.again is not None

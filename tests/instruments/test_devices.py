@@ -1,15 +1,12 @@
 """The devices of a session are opened by their addresses, prepared, and say what they are."""
 
 from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import cast
 
-import numpy as np
 import pytest
-from device_benches import BosonBench
+from device_benches import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
-from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
+from dbthermal.instruments.boson import Boson, commands
 from dbthermal.instruments.boson.commands import Ir16Mode, Switch
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.devices import (
@@ -18,11 +15,7 @@ from dbthermal.instruments.devices import (
     Thermocouples,
     open_devices,
 )
-from dbthermal.instruments.emulated.camera import EmulatedCamera
-from dbthermal.instruments.emulated.clock import EmulatedClock
-from dbthermal.instruments.emulated.world import emulated_world
 from dbthermal.instruments.filterwheel import NotHomedError
-from dbthermal.instruments.tc08 import TC08, Flag, Scan
 from dbthermal.instruments.transport import TransportError
 
 
@@ -31,23 +24,6 @@ def devices() -> Iterator[Devices]:
     """Open the whole rig on emulators."""
     with rig(from_yaml(TEXT)) as opened:
         yield opened
-
-
-def test_whole_rig_is_opened_and_closed() -> None:
-    """All devices of the file answer through their drivers, and are closed in the end."""
-    with rig(from_yaml(TEXT)) as devices:
-        assert list(devices.sources) == list(devices.cameras) == ["8-14", "9.5"]
-        assert devices.wheel is not None
-        assert devices.thermocouples is not None
-        devices.wheel.status()
-    for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
-        with pytest.raises(TransportError, match="must stay connected and open"):
-            ask()
-    for source in devices.sources.values():
-        with pytest.raises(ConnectionError, match="it is closed"):
-            source.read()
-    with pytest.raises(RuntimeError, match="closed"):
-        devices.thermocouples.logger.identity()
 
 
 def test_every_device_says_what_it_is(devices: Devices) -> None:
@@ -64,6 +40,21 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
     assert devices.wheel is not None
     with pytest.raises(NotHomedError):
         devices.wheel.position()
+
+
+def test_whole_rig_is_closed() -> None:
+    """All devices of the file are closed in the end."""
+    with rig(from_yaml(TEXT)) as devices:
+        assert devices.wheel is not None
+        assert devices.thermocouples is not None
+    for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
+        with pytest.raises(TransportError, match="must stay connected and open"):
+            ask()
+    for source in devices.sources.values():
+        with pytest.raises(ConnectionError, match="it is closed"):
+            source.read()
+    with pytest.raises(RuntimeError, match="closed"):
+        devices.thermocouples.logger.identity()
 
 
 def test_readings_are_named(devices: Devices) -> None:
@@ -142,47 +133,24 @@ def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
     assert source.read().device_time >= start
 
 
-class Logger:
-    """A logger that counts its scans; channel 2 is open."""
-
-    def __init__(self) -> None:
-        self.scans, self.clock = 0, EmulatedClock()
-
-    def single(self) -> Scan:
-        """Scan once more: each one is a kelvin warmer."""
-        self.scans += 1
-        values = np.full(9, 300.0 + self.scans)
-        flags = np.where(np.arange(9) == 2, Flag.MISSING, Flag.GOOD).astype(np.uint8)
-        return Scan(0.0, values, flags)
-
-
 def test_one_scan_gives_all_channels_once() -> None:
     """One scan of the logger serves all channels, and each value is read once."""
-    logger = Logger()
-    names = {1: "plate", 2: "room", 3: "wall"}
-    thermocouples = Thermocouples(cast(TC08, logger), names)
-    assert [thermocouples.read(1), thermocouples.read(3), logger.scans] == [301.0, 301.0, 1]
-    assert [thermocouples.read(1), logger.scans] == [302.0, 2]
-    logger.clock.sleep(1.1)
-    assert [thermocouples.read(3), logger.scans] == [303.0, 3]
+    bench = LoggerBench()
+    thermocouples = Thermocouples(bench.ready(), {1: "plate", 2: "room"})
+
+    def read(channel: int, rise: float) -> float:
+        """Reading of a channel [K] where the tips are warmer than at first by a rise [K]."""
+        bench.tips = {1: 350.0 + rise, 2: 300.0 + rise}
+        return round(thermocouples.read(channel), 3)
+
+    assert [read(1, 0.0), read(2, 1.0)] == [350.0, 300.0]
+    assert [read(2, 2.0), read(2, 3.0)] == [302.0, 303.0]
+    bench.clock.sleep(1.1)  # the value that was not read yet is too old
+    assert read(1, 4.0) == 354.0
+    bench.unit.faults.open = {2}
+    bench.clock.sleep(1.1)
     with pytest.raises(ReadingError, match=r"No temperature of thermocouple 'room' in channel 2"):
         thermocouples.read(2)
-
-
-def test_instrument_that_fails_is_a_failed_reading(devices: Devices) -> None:
-    """A mute camera and an unplugged logger raise what a recording notes and survives."""
-
-    def mute() -> float:
-        raise BosonTimeoutError("No reply to 'FPA temperature [K]'.")
-
-    camera = SimpleNamespace(fpa_temperature=mute, ffc_status=mute)
-    readings = Devices(devices.session, {}, {"9.5": cast(Boson, camera)}).readings()
-    with pytest.raises(BosonTimeoutError, match="No reply to 'FPA temperature"):
-        readings["fpa 9.5"].read()
-    assert devices.thermocouples is not None
-    devices.thermocouples.logger.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        devices.readings()["plate"].read()
 
 
 def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:
@@ -203,16 +171,3 @@ def test_hardware_has_no_emulated_world() -> None:
             open_devices(real, *extra),
         ):
             pass
-
-
-def test_world_of_a_session() -> None:
-    """Cameras, filters and thermocouples of the emulated bench are those of the session."""
-    session = from_yaml(TEXT)
-    world = emulated_world(session, wheel_position=3)
-    assert (list(world.cameras), world.filter_name) == (["8-14", "9.5"], "11")
-    assert world.thermocouples == {1: "blackbody", 4: "plate"}
-    with open_devices(session) as devices:
-        wide, narrow = devices.sources.values()
-    assert isinstance(wide, EmulatedCamera)
-    assert isinstance(narrow, EmulatedCamera)
-    assert (wide.band, narrow.band) == ("8-14", None)

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from device_benches import FILTERS, WheelBench
 from dialogue import Dialogue, Pair
-from faulty_devices import MESSAGES
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,16 +52,8 @@ def test_every_slot_turns_into_the_beam(model: str) -> None:
     assert moves == [SIXTHS[model][slot - 1] for slot in slots]
     speeds = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
     assert speeds == (1, 0, *TURNS[model])
-
-
-def test_no_other_messages() -> None:
-    """The driver sends these messages and no others, and enables the motor before it moves."""
-    bench = WheelBench()
-    bench.homed().move_to(3)
     order = [message.id for message in bench.device.received]
-    assert {*order} <= MESSAGES
-    assert order.index(0x0210) < order.index(0x0443)  # the motor is enabled, then homed
-    assert order.index(0x0440) < order.index(0x0443)
+    assert max(order.index(0x0210), order.index(0x0440)) < order.index(0x0443)  # enabled, then home
 
 
 @pytest.mark.parametrize("turns", [-1, 1])
@@ -189,10 +180,8 @@ def test_answers_of_others() -> None:
 
 
 BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
-
-
-OTHERS: list[Pair] = [(bytes.fromhex(GREETING.format(unit)), None) for unit in (11, 50)]
-OTHERS[0] = (OTHERS[0][0], BANNER)
+GREETINGS = [bytes.fromhex(GREETING.format(unit)) for unit in (11, 50)]
+OTHERS: list[Pair] = [(GREETINGS[0], BANNER), (GREETINGS[1], None)]
 STATES: list[Pair] = [(PAIRS[-1][0], bytes((0x12, 2, 1, state, 1, 0x21))) for state in (0, 3)]
 
 
@@ -219,17 +208,13 @@ class Babbler(Dialogue):
 @settings(max_examples=60)
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
-    """Connecting ends with a documented error for arbitrary answers."""
+    """Connecting ends with a documented error for arbitrary answers, also if they never end."""
     babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
         FilterWheel(babbler, FILTERS).connect()
-
-
-def test_a_device_that_never_ends_is_another_one() -> None:
-    """An endless stream of bytes ends the wait with an error."""
-    line = Babbler([(None, [bytes(256)] * 513)])
+    endless = Babbler([(None, [bytes(256)] * 513)])
     with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
-        FilterWheel(line, {}).connect()
+        FilterWheel(endless, {}).connect()
 
 
 Case = tuple[dict[str, Any], type[WheelError], str]
@@ -283,18 +268,9 @@ def test_harmless_faults(faults: dict[str, object]) -> None:
 
 # Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
 STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
-    (
-        {"stands_after": 20.0},
-        StalledWheelError,
-        r"120.00 deg: .* at 20.00 deg for 2.0 s",
-        True,
-        True,
-    ),
+    ({"stands_after": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
     # It still moves, however near to its target it is seen twice.
-    (
-        *({"stands_after": 119.95, "unreported": True}, StalledWheelError),
-        *("stood at 119.95 deg for 2.0 s", True, True),
-    ),
+    ({"stands_after": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
     ({"stops_short": 1.5}, StalledWheelError, "stopped at 118.50 deg. Must arrive", False, True),
     ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
     ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
@@ -367,19 +343,6 @@ def test_moving_bits_that_stick() -> None:
         wheel.move_to(4)
 
 
-def test_lost_steps_are_seen_by_nobody() -> None:
-    """Without an encoder lost steps are not detected; homing restores the position."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    bench.device.faults.slips = 5.0
-    wheel.move_to(3)
-    assert (wheel.position(), bench.world.wheel_position) == (3, None)
-    bench.device.faults.slips = 0.0
-    wheel.home()
-    wheel.move_to(3)
-    assert bench.world.wheel_position == 3
-
-
 def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
     """A controller need not know its greeting; what it says is logged. Later errors stop homing."""
     bench = WheelBench()
@@ -426,11 +389,7 @@ def test_unplugging_at_any_step(polls: int) -> None:
     """Unplugging at any step raises the documented error, and closing still works, twice."""
     bench = WheelBench()
     bench.device.faults.polls = polls
-
-    def use() -> None:
-        bench.homed().select("9.5")
-
     with pytest.raises(TransportError, match="Lost the emulated device"):
-        use()
+        bench.homed().select("9.5")
     for _ in range(2):
         bench.wheel.close()

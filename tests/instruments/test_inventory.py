@@ -1,46 +1,139 @@
 """The inventory of the rig on an emulated USB bus and a written sysfs tree."""
 
 import os
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
-import emulated_bus as emulated
 import pytest
+import usb.backend
 import usb.backend.libusb0
 import usb.backend.libusb1
 import usb.backend.openusb
-from emulated_bus import EmulatedBackend, apt, boson, tc08
 
 from dbthermal.instruments import inventory
 from dbthermal.instruments.inventory import Device
 
 
-def look(
-    tmp_path: Path, *devices: emulated.EmulatedDevice, frame_rate: float = 30.0
-) -> list[Device]:
+@dataclass
+class EmulatedDevice:
+    """One device that is plugged in; its serial number says that it is emulated."""
+
+    vendor: int
+    product: int
+    serial: str = "EMULATED"
+    bus: int = 1
+    ports: tuple[int, ...] = (1,)  # on the way
+    speed: int = 3  # as libusb numbers it; 2 is full, 3 high
+    nodes: tuple[str, ...] = ()  # as sysfs lists them below the device's interfaces
+
+    @property
+    def path(self) -> str:
+        """Bus and ports."""
+        return f"{self.bus}-{'.'.join(str(port) for port in self.ports)}"
+
+
+def boson(number: int = 1, **settings: Any) -> EmulatedDevice:
+    """A camera with two video nodes and a serial one; `number`, from 1, is in all its names."""
+    own: dict[str, Any] = {"serial": f"EMULATED{number}", "ports": (number,)}
+    video = (f"video4linux/video{index}" for index in (2 * number - 2, 2 * number - 1))
+    own["nodes"] = (*video, f"tty/ttyACM{number - 1}")
+    return EmulatedDevice(0x09CB, 0x4007, **{**own, **settings})
+
+
+def apt(**settings: Any) -> EmulatedDevice:
+    """An APT controller on its FTDI chip, at full speed."""
+    own: dict[str, Any] = {"ports": (3,), "speed": 2, "nodes": ("ttyUSB0",)}
+    return EmulatedDevice(0x0403, 0xFAF0, **{**own, **settings})
+
+
+def tc08(**settings: Any) -> EmulatedDevice:
+    """A TC-08, at full speed, without a kernel driver."""
+    return EmulatedDevice(0x0CE9, 0x1000, **{"ports": (4,), "speed": 2, **settings})
+
+
+class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
+    """A backend of pyusb with devices of its own, which can only be listed.
+
+    Everything that would open or disturb a live device is missing: pyusb then raises an error.
+    """
+
+    def __init__(self, *devices: EmulatedDevice) -> None:
+        self.devices = devices
+
+    def enumerate_devices(self) -> Iterator[EmulatedDevice]:
+        """List what is plugged in."""
+        return iter(self.devices)
+
+    def get_device_descriptor(self, dev: EmulatedDevice) -> SimpleNamespace:
+        """Give the device descriptor, with what libusb adds: bus, address, ports, speed."""
+        fixed = {
+            **dict.fromkeys(("bDeviceClass", "bDeviceSubClass", "bDeviceProtocol"), 0),
+            **dict.fromkeys(("bDescriptorType", "iSerialNumber", "bNumConfigurations"), 1),
+            **dict(zip(("bLength", "bcdUSB", "bMaxPacketSize0"), (18, 0x0200, 64), strict=True)),
+            **dict(zip(("bcdDevice", "iManufacturer", "iProduct"), (0x0100, 0, 0), strict=True)),
+        }
+        return SimpleNamespace(
+            **fixed,
+            idVendor=dev.vendor,
+            idProduct=dev.product,
+            address=dev.ports[0],
+            bus=dev.bus,
+            port_number=dev.ports[-1],
+            port_numbers=dev.ports,
+            speed=dev.speed,
+        )
+
+
+def write_trees(sysfs: Path, dev: Path, devices: tuple[EmulatedDevice, ...]) -> None:
+    """Write what Linux's sysfs would hold of the devices, and their nodes."""
+    for device in devices:
+        folder = sysfs / "bus" / "usb" / "devices" / device.path
+        folder.mkdir(parents=True)
+        if device.serial:
+            (folder / "serial").write_text(f"{device.serial}\n", encoding="utf-8")
+        usb_node = dev / f"bus/usb/{device.bus:03d}" / f"{device.ports[0]:03d}"
+        usb_node.parent.mkdir(parents=True, exist_ok=True)
+        usb_node.touch()
+        for node in device.nodes:
+            (folder / f"{device.path}:1.0" / node).mkdir(parents=True)
+            (dev / Path(node).name).touch()
+
+
+def look(tmp_path: Path, *devices: EmulatedDevice, frame_rate: float = 30.0) -> list[Device]:
     """Find the devices on a bus of their own, with the sysfs that belongs to it."""
-    emulated.write_trees(tmp_path, tmp_path / "dev", devices)
+    write_trees(tmp_path, tmp_path / "dev", devices)
     backend = EmulatedBackend(*devices)
     return inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev", frame_rate=frame_rate)
 
 
 def test_whole_rig(tmp_path: Path) -> None:
     """Two cameras, the wheel's controller and the logger are listed without a warning."""
-    found = look(tmp_path, tc08(), apt(), boson(2, bus=2), boson(1))
-    assert [device.kind.name.split()[0] for device in found] == ["FLIR", "FLIR", "Thorlabs", "Pico"]
-    assert [device.path for device in found] == ["1-1", "2-2", "1-3", "1-4"]
-    assert [device.serial for device in found] == ["EMULATED1", "EMULATED2", "EMULATED", "EMULATED"]
-    assert [device.speed for device in found] == ["high", "high", "full", "full"]
+    found = look(tmp_path, tc08(serial=""), apt(), boson(2, bus=2), boson(1))
     assert {device.warnings for device in found} == {()}
+    assert [
+        line.replace(str(tmp_path / "dev"), "") for line in inventory.describe(found).splitlines()
+    ] == [
+        "FLIR Boson EMULATED1: 1-1, high speed, /video0 /video1 /ttyACM0",
+        "FLIR Boson EMULATED2: 2-2, high speed, /video2 /video3 /ttyACM1",
+        "Thorlabs APT controller EMULATED: 1-3, full speed, /ttyUSB0",
+        "Pico TC-08 without serial number: 1-4, full speed, no nodes",
+    ]
 
 
 def test_nothing_plugged_in(tmp_path: Path) -> None:
-    """A mouse, and FLIR's devices of another kind, are not listed; missing devices are named."""
-    others = emulated.EmulatedDevice(0x046D, 0xC077), emulated.EmulatedDevice(0x09CB, 0x0100, bus=2)
+    """A mouse and FLIR's other devices are not listed; missing devices and warnings are named."""
+    others = EmulatedDevice(0x046D, 0xC077), EmulatedDevice(0x09CB, 0x0100, bus=2)
     assert look(tmp_path, *others) == []
     assert inventory.describe([]).splitlines()[0] == (
         "FLIR Boson: not found (09cb:4007). Must be plugged in and switched on; "
         "'lsusb -d 09cb:4007' lists it then."
     )
+    lines = inventory.describe(look(tmp_path / "slow", boson(speed=2))).splitlines()
+    assert lines[1].startswith("  ! It runs at full speed")
+    assert lines[2].startswith("Thorlabs APT controller: not found")
 
 
 def test_nodes_belong_to_their_camera(tmp_path: Path) -> None:
@@ -106,15 +199,3 @@ def test_missing_libusb(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "get_backend", lambda: None)
     with pytest.raises(inventory.LibusbMissingError, match=r"No libusb found\. Must be installed"):
         inventory.find()
-
-
-def test_description(tmp_path: Path) -> None:
-    """The description names each device and puts warnings below it."""
-    found = look(tmp_path, boson(speed=2), tc08(serial=""))
-    lines = inventory.describe(found).splitlines()
-    nodes = " ".join(str(tmp_path / "dev" / name) for name in ("video0", "video1", "ttyACM0"))
-    assert lines[0] == f"FLIR Boson EMULATED1: 1-1, full speed, {nodes}"
-    assert lines[1].startswith("  ! It runs at full speed")
-    assert lines[2].startswith("Thorlabs APT controller: not found")
-    assert lines[3] == "Pico TC-08 without serial number: 1-4, full speed, no nodes"
-    assert (found[1].serial, found[1].warnings) == ("", ())

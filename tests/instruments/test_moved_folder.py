@@ -20,7 +20,7 @@ from dbthermal import store
 from dbthermal.instruments.recording import Preview, notes, open_sweep, record
 
 FRAMES = 15
-EVERY = pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
+EVERY = pytest.mark.parametrize("every", [500, pytest.param(137, marks=pytest.mark.slow)])
 
 
 def itself(path: Path) -> Path:
@@ -65,20 +65,22 @@ def write(path: Path, then: Callable[[int], object] = lambda _: None) -> Path:
     return file.recording.place()
 
 
-def moments(tmp_path: Path, every: int) -> range:
-    """Every so many-th file operation of a recording, from when it is begun to its end."""
+def moments(tmp_path: Path, every: int, case: int) -> range:
+    """Every so many-th file operation of a recording since it was begun, others in each case."""
     start = operations_of(lambda: begun(tmp_path / "a.zarr", chunk=3))
-    return range(start + 1, operations_of(lambda: write(tmp_path / "b.zarr")), every)
+    return range(start + 1 + 30 * case, operations_of(lambda: write(tmp_path / "b.zarr")), every)
 
 
 @EVERY
-@pytest.mark.parametrize("move", [itself, parent, elsewhere, replaced_by_another, twice])
+@pytest.mark.parametrize(
+    ("case", "move"), [*enumerate([itself, parent, elsewhere, replaced_by_another, twice])]
+)
 def test_moved_at_any_operation_it_goes_on(
-    tmp_path: Path, move: Callable[[Path], Path], every: int
+    tmp_path: Path, case: int, move: Callable[[Path], Path], every: int
 ) -> None:
     """Moved before any file operation, the recording is whole at its new place, and says so."""
     noted = 0
-    for moment in (chosen := moments(tmp_path, every)):
+    for moment in (chosen := moments(tmp_path, every, case)):
         path, places = tmp_path / f"{moment}" / "deep" / "a.zarr", list[Path]()
         path.parent.mkdir(parents=True)
 
@@ -124,10 +126,14 @@ def array_replaced(path: Path) -> None:
 
 
 @EVERY
-@pytest.mark.parametrize("lose", [deleted, carried_off, array_moved, array_replaced])
-def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], every: int) -> None:
+@pytest.mark.parametrize(
+    ("case", "lose"), [*enumerate([deleted, carried_off, array_moved, array_replaced])]
+)
+def test_without_a_part_it_ends(
+    tmp_path: Path, case: int, lose: Callable[[Path], None], every: int
+) -> None:
     """Without its folder, or an array's, a recording ends with its name, and makes no other."""
-    for moment in moments(tmp_path, every):
+    for moment in moments(tmp_path, every, case):
         path = tmp_path / f"{moment}" / "a.zarr"
         path.parent.mkdir()
         said = "No array 'counts'" if "array" in lose.__name__ else r"a\.zarr"

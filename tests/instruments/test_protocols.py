@@ -132,20 +132,6 @@ def test_what_is_missing_is_named(recorded: tuple[Path, list[Summary]], tmp_path
         recording.open_sweep(tmp_path, "plate", frames=8)
 
 
-def test_recordings_of_a_step_must_agree(tmp_path: Path) -> None:
-    """A blackbody that drifted between two filters has no one temperature."""
-    with rig(from_yaml(ONE)) as devices:
-        devices.prepare()
-
-        def drift(_: Preview) -> None:
-            if (tmp_path / "plate_00_11.zarr").exists():
-                world_of(devices).blackbody_temperature = 300.5
-
-        swept(devices, tmp_path, preview=drift)
-    with pytest.raises(ValueError, match=r"Invalid readings \[300.*, 300\..*\] K of 'blackbody'"):
-        recording.open_sweep(tmp_path, "plate", frames=8)
-
-
 def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
     """A resumed sweep keeps complete recordings, names an incomplete one, and records the rest."""
     log: list[float] = []
@@ -178,24 +164,27 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         swept(devices, tmp_path)
 
 
-def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
-    """A wheel that turns during a recording raises an error, then and when the sweep is opened."""
+def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
+    """A wheel or a blackbody that moves during a step is an error, at once or on opening it."""
     with rig(from_yaml(ONE)) as devices:
         devices.prepare()
         wheel = devices.wheel
         assert wheel is not None
         for _ in range(2):
             with pytest.raises(ValueError, match=r"Invalid slots .* of filter '9\.5' throughout"):
-                swept(devices, tmp_path, preview=lambda _: wheel.move_to(2))
+                swept(devices, tmp_path / "wheel", preview=lambda _: wheel.move_to(2))
+        lost = faulty(devices, "9.5", Faults(unplugged=3))
 
+        def drift(_: Preview) -> None:
+            if (tmp_path / "plate_00_11.zarr").exists():
+                world_of(devices).blackbody_temperature = 300.5
 
-def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
-    """An unplugged camera ends the sweep with an incomplete recording."""
-    with rig(from_yaml(ONE)) as devices:
-        devices.prepare()
+        swept(devices, tmp_path, preview=drift)
+        with pytest.raises(ValueError, match=r"Invalid readings \[300.*\] K of 'blackbody'"):
+            recording.open_sweep(tmp_path, "plate", frames=8)
         with pytest.raises(SourceLostError, match=r"plate_00_9\.5\.zarr' ended: source lost"):
-            swept(faulty(devices, "9.5", Faults(unplugged=3)), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["plate_00_9.5.zarr"]
+            swept(lost, tmp_path / "lost")
+    assert [path.name for path in (tmp_path / "lost").iterdir()] == ["plate_00_9.5.zarr"]
 
 
 def test_blackbody_must_be_read(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,10 +12,8 @@ from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 from dbthermal.__main__ import main
 from dbthermal._cli import record as command
 from dbthermal.instruments import inventory, protocols, recording
-from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording import Preview, open_capture
+from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
 
 ONE = replaced(
@@ -129,28 +128,19 @@ def test_interrupted(
     assert (tmp_path / "recorded" / "plate.zarr").is_dir()
 
 
-@pytest.mark.parametrize("error", [None, EOFError, NotImplementedError])
-def test_blackbody_is_set_by_the_user(
-    error: type[Exception] | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
-    asked: list[str] = []
-
-    def answer(text: str) -> None:
-        asked.append(text)
-        if error:
-            raise error
-
-    monkeypatch.setattr("builtins.input", answer)
-    devices = Devices(from_yaml(TEXT), {})
-    if error:
-        told = r"26\.85 degC\. Must be run in a terminal, or in Jup"
-        with pytest.raises(RuntimeError, match=told):
-            command._set_blackbody(devices, 300.0)
-    else:
-        command._set_blackbody(devices, 300.0)
+    asked, devices = list[str](), Devices(from_yaml(TEXT), {})
+    monkeypatch.setattr("builtins.input", asked.append)
+    command._set_blackbody(devices, 300.0)
     told = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
     assert asked == [told]
+    for error in (EOFError, NotImplementedError):
+        monkeypatch.setattr("builtins.input", Mock(side_effect=error))
+        with pytest.raises(
+            RuntimeError, match=r"26\.85 degC\. Must be run in a terminal, or in Jup"
+        ):
+            command._set_blackbody(devices, 300.0)
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,14 +154,3 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     real = replace(emulated, simulated=False)
     assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)
-
-
-def test_progress_is_a_line() -> None:
-    """The progress is one line with the losses, temperatures and shutter of each band."""
-    totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
-    readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
-    line = command._progress(Watch(), Preview(1.0, {}, totals, readings))
-    assert line.startswith("\r   1.0 s  9.5: ")
-    for part in ("3 lost", "0 refused", "FPA 35.0 \N{DEGREE SIGN}C", "FFC in progress"):
-        assert part in line
-    assert "\n" not in line

@@ -11,14 +11,13 @@ import pytest
 from faulty_camera import BANDS, Faults, FaultyCamera
 from test_capture_file import CaptureFile
 from test_record import CHUNK, SMALL, bench, session
+from test_signals import LIMIT, written
 
 from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag
 from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, notes, open_capture, record
-
-LIMIT = 600.0  # how long a busy machine may take [s]
 
 
 @pytest.fixture(autouse=True)
@@ -72,11 +71,6 @@ def test_slow_disk_refuses_frames_and_counts_them(
         assert 0 <= behind <= noted[-1]
         flags = np.bitwise_or.reduce(opened["frame_flags"][place].values)
         assert FrameFlag.FRAMES_LOST_BEFORE & int(flags)
-
-
-def written(path: Path) -> int:
-    """Frames of all bands that a recording says it has."""
-    return int(sum(store.open_dataset(path).attrs["frames_written"].values()))
 
 
 def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:

@@ -103,9 +103,8 @@ def test_a_closed_pipe_ends_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", ENDING)
-@pytest.mark.parametrize("again", [False, True])
 def test_a_script_ends_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, *, again: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     """Called by a script, a recording is closed, whatever comes meanwhile, and the script ends."""
     before, sources, close = [signal.getsignal(one) for one in ENDING], bench(), CaptureFile.close
@@ -121,8 +120,7 @@ def test_a_script_ends_whole(
     def end(_: Preview) -> None:
         signal.raise_signal(number)
 
-    if again:
-        monkeypatch.setattr(CaptureFile, "close", hit)
+    monkeypatch.setattr(CaptureFile, "close", hit)
     with pytest.raises(SignalExit) as raised:
         record(session(60.0), sources, tmp_path / "a.zarr", limits=SMALL, preview=end)
     assert raised.value.code == 128 + number

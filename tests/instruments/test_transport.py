@@ -13,12 +13,9 @@ from collections.abc import Iterator
 import pytest
 import serial
 from device_benches import BosonBench
-from dialogue import Dialogue, Pair
 
 from dbthermal import instruments
-from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import KINDS
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import SerialTransport, TransportError, open_serial
 
 AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
@@ -110,15 +107,6 @@ def test_a_wrong_name_is_refused(url: str, message: str) -> None:
         open_serial(url, baudrate=115200)
 
 
-def test_the_path_of_an_emulator_is_its_name() -> None:
-    """The address selects one of two emulated cameras by its name."""
-    world = World()
-    for name, number in (("boson", 1), ("wide", 2)):
-        world.add_camera(name, number)
-    with Boson.from_url("sim://boson/wide", world=world) as camera:
-        assert camera.serial_number() == 2
-
-
 class Port:
     """A serial port that fails with an error of input and output."""
 
@@ -139,14 +127,15 @@ def test_what_went_wrong_is_not_hidden_by_closing(monkeypatch: pytest.MonkeyPatc
 
 
 def test_importing_the_instruments_is_light() -> None:
-    """The package loads no library that talks to devices, the logger's driver no serial line."""
+    """No library is loaded before its use, of devices by the drivers, of figures by the watch."""
     code = (
         "import sys; from dbthermal import instruments as all\n"
         "print({'serial', 'usb', 'numpy'} & {*sys.modules})\n"
-        "all.tc08.CHANNELS; print({'serial', 'usb'} & {*sys.modules})"
+        "all.tc08.CHANNELS; print({'serial', 'usb'} & {*sys.modules})\n"
+        "all.live.Watch; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["set()", "set()"]
+    assert done.stdout.split() == 3 * ["set()"]
 
 
 def test_every_module_is_on_the_map() -> None:
@@ -177,27 +166,3 @@ def test_a_line_in_memory() -> None:
             end.write(b"x")
         with pytest.raises(TransportError, match="It must stay connected and open"):
             end.read(1, 30.0)
-
-
-@pytest.mark.parametrize(
-    ("pairs", "steps", "message"),
-    [
-        ([(b"a", b"b")], ["a"], "Left unread"),
-        ([(b"a", None)], [], "Left unwritten"),
-        ([(b"ab", None)], ["a"], "Cut short"),
-        ([(b"a", None)], ["b"], "Unexpected 62 was written. Must be 61"),
-        ([], ["a"], "Must be nothing more"),
-        ([(b"a", b"b"), (b"c", None)], ["a", "c"], "Unread .* but 63 was written"),
-        ([(None, b"a")], [], "Left unread"),
-    ],
-)
-def test_a_dialogue_allows_no_rest(pairs: list[Pair], steps: list[str], message: str) -> None:
-    """Unread, unwritten and unexpected bytes fail the test that a dialogue is written for."""
-
-    def talk() -> None:
-        with Dialogue(pairs) as line:
-            for step in steps:
-                line.write(step.encode())
-
-    with pytest.raises(AssertionError, match=message):
-        talk()

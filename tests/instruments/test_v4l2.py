@@ -5,31 +5,21 @@ import errno
 import importlib
 import struct
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import Clock
 from faulty_camera import frames
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream
-from dbthermal.instruments.clock import Clock
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6
 GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
-
-
-class ExposureClock(Clock):
-    """A clock that stands at 12.5 s."""
-
-    def __call__(self) -> float:
-        """Time [s]."""
-        return 12.5
 
 
 class Memory(bytearray):
@@ -67,10 +57,10 @@ class Driver:
             ioctl=self._ioctl,
             map=self._map,
             select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
-            clock=ExposureClock(),
+            clock=Clock(12.5),
         )
 
-    def _open(self, path: str, flags: int) -> int:  # noqa: ARG002 - as os.open
+    def _open(self, *_: object) -> int:
         self.open_files += 1
         return 3
 
@@ -91,36 +81,31 @@ class Driver:
         self.calls.append(number)
         if self.lost and number in self.lost_at:
             raise OSError(self.lost, "No such device")
-        if number in REPLIES:
-            REPLIES[number](self, argument)
+        self._reply(number, argument, struct.unpack_from("=I", argument)[0])
         return 0
 
-    def _capability(self, argument: bytearray) -> None:
-        argument[:] = v4l2.CAPABILITY.pack(
-            b"uvcvideo", b"Boson: FLIR Video", b"usb-1.2", 0x60C05, 0, self.capabilities
-        )
-
-    def _enumerate(self, argument: bytearray) -> None:
-        index = struct.unpack_from("=I", argument)[0]
-        if index >= len(self.formats):
-            raise OSError(errno.EINVAL, "Invalid argument")
-        argument[:] = v4l2.FORMAT_ENTRY.pack(index, 1, 0, b"", self.formats[index])
-
-    def _format(self, argument: bytearray) -> None:
-        kind, columns, _, code, place, line, _, space = v4l2.FORMAT.unpack(argument)
-        argument[:] = v4l2.FORMAT.pack(
-            kind, columns, self.rows, code, place, line, self.rows * line, space
-        )
-
-    def _rate(self, argument: bytearray) -> None:
-        argument[:] = v4l2.PARAMETERS.pack(1, 0, 0, 1, self.rate, 0, 0)
-
-    def _query(self, argument: bytearray) -> None:
-        index = struct.unpack_from("=I", argument)[0]
-        argument[:] = v4l2.BUFFER.pack(index, 1, 0, 0, 0, 0, 0, 0, 1, 4096 * index, BYTES)
-
-    def _queue(self, argument: bytearray) -> None:
-        self.queued.append(struct.unpack_from("=I", argument)[0])
+    def _reply(self, number: int, argument: bytearray, index: int) -> None:
+        match number:
+            case v4l2.QUERYCAP:
+                names = b"uvcvideo", b"Boson: FLIR Video", b"usb-1.2"
+                argument[:] = v4l2.CAPABILITY.pack(*names, 0x60C05, 0, self.capabilities)
+            case v4l2.ENUM_FMT if index >= len(self.formats):
+                raise OSError(errno.EINVAL, "Invalid argument")
+            case v4l2.ENUM_FMT:
+                argument[:] = v4l2.FORMAT_ENTRY.pack(index, 1, 0, b"", self.formats[index])
+            case v4l2.S_FMT:
+                kind, columns, _, code, place, line, _, space = v4l2.FORMAT.unpack(argument)
+                form = (kind, columns, self.rows, code, place, line, self.rows * line, space)
+                argument[:] = v4l2.FORMAT.pack(*form)
+            case v4l2.S_PARM:
+                argument[:] = v4l2.PARAMETERS.pack(1, 0, 0, 1, self.rate, 0, 0)
+            case v4l2.QUERYBUF:
+                place = 4096 * index
+                argument[:] = v4l2.BUFFER.pack(index, 1, 0, 0, 0, 0, 0, 0, 1, place, BYTES)
+            case v4l2.QBUF:
+                self.queued.append(index)
+            case v4l2.DQBUF:
+                self._dequeue(argument)
 
     def _dequeue(self, argument: bytearray) -> None:
         if self.answers[0][0] < 0:
@@ -134,21 +119,9 @@ class Driver:
         )
 
 
-REPLIES: dict[int, Callable[[Driver, bytearray], None]] = {
-    v4l2.QUERYCAP: Driver._capability,
-    v4l2.ENUM_FMT: Driver._enumerate,
-    v4l2.S_FMT: Driver._format,
-    v4l2.S_PARM: Driver._rate,
-    v4l2.QUERYBUF: Driver._query,
-    v4l2.QBUF: Driver._queue,
-    v4l2.DQBUF: Driver._dequeue,
-}
-
-
-def opened(driver: Driver, **changes: Any) -> v4l2.Capture:
+def opened(driver: Driver) -> v4l2.Capture:
     """Open the node of a driver."""
-    stream = Stream(**{**STREAM.__dict__, **changes})
-    return v4l2.Capture("/dev/video0", stream, driver.kernel())
+    return v4l2.Capture("/dev/video0", STREAM, driver.kernel())
 
 
 # Numbers of the calls in `linux/videodev2.h`: direction (1 write, 2 read, 3 both), number, size.

@@ -1,29 +1,30 @@
-"""A generic 16-bit camera: its frames, and its shutter from repeated images."""
+"""A generic 16-bit camera, and shutter events of cameras up to the corrected capture."""
 
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from device_openings import real_video
+import xarray as xr
 from test_v4l2 import BYTES, GOOD, Driver
 
 from dbthermal import correction
 from dbthermal.instruments import v4l2, y16
 from dbthermal.instruments.camera import FrameFlag, Stream
+from dbthermal.instruments.clock import Task
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.world import FFC_DURATION
 from dbthermal.instruments.protocols import record_scene
-from dbthermal.instruments.recording import Limits, open_capture
+from dbthermal.instruments.recording import Limits, Preview, notes, open_capture
 from dbthermal.instruments.session import Session
 
-SESSION = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
+RATE = 50.0
 
 
 def session(**changes: object) -> Session:
     """The session of the parameters, with few pixels."""
-    return Session.load(SESSION, {"shape": [16, 24], **changes})
+    file = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
+    return Session.load(file, {"shape": [16, 80], **changes})
 
 
 def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,18 +37,6 @@ def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch
     assert (frame.sequence, {*source.identity}) == (7, {"device", "model", "bus", "driver"})
     with pytest.raises(ValueError, match=r"Invalid address 'serial:///dev/ttyACM0'\. Must"):
         y16.KIND.open_frames("serial:///dev/ttyACM0", Stream())
-
-
-def test_hardware_is_opened_by_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The environment names address, kind and format of the camera that the contract is held on."""
-    kernel = Driver(rate=9).kernel()
-    monkeypatch.setattr(v4l2, "Kernel", lambda: kernel)
-    monkeypatch.setenv("DBTHERMAL_VIDEO", "v4l2:///dev/video0")
-    for name, value in (("KIND", "y16"), ("SHAPE", "6x8"), ("RATE", "9")):
-        monkeypatch.setenv(f"DBTHERMAL_VIDEO_{name}", value)
-    with ExitStack() as stack:
-        device = real_video(stack).device
-        assert (device.shape, device.frame_rate) == ((6, 8), 9.0)
 
 
 def test_it_has_neither_telemetry_nor_command_port() -> None:
@@ -68,7 +57,7 @@ def test_its_shutter_is_told_by_frozen_images(
     models = {"y16": ("emulated Y16 camera", 1.0)}  # corrects its offsets every second
     monkeypatch.setattr("dbthermal.instruments.emulated.camera.MODELS", models)
     camera = {"kind": "y16", "video": "v4l2:///dev/video0"}
-    short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=50.0)
+    short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=RATE)
     with open_devices(short) as devices:
         identity = devices.identities()["8-14"]
         assert (identity["device"], identity["model"]) == ("sim://y16/8-14", "emulated Y16 camera")
@@ -77,11 +66,42 @@ def test_its_shutter_is_told_by_frozen_images(
     repeated = (capture["frame_flags"] & int(FrameFlag.IMAGE_REPEATED)) != 0
     closed = (capture["frame_flags"] & int(FrameFlag.SHUTTER_CLOSED)) != 0
     frozen = np.count_nonzero(repeated)
-    assert 10 < frozen <= FFC_DURATION * short.frame_rate + 1
+    assert 10 < frozen <= FFC_DURATION * RATE + 1
     assert np.count_nonzero(closed) == frozen - 2
     assert not np.any(closed & ~repeated)
     events = correction.find_shutter(capture, closed=closed)
-    assert (events["renewed"].values.tolist(), events["frames"].values.tolist()) == (
-        [True],
-        [frozen],
-    )
+    assert (events["renewed"].all(), *events["frames"].values) == (True, frozen)
+
+
+@pytest.mark.filterwarnings("ignore:Fixed pattern")  # of an emulated detector without correction
+@pytest.mark.parametrize("telemetry_rows", [2, 0])
+def test_a_correction_is_taken_out_of_its_band(telemetry_rows: int, tmp_path: Path) -> None:
+    """A commanded correction is removed from its band; telemetry marks its first frame."""
+    ports = {"video": "v4l2:///dev/video0", "control": "serial:///dev/ttyACM0"}
+    form = {"frame_rate": RATE, "duration": 1.3, "telemetry_rows": telemetry_rows}
+    with open_devices(session(cameras={"8-14": ports, "9.5": ports}, **form)) as devices:
+        task = Task(devices.clock, "corrector", devices.cameras["9.5"].run_ffc)
+
+        def correct(preview: Preview) -> None:
+            if preview.time > 0.3 and task.ident is None:
+                task.start()
+
+        limits = Limits(reserve=0, reading_period=0.05, preview_period=0.02)
+        record_scene(devices, tmp_path / "a.zarr", limits=limits, preview=correct)
+        assert task.ended.is_set()
+    capture = open_capture(tmp_path / "a.zarr")
+    padded = (capture["frame_flags"] & int(FrameFlag.PADDED)).any("band")
+    flags = (capture := capture.isel(time=~padded.values))["frame_flags"].values
+    closed = (flags & int(FrameFlag.SHUTTER_CLOSED)) != 0
+    frozen = np.count_nonzero(flags[1] & int(FrameFlag.IMAGE_REPEATED))
+    assert 10 < frozen <= FFC_DURATION * RATE + 1
+    assert not closed[0].any()
+    late = frozen - np.count_nonzero(closed[1])
+    assert (late == 0) if telemetry_rows else (0 <= late <= 2)
+    kinds = [kind for _, kind, source, _ in notes(tmp_path / "a.zarr") if source == "9.5"]
+    assert [kind for kind in kinds if "shutter" in kind] == ["shutter_closed", "shutter_open"]
+    unity = xr.DataArray(np.ones((2, *capture["counts"].shape[2:])), dims=("band", "y", "x"))
+    maps = xr.Dataset({"gain": unity, "offset": 0 * unity, "bad": unity < 0})
+    corrected = correction.correct_capture(capture, maps.assign_coords(band=capture["band"]))
+    assert corrected.attrs["frames_taken_out"] == [0, frozen]
+    assert (corrected.attrs["shutter_events"], int(corrected["segment"][-1])) == (1, 1)
