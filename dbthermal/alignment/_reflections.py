@@ -26,7 +26,6 @@ from dbthermal.alignment._products import Movie
 SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _ROWS: Final = 32  # that are read at a time
-_SAMPLES: Final = 2**26  # of a band that are matched, at most: of a large image fewer frames
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
@@ -36,7 +35,6 @@ _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _MORE: Final = 1.25
 _AGREE: Final = 2.25
-_CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
@@ -137,23 +135,34 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
-    capture, period, used, field = _coarse(capture, spline, factor)
-    fine = capture.rapid(period, used)
-    freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
+    capture, signals, period, field = _coarse(capture, spline, factor)
+    functions = capture.functions(signals, period)
+    freedom, fine = _freedom(functions), capture.planes(functions)
     while True:
         factor = max(1, factor // 2)
         pictures = [matching.binned(movie, factor) for movie in fine]
-        level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor)
+        level = Movies.blurred(
+            pictures,
+            capture.valid,
+            capture.noise,
+            freedom,
+            factor,
+            _white(capture.frames.size, period),
+        )
         field, data = matching.refine(level, field)
         if factor == 1:
             # The delay is seen in slower changes, too, in which there is more than noise.
             spread = _variances(field, level, _told(data), _squares(data))
-            period = max(period, _PERIODS[2])
-            freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
-            pictures = capture.rapid(period, used)
+            functions = capture.functions(signals, max(period, _PERIODS[2]))
+            freedom, pictures = _freedom(functions), capture.planes(functions)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
-            times = corrected["time"].values[capture.frames[used]]
-            late, std, energy = matching.delay(level, field.on(level.centres()), times)
+            times = corrected["time"].values[capture.frames]
+            # Planes of a rate, by the functions that a rate's transpose makes of these.
+            rates = np.gradient(np.eye(times.size), times, axis=0).T @ functions
+            rate = Movies.blurred(
+                capture.planes(rates)[:1], capture.valid, capture.noise, freedom, 1
+            )
+            late, std, energy = matching.delay(level, rate.first, field.on(level.centres()))
             result = _result(corrected, capture, field, data, spread)
             result["energy"] = ("part", "y", "x"), energy
             return result.assign_attrs(delay=late, delay_std=std)
@@ -222,13 +231,18 @@ class _Capture:
         penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
-    def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[Movie]:
-        """Rapid changes of the bands (y, x, time) [K] in some of the frames."""
+    def functions(self, signals: Array, period: float) -> Array:
+        """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
-        result = np.empty((self.bands.size, *self.valid.shape, used.size), np.float32)
+        rapid = _rapid(signals.reshape(-1, signals.shape[-1]), smoothing)
+        return _rapid(matching.leading(rapid).T, smoothing).T
+
+    def planes(self, functions: Array) -> list[Movie]:
+        """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""
+        result = np.empty((self.bands.size, *self.valid.shape, functions.shape[1]), np.float32)
         for rows, signals in self.blocks(_ROWS):
             for movie, signal in zip(result, signals, strict=True):
-                movie[rows] = _rapid(_filled(signal), smoothing)[..., used]
+                movie[rows] = _filled(signal) @ functions
         nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
         result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
         return list(result)
@@ -244,10 +258,8 @@ class _Capture:
         return [np.concatenate(band) for band in zip(*parts, strict=True)], valid
 
 
-def _coarse(
-    capture: _Capture, spline: Spline, factor: int
-) -> tuple[_Capture, float, npt.NDArray[np.intp], Field]:
-    """Capture with its valid pixels, the period that tells most, energetic frames, rough field."""
+def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, Array, float, Field]:
+    """Capture with its valid pixels, coarse signals, the period that tells most, rough field."""
     signals, valid = capture.binned(factor)
     reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, result = capture.frames.size, None
@@ -255,10 +267,19 @@ def _coarse(
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        smoothing, freedom = capture.smoothing(period), _freedom(frames, period)
-        pictures = [_rapid(part, smoothing).astype(np.float32) for part in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
-        begin = matching.start(level, spline, reach) if result is None else result[-1]
+        functions = capture.functions(signals[0], period)
+        pictures = [(part @ functions).astype(np.float32) for part in signals]
+        level = Movies.blurred(
+            pictures, valid, capture.noise, _freedom(functions), factor, _white(frames, period)
+        )
+        begin = None if result is None else result[-1]
+        if begin is None:
+            # Whole frames: what is rare in a pixel's time is cut.
+            smoothing = capture.smoothing(period)
+            pictures = [_rapid(part, smoothing).astype(np.float32) for part in signals]
+            freedom = _white(frames, period)
+            whole = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
+            begin = matching.start(whole, spline, reach)
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
@@ -269,11 +290,7 @@ def _coarse(
         apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
         if told.any() and size < best / _MORE and apart < limit:
             best, before, limit = size, data, _AGREE * max(squares[:, told].mean(), 1.0)
-            energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
-            # Those of the largest energy, no more than memory allows.
-            most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
-            used = np.sort(np.argsort(energy)[::-1][:most])
-            result = (replace(capture, valid=valid), period, used, field)
+            result = (replace(capture, valid=valid), signals[0], period, field)
     if result is None:
         raise ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "
@@ -312,7 +329,12 @@ def _variances(field: Field, level: Movies, told: Mask, squares: Array) -> Array
     return np.asarray(chi * field.variances(level.centres()))
 
 
-def _freedom(frames: int, period: float) -> float:
+def _freedom(functions: Array) -> float:
+    """Degrees of freedom of white noise along functions of time (time, plane)."""
+    return float(np.sum(functions**2))
+
+
+def _white(frames: int, period: float) -> float:
     """Degrees of freedom of white noise that a smoother leaves, see `_Capture.smoothing`."""
     frequency = np.pi * (np.arange(frames) + 0.5) / frames
     ratio = (np.sin(0.5 * frequency) / np.sin(np.pi / period)) ** 6

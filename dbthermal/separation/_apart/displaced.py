@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,7 @@ _KEPT: Final = 2**30
 TAIL: Final = 3.0
 
 
+T = TypeVar("T")
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
 """Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
 
@@ -61,16 +62,17 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
-    found: dict[Hashable, Array] = field(default_factory=dict)  # see `once`
+    found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
     read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
     shelf: Shelf | None = field(default_factory=shelf)  # of captures whose films are on disk
     shelved: dict[Hashable, list[Callable[[], Any]]] = field(default_factory=dict)
 
-    def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
+    def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
         if key not in self.found:
             self.found[key] = compute()
-        return self.found[key]
+        result: T = self.found[key]
+        return result
 
     def source(self, rows: slice) -> slice:
         """Rows of the image that hold some rows, and what the second camera shows of them."""

@@ -17,7 +17,7 @@ from dbthermal._arrays import Array, parts
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
-from dbthermal.separation._apart.displaced import without
+from dbthermal.separation._apart.displaced import Displacement, without
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.reflection_ratio import (
     HIGHEST_ORDER,
@@ -287,8 +287,17 @@ def first_band(
     frame) [K], of any frames, and its variance (loose): smoothed over time, it is that of
     e_1 u_1(x) and holds little of that of the reflection. Bad pixels have no part in it.
     """
-    displacement, capture = inputs.displacement, inputs.capture
+    displacement = inputs.displacement
     assert displacement is not None
+    key = "first band", loose.tobytes(), frames.tobytes()
+    return displacement.once(key, lambda: _first_band(inputs, displacement, loose, frames))
+
+
+def _first_band(
+    inputs: Inputs, displacement: Displacement, loose: Whole, frames: Whole
+) -> tuple[Array, Array, Callable[[slice | Whole], Floats], Floats]:
+    """See `first_band`."""
+    capture = inputs.capture
     (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
     segment = capture["segment"].values if "segment" in capture else None
     time = capture["time"].values

@@ -51,6 +51,11 @@ _FRAMES: Final = 8
 _LOOKED_AT: Final = 32
 _MATTERS: Final = 0.2
 _MOST: Final = 0.99
+# Frames for each polynomial that tell a smooth film, pixels that are written at once, and the share
+# of a deviation below which it is no matter that a film is not smooth.
+_NODES: Final = 2
+_AT_ONCE: Final = 2048
+_NO_MATTER: Final = 0.1
 # Draws of noise by which the deviations are propagated, and the variance over that of a pixel alone
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
@@ -194,15 +199,18 @@ def solve(
             here, beside = looked_at(equations)
         system.bridge(film, solved)
         unsettled = np.zeros(solved.size, dtype=bool)
-        parts = _parts(film)
+        nodes, spread = _nodes(film, result["time"].values, std, places, some)
+        parts = [nodes[part] for part in _parts(nodes)]
         results = threads.map(
-            lambda part: both(film[part, places], moved(part), change(part), equations), parts
+            lambda part: both(film[part][:, places], moved(part), change(part), equations), parts
         )
-        for part, (*pair, step) in zip(parts, results, strict=True):
-            for whole, one in zip((film, there), pair, strict=True):
-                _write(whole, part, places, curve, one)
+        signals = np.empty((2, nodes.size, places.size), np.float32)
+        for part, (*pair, step) in zip(_parts(nodes), results, strict=True):
+            signals[:, part] = np.swapaxes(pair, 1, 2)
             unsettled[places] |= step > 10.0 * system.CONVERGED
-            release()
+        for whole, signal in zip((film, there), signals, strict=True):
+            _write(whole, places, curve, signal, spread)
+        release()
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
@@ -225,7 +233,9 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
         system.bridge(film, solved)
         for part in _parts(film):
             signal = curve.signal(film[part, places]).T - curve.reference
-            _write(there, part, places, curve, equations.packed.beside(signal, change(part)))
+            beside = equations.packed.beside(signal, change(part))
+            there[part] = np.nan
+            there[part, places] = curve.temperature(beside.T + curve.reference)
             release()
     shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
     films = {
@@ -235,15 +245,42 @@ def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     return Joint(inputs, xr.Dataset(films), emissivity, np.ones(solved.size), unsettled)
 
 
-def _parts(film: Floats) -> list[slice]:
+def _parts(film: Floats | Whole) -> list[slice]:
     """Frames of a film that are solved together."""
     return [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
 
 
-def _write(film: Floats, part: slice, places: Whole, curve: Curve, signal: Floats) -> None:
-    """Write some frames of a film of temperatures, of signals (solved pixel, frame), in place."""
-    film[part] = np.nan
-    film[part, places] = curve.temperature(signal.T + curve.reference)
+def _nodes(
+    film: Floats, time: Array, std: Floats, places: Whole, some: Whole
+) -> tuple[Whole, Floats | None]:
+    """Frames (node) that tell a smooth film, and weights (frame, node) of these; else all, None.
+
+    Polynomials through the nodes, which lie close together near the ends as Chebyshev's do, repeat
+    a film that is one of them. Where they are off by more than a share of the deviation (some
+    frame, pixel), in more than a few of the samples, the object changes rapidly.
+    """
+    order = min(HIGHEST_ORDER, time.size // 4)
+    ends = np.cos(np.pi * (np.arange(_NODES * order) + 0.5) / (_NODES * order))
+    place = time[0] + 0.5 * (1.0 - ends) * (time[-1] - time[0])
+    nodes = np.unique(np.abs(time - place[:, np.newaxis]).argmin(axis=1))
+    functions = smooth.subspace(time, order).functions
+    weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
+    few, apart = weights[some] @ film[nodes][:, places], 0.0
+    apart = np.abs(few - film[some][:, places]) / std[:, places]
+    if nodes.size == time.size or not np.nanquantile(apart, _MOST) < _NO_MATTER:
+        return np.arange(time.size), None
+    return nodes, weights
+
+
+def _write(
+    film: Floats, places: Whole, curve: Curve, signal: Floats, weights: Floats | None
+) -> None:
+    """Write a film of temperatures, of signals (node, solved pixel) and their weights, in place."""
+    for start in range(0, places.size, _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        kelvin = curve.temperature(signal[:, part] + curve.reference).astype(np.float32)
+        film[:, places[part]] = kelvin if weights is None else weights @ kelvin
+    film[:, ~np.isin(np.arange(film.shape[1]), places)] = np.nan
 
 
 def _both(

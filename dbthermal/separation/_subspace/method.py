@@ -158,7 +158,7 @@ def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
         functions = _functions(tile)
         alone = _solve(tile, functions, settings, least=0.0)
         result = _survey(tile, functions.orders, alone)
-        first = _followed(tile, settings)[1]
+        first = _followed(tile, settings, alone)[1]
         divided = np.asarray(first.any(axis=0))
         if np.any(divided):
             part = tile.select_pixels(divided)
@@ -301,14 +301,17 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     }
 
 
-def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
+def _followed(
+    tile: Tile, settings: SubspaceSettings, solution: Solution | None = None
+) -> tuple[Estimate, Mask]:
     """
     All steps: pixels that do not fit are solved anew with polynomials in pieces of the time.
 
     And the frames that pieces begin with (time, pixel), none where one curve is smooth.
     """
     functions, noise = _functions(tile), np.array(tile.noise)
-    solution = _solve(tile, functions, settings)
+    if solution is None:
+        solution = _solve(tile, functions, settings)
     used = solution.order + functions.steps
     asked = pieces.asked(
         solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
