@@ -12,7 +12,7 @@ from hostile_files import seed_of_week
 
 from attack import oracle
 from attack.oracle import Attack, Verdict, carry_out
-from attack.runner import CLASSES, Worker, attack_all, table
+from attack.runner import CLASSES, Worker, attack_all, bad, table
 
 SHORT, WEEKLY, LONG = 200, 1500, 6000
 """Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
@@ -23,7 +23,7 @@ def worker() -> Iterator[Worker]:
     """A process for the attacks."""
     made = Worker()
     yield made
-    made.close()
+    made.pool.shutdown()
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -31,8 +31,7 @@ def test_short_attack(worker: Worker, name: str) -> None:
     """No input of a class ends badly."""
     total = sum(share for _, share in CLASSES.values())
     number = 2 if name == "kills" else max(3, SHORT * CLASSES[name][1] // total)
-    outcomes = {seed: worker.run(name, seed) for seed in range(1, number + 1)}
-    assert not {seed: one for seed, one in outcomes.items() if one.kind in oracle.BAD}
+    assert not bad(name, 1, [worker.run(name, seed) for seed in range(1, number + 1)])
 
 
 @pytest.mark.parametrize(
@@ -49,11 +48,10 @@ def test_many_attacks(number: int, seed: int) -> None:
     pixels is not surely above it: wrong pixels come by inputs, so the sum of their squares is the
     variance of their number.
     """
-    tallies = dict(attack_all(list(CLASSES), number, seed))
-    print(f"DBTHERMAL_SEED={seed_of_week()}, first seed {seed}", *table(tallies), sep="\n")
-    for tally in tallies.values():
-        print(*tally.bad_lines(), sep="\n")
-    outcomes = [one for tally in tallies.values() for one in tally.outcomes.values()]
+    found = dict(attack_all(list(CLASSES), number, seed))
+    print(f"DBTHERMAL_SEED={seed_of_week()}, first seed {seed}", *table(found), sep="\n")
+    print(*(line for name, some in found.items() for line in bad(name, seed, some)), sep="\n")
+    outcomes = [one for some in found.values() for one in some]
     assert sum(one.kind in oracle.BAD for one in outcomes) <= 0.01 * len(outcomes)
     assert sum(one.kind == "silent" for one in outcomes) <= 0.005 * len(outcomes)
     judged = [one for one in outcomes if one.unflagged > 1]  # pixels; of others, one is the whole
@@ -100,7 +98,7 @@ def test_oracle(act: Callable[[], Any], kind: str) -> None:
 
 def test_dead_process_is_told(worker: Worker) -> None:
     """A process that an attack kills is told as a crash, and made anew."""
-    os.kill(worker.process.pid or 0, 9)
+    os.kill(worker.pool.submit(os.getpid).result(), 9)
     assert worker.run("bits", 1).kind == "crash"
     assert worker.run("bits", 1).kind != "crash"
 
