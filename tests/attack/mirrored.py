@@ -1,13 +1,14 @@
 """Hostile arguments beside a capture: the reflections' shift, and what completes a result."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from attack.arrays import FLOOR, judge, response_of
+from attack.arrays import FLOOR, response_of, solving
 from attack.damage import ALL, TURNED, Rng, Table, cut, hurt, hurt_one
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import SLOPE, Scene, clock, leaving, pick
@@ -45,16 +46,12 @@ def _picture(
     return made, xr.Dataset(parts, {"axis": ["y", "x"], **place}, attrs)
 
 
-def _patch(value: float, *names: str) -> Callable[[Rng, xr.Dataset], xr.Dataset]:
+def _patch(_: Rng, field: xr.Dataset, **values: float) -> xr.Dataset:
     """A patch of other values in some variables."""
-
-    def damage(_: Rng, field: xr.Dataset) -> xr.Dataset:
-        field = field.copy(deep=True)
-        for name in names:
-            field[name][..., 10:20, 15:30] = value
-        return field
-
-    return damage
+    field = field.copy(deep=True)
+    for name, value in values.items():
+        field[name][..., 10:20, 15:30] = value
+    return field
 
 
 _FIELDS: Final[Table] = {
@@ -63,14 +60,14 @@ _FIELDS: Final[Table] = {
     "for other bands": lambda _, one: one.assign_attrs(bands=["10.6"]),
     "of another reference": lambda _, one: one.assign_attrs(reference_band="9.5", bands=["8-14"]),
     "beyond the image": lambda _, one: one.assign(shift=one["shift"] * 40),
-    "NaN where known": _patch(np.nan, "shift"),
-    "infinite patch": _patch(np.inf, "shift"),
+    "NaN where known": partial(_patch, shift=np.nan),
+    "infinite patch": partial(_patch, shift=np.inf),
     "all NaN": lambda _, one: one.assign(shift=one["shift"] * np.nan),
-    "a hole": lambda rng, one: _patch(0, "known")(rng, _patch(np.nan, "shift")(rng, one)),
+    "a hole": partial(_patch, known=0, shift=np.nan),
     "noisy": lambda rng, one: one.assign(shift=one["shift"] + rng.normal(0, 3, one["shift"].shape)),
-    "a step": _patch(9.0, "shift"),
-    "deviation negative": _patch(-1.0, "shift_std"),
-    "deviation NaN": _patch(np.nan, "shift_std"),
+    "a step": partial(_patch, shift=9.0),
+    "deviation negative": partial(_patch, shift_std=-1.0),
+    "deviation NaN": partial(_patch, shift_std=np.nan),
     "axes turned": cut(axis=TURNED),
     "a number": lambda rng, _: float(rng.normal()),
     "turned round": lambda _, one: one.assign(shift=-one["shift"]),
@@ -83,13 +80,12 @@ def shifts(rng: Rng) -> Attack:
     what, spoilt = hurt(rng, _FIELDS, field)
     method, response = pick(rng, ["subspace"] * 5 + ["apparent"]), response_of(made)
 
-    def act() -> Any:
-        return separation.solve(made.capture, response, method, reflection_shift=spoilt)
-
     names = ("shift|axis|known|band|pixel|reflection_shift|dims|coordinate|'x'",)
     limit = "a wrong shift is not seen everywhere" if what in ("a step", "turned round") else ""
-    good = what == "nothing" and method == "subspace"
-    return Attack(f"shift {what}", act, lambda found: judge(made, found), names, good, limit)
+    good, more = what == "nothing" and method == "subspace", {"reflection_shift": spoilt}
+    return replace(
+        solving(f"shift {what}", made, response, method, *names, good=good, **more), limit=limit
+    )
 
 
 @cache

@@ -41,7 +41,13 @@ def align(rng: Rng) -> Attack:
     def judge(result: xr.Dataset) -> Verdict:
         if abs(result.attrs["time_offset"][1] - expected) > 0.025:
             return wrong(f"offset {result.attrs['time_offset'][1]:.3f} s, truly {expected:.3f} s")
-        return _compare(result, made)
+        # Both bands on the second one's clock must show the scene of one moment.
+        truth = xr.DataArray(made.clean(), {"time": made.time}, ("band", "time", "y", "x"))
+        apart = abs(result["counts"].values - truth.interp(time=result["time"].values).values)
+        error = [np.quantile(np.append(one[np.isfinite(one)], 0.0), 0.99) for one in apart]
+        # The line between two frames misses a moving body's edge by up to a kelvin.
+        excess = error > 5 * made.noise + 1.5 * SLOPE
+        return wrong(f"counts off by {error}, noise {made.noise}", where=bool(excess.any()))
 
     more: dict[str, Any] = {"offset": expected, "clock": "9.5"} if given else {}
     what = f"align {delay:.1f} frames, {sorted(more)}: {what}"
@@ -53,17 +59,6 @@ def _cameras(rng: Rng, delay: float, frames: int) -> tuple[str, Scene, xr.Datase
     made = scene(rng, shape=(8, 12), time=clock(frames), ratio=3.0, delay=delay / 10)
     what, spoilt = hurt(rng, _LOSSES, made)
     return what, made, spoilt, 0.0 if what == "stamps of that delay" else delay
-
-
-def _compare(result: xr.Dataset, made: Scene) -> Verdict:
-    """Both bands on the second one's clock must show the scene of one moment."""
-    counts, times = result["counts"].values, result["time"].values
-    truth = xr.DataArray(made.clean(), {"time": made.time}, ("band", "time", "y", "x"))
-    apart = np.abs(counts - truth.interp(time=times).values)
-    error = [np.quantile(np.append(one[np.isfinite(one)], 0.0), 0.99) for one in apart]
-    # The line between two frames misses a moving body's edge by up to a kelvin.
-    excess = error > 5 * made.noise + 1.5 * SLOPE
-    return wrong(f"counts off by {error}, noise {made.noise}", where=bool(excess.any()))
 
 
 def _stamped(made: Scene, second: Array) -> xr.Dataset:
