@@ -168,21 +168,21 @@ def tell_of_compiling() -> None:
     """Say from now on, once, that the separation is compiled, if no earlier run left it so."""
     from numba.core import event  # noqa: PLC0415 - takes long
 
-    class Told(event.Listener):
+    class CompilerListener(event.Listener):
         """Listener to the compiler."""
 
-        said = False
+        announced = False
 
         def on_start(self, _: event.Event) -> None:
-            if not self.said:
+            if not self.announced:
                 text = "Compiling the separation, once after an installation: about a minute.\n"
                 sys.stderr.write(text)
-            self.said = True
+            self.announced = True
 
         def on_end(self, _: event.Event) -> None:
             """Say nothing more: a listener must have it."""
 
-    event.register("numba:compile", Told())  # type: ignore[no-untyped-call]
+    event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
 
 
 def _known(options: argparse.Namespace) -> dict[str, Any]:

@@ -49,8 +49,8 @@ class Comparison:
 
     def noted(self, aligned: xr.Dataset) -> xr.Dataset:
         """Capture on these clocks, with what was found beside them; doubts are warned of."""
-        known = {"time_offset_std": self.std} if np.isfinite(self.std) else {}
-        return warned(aligned.assign_attrs(known), *self.doubts)
+        deviation = {"time_offset_std": self.std} if np.isfinite(self.std) else {}
+        return warned(aligned.assign_attrs(deviation), *self.doubts)
 
 
 def compare(
@@ -69,25 +69,25 @@ def compare(
     `time_offset`.
     """
     names = [str(name) for name in corrected["band"].values]
-    together = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
+    synchronous = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
     if len(names) == 1:
-        return Comparison(together, 0.0)
+        return Comparison(synchronous, 0.0)
     for name in names[1:]:
         check(corrected, name, search)
     if side_by_side:
-        result = _compared(corrected, scale, together, search=search, clock=clock, lazy=lazy)
+        result = _compared(corrected, scale, synchronous, search=search, clock=clock, lazy=lazy)
     else:
         result = _at_one_place(corrected, search)
     if corrected.attrs.get("offset_by") != "caller":
         return result
     frame = clocks.frame_period(clocks.exposure_times(corrected)[0])
-    off = float(result.offset.values[np.argmax(np.abs(result.offset.values))])
-    if not abs(off) > max(_PRECISION * frame, _SIGMAS * result.std):  # or of no deviation
-        return replace(result, offset=together, doubts=())
-    told = f"by {off:.4f} +- {result.std:.4f} s, {off / frame:.2f} frames"
+    largest = float(result.offset.values[np.argmax(np.abs(result.offset.values))])
+    if not abs(largest) > max(_PRECISION * frame, _SIGMAS * result.std):  # or of no deviation
+        return replace(result, offset=synchronous, doubts=())
+    contradiction = f"by {largest:.4f} +- {result.std:.4f} s, {largest / frame:.2f} frames"
     doubt = (
         f"The stated offset of the recordings, {corrected.attrs.get('offset')} s, is contradicted "
-        f"by the images {told}, which are followed. Give offset= [s] to align to keep it."
+        f"by the images {contradiction}, which are followed. Give offset= [s] to align to keep it."
     )
     return replace(result, doubts=(*result.doubts, doubt))
 
@@ -95,9 +95,9 @@ def compare(
 def _at_one_place(corrected: xr.Dataset, search: int) -> Comparison:
     """Clocks of cameras at one place, which all pixels tell, of registered views."""
     names = [str(name) for name in corrected["band"].values]
-    found = [measured_offset(corrected, name, search) for name in names[1:]]
-    offsets = np.array([0.0, *(offset for offset, _ in found)])
-    return Comparison(xr.DataArray(offsets, {"band": names}, "band"), max(std for _, std in found))
+    pairs = [measured_offset(corrected, name, search) for name in names[1:]]
+    offsets = np.array([0.0, *(offset for offset, _ in pairs)])
+    return Comparison(xr.DataArray(offsets, {"band": names}, "band"), max(std for _, std in pairs))
 
 
 def apart(
@@ -117,7 +117,7 @@ def _reduced(corrected: xr.Dataset, **options: Any) -> tuple[xr.Dataset, Callabl
 
 
 def _compared(
-    corrected: xr.Dataset, scale: Scale | None, together: xr.DataArray, **options: Any
+    corrected: xr.Dataset, scale: Scale | None, synchronous: xr.DataArray, **options: Any
 ) -> Comparison:
     """Clocks that the images tell."""
     stamps = clocks.exposure_times(corrected)
@@ -127,71 +127,71 @@ def _compared(
         scale = Scale.of_changes(small) if scale is None else scale
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
-    offset, field, left = _clocked(small, scale, together, resample)
-    wide = None if field is None else _enlarged(field, corrected)
-    if field is None or wide is None or not seen_apart(wide):
+    offset, field, uncertainty = _clocked(small, scale, synchronous, resample)
+    full_field = None if field is None else _enlarged(field, corrected)
+    if field is None or full_field is None or not seen_apart(full_field):
         return _at_one_place(corrected, options["search"])
     # A false shift may go with a false delay: then one place and its clocks explain more.
     try:
-        plain = _at_one_place(corrected, options["search"])
-        rival = _shift(resample(small, offset=plain.offset), scale)
+        at_one_place = _at_one_place(corrected, options["search"])
+        rival = _shift(resample(small, offset=at_one_place.offset), scale)
     except ValueError:
         rival = None
     shift = np.inf if rival is None else np.nanmedian(np.hypot(*rival["shift"].values))
     if shift < _SAME and rival is not None and np.diff(_explained(field, rival)) > 0.0:
-        return plain
+        return at_one_place
     frame = clocks.frame_period(stamps[0])
-    if left <= _PRECISION * frame:
-        return Comparison(offset, left, wide)
-    off = f"{left / frame:.2g}" if np.isfinite(left) else "an unknown number of"
+    if uncertainty <= _PRECISION * frame:
+        return Comparison(offset, uncertainty, full_field)
+    count = f"{uncertainty / frame:.2g}" if np.isfinite(uncertainty) else "an unknown number of"
     doubt = (
-        f"The offset found between the cameras' clocks may be off by {off} frames, more than "
+        f"The offset found between the cameras' clocks may be off by {count} frames, more than "
         f"{_PRECISION:g}: what moves fast may be wrong without a flag. Give it [s] if known."
     )
-    return Comparison(offset, left, wide, (doubt,))
+    return Comparison(offset, uncertainty, full_field, (doubt,))
 
 
 def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
     """Share of the others' energy that each of two shifts explains, in the pixels of both."""
-    known = np.all([one["known"].values for one in fields], axis=0)
-    sums = [one["energy"].values[:, known].sum(axis=1) for one in fields]
+    common = np.all([field["known"].values for field in fields], axis=0)
+    sums = [field["energy"].values[:, common].sum(axis=1) for field in fields]
     return tuple(float(explained / max(energy, 1e-9)) for explained, energy in sums)
 
 
 def _clocked(
     small: xr.Dataset,
     scale: Scale,
-    together: xr.DataArray,
+    synchronous: xr.DataArray,
     resample: Callable[..., xr.Dataset],
 ) -> tuple[xr.DataArray, xr.Dataset | None, float]:
     """Offsets of the clocks, the shift of the reflections, and what clocks are off by [s]."""
-    names, tried = small["band"].values, list[_Trial]()
+    names, trials = small["band"].values, list[_Trial]()
 
-    def at(**how: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
-        aligned = resample(small, **how)
-        offset, field = together.copy(data=aligned.attrs["time_offset"]), _shift(aligned, scale)
+    def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
+        aligned = resample(small, **clock)
+        offset, field = synchronous.copy(data=aligned.attrs["time_offset"]), _shift(aligned, scale)
         if field is not None and np.isfinite(field.attrs["delay"]):
-            tried.append(_Trial(offset, names != field.attrs["reference_band"], field))
+            trials.append(_Trial(offset, names != field.attrs["reference_band"], field))
         return offset, field
 
-    _, field = at(offset=together)
+    _, field = compare_at(offset=synchronous)
     if field is None:
-        return together, None, np.nan
-    first, frame = tried.copy(), clocks.frame_period(clocks.exposure_times(small)[0])
-    tried.clear()
+        return synchronous, None, np.nan
+    synchronous_trials, frame = trials.copy(), clocks.frame_period(clocks.exposure_times(small)[0])
+    trials.clear()
     try:
-        offset, field = at(reflection_shift=field)
+        offset, field = compare_at(reflection_shift=field)
     except ValueError:  # the shift of clocks that are far off may be a false one
-        if not first or (trial := _next(first, frame)) is None:
+        if not synchronous_trials or (trial := _next(synchronous_trials, frame)) is None:
             raise
-        offset, field = at(offset=trial)
-    while tried and field is tried[-1].field:  # the last one told a delay
-        if (trial := _next(tried, frame)) is None:
+        offset, field = compare_at(offset=trial)
+    while trials and field is trials[-1].field:  # the last one told a delay
+        if (trial := _next(trials, frame)) is None:
             break
-        offset, field = at(offset=trial)
-    if not tried:
+        offset, field = compare_at(offset=trial)
+    if not trials:
         return offset, field, np.nan
-    best, step = _step(tried, frame)
+    best, step = _step(trials, frame)
     # A delay that is not seen is known no better than by its deviation.
     return best.offset, best.field, float(np.hypot(step, best.field.attrs["delay_std"]))
 
@@ -201,11 +201,11 @@ class _Trial:
     """Offsets of the bands' clocks [s], and the shift of the reflections found with them."""
 
     offset: xr.DataArray
-    others: Mask  # bands but the reference of the shift
+    late_bands: Mask  # bands but the reference of the shift
     field: xr.Dataset
 
     @property
-    def late(self) -> float:
+    def delay(self) -> float:
         """Time by which the others are seen late with these clocks [s]."""
         return float(self.field.attrs["delay"])
 
@@ -213,38 +213,35 @@ class _Trial:
     def clock(self) -> float:
         """Offset of the others from the reference [s]."""
         offset = self.offset.values
-        return float(offset[self.others].mean() - offset[~self.others].mean())
+        return float(offset[self.late_bands].mean() - offset[~self.late_bands].mean())
 
 
-def _step(tried: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
+def _step(trials: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
     """Trial with the least delay, and the step of the others' clocks that ends it [s]."""
-    best = min(tried, key=lambda one: abs(one.late))
-    rest = [
-        one
-        for one in tried
-        if np.array_equal(one.others, best.others) and abs(one.clock - best.clock) >= _LATE * frame
-    ]
-    beyond = [one for one in rest if one.late * best.late < 0.0]
+    best = min(trials, key=lambda trial: abs(trial.delay))
+    alike = [trial for trial in trials if np.array_equal(trial.late_bands, best.late_bands)]
+    distinct = [trial for trial in alike if abs(trial.clock - best.clock) >= _LATE * frame]
+    opposite = [trial for trial in distinct if trial.delay * best.delay < 0.0]
     slope = 1.0
-    if rest:  # Newton's steps are short beside noise: from the second on they are a secant's
-        near = min(beyond or rest, key=lambda one: abs(one.clock - best.clock))
-        slope = (near.late - best.late) / (best.clock - near.clock)
+    if distinct:  # Newton's steps are short beside noise: from the second on they are a secant's
+        neighbour = min(opposite or distinct, key=lambda trial: abs(trial.clock - best.clock))
+        slope = (neighbour.delay - best.delay) / (best.clock - neighbour.clock)
     if not slope > 0.0:
         slope = 1.0
-    elif not beyond:
+    elif not opposite:
         slope = float(np.clip(slope, _FLAT, 1.0))
-    return best, best.late / slope
+    return best, best.delay / slope
 
 
-def _next(tried: Sequence[_Trial], frame: float) -> xr.DataArray | None:
+def _next(trials: Sequence[_Trial], frame: float) -> xr.DataArray | None:
     """Offsets of the clocks to be tried next [s]; None if they, or enough others, have been."""
-    best, step = _step(tried, frame)
-    if len(tried) >= _ROUNDS or len(tried) - 1 - tried.index(best) >= _VAIN:
+    best, step = _step(trials, frame)
+    if len(trials) >= _ROUNDS or len(trials) - 1 - trials.index(best) >= _VAIN:
         return None
-    behind = step * best.others
-    offset = best.offset.copy(data=best.offset.values + behind - behind[0])
-    known = any(float(abs(offset - one.offset).max()) < _LATE * frame for one in tried)
-    return None if known else offset
+    change = step * best.late_bands
+    offset = best.offset.copy(data=best.offset.values + change - change[0])
+    repeated = any(float(abs(offset - trial.offset).max()) < _LATE * frame for trial in trials)
+    return None if repeated else offset
 
 
 def _shift(aligned: xr.Dataset, scale: Scale) -> xr.Dataset | None:
@@ -270,32 +267,32 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
     if side == 1:
         return corrected
     bands, frames, height, width = (*counts.shape[:2], *(n // side for n in counts.shape[2:]))
-    film, seen = empty((bands, frames, height, width), np.float32), np.zeros((height, width), bool)
-    bad = np.zeros(counts.shape[2:], dtype=bool)
+    film = empty((bands, frames, height, width), np.float32)
+    covered, bad = np.zeros((height, width), bool), np.zeros(counts.shape[2:], bool)
     if "status" in corrected:
         bad = (corrected["status"].values & int(schema.UNMEASURED)) != 0
     for row in range(height):
-        part = slice(row * side, (row + 1) * side), slice(0, width * side)
-        values = counts[:, :, *part].values
-        here = schema.measured(values) & ~bad[part]
-        own = np.where(here, values, 0.0).sum(axis=1, dtype=np.float64)
-        own = quotient(own, here.sum(axis=1), np.nan)
-        told = np.isfinite(own).all(axis=0)  # of all bands the same pixels
-        here &= told
-        change = np.where(here, values - own[:, np.newaxis], 0.0)
+        window = slice(row * side, (row + 1) * side), slice(0, width * side)
+        values = counts[:, :, *window].values
+        valid = schema.measured(values) & ~bad[window]
+        means = np.where(valid, values, 0.0).sum(axis=1, dtype=np.float64)
+        means = quotient(means, valid.sum(axis=1), np.nan)
+        measured = np.isfinite(means).all(axis=0)  # of all bands the same pixels
+        valid &= measured
+        change = np.where(valid, values - means[:, np.newaxis], 0.0)
         squares = (bands, -1, side, width, side)
-        number = here.reshape(squares).sum(axis=(2, 4))
+        number = valid.reshape(squares).sum(axis=(2, 4))
         changes = quotient(change.reshape(squares).sum(axis=(2, 4)), number, np.nan)
-        all_told = told.reshape(side, width, side).sum(axis=(0, 2))
-        levels = np.where(told, own, 0.0).reshape(bands, 1, side, width, side).sum(axis=(2, 4))
-        common = number > _COMMON * all_told
-        film[:, :, row] = np.where(common, changes + quotient(levels, all_told, np.nan), np.nan)
-        seen[row] = all_told > 0
+        pixels = measured.reshape(side, width, side).sum(axis=(0, 2))
+        levels = np.where(measured, means, 0.0).reshape(squares).sum(axis=(2, 4))
+        common = number > _COMMON * pixels
+        film[:, :, row] = np.where(common, changes + quotient(levels, pixels, np.nan), np.nan)
+        covered[row] = pixels > 0
         release()
     dims, attrs = counts.dims, counts.attrs
     return corrected.drop_dims(["y", "x"]).assign(
         counts=(dims, film, attrs),
-        status=(dims[2:], np.where(seen, 0, Status.DEAD_PIXEL).astype(np.uint32)),
+        status=(dims[2:], np.where(covered, 0, Status.DEAD_PIXEL).astype(np.uint32)),
         # Neighbours that a registration made of the same pixels have their mean's noise together.
         noise_factor=("band", np.full(bands, 1.0 / side), schema.NOISE_FACTOR.attrs),
     )
@@ -335,18 +332,19 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
         return field
     # The centre of a square of n pixels is n - 1 half pixels from that of its first.
     places = (np.indices(shape) - 0.5 * (side - 1)) / side
-    near = tuple(
+    squares = tuple(
         np.clip(np.rint(place).astype(np.intp), 0, size - 1)
         for place, size in zip(places, field["known"].shape, strict=True)
     )
-    lost = np.isnan(field["shift"].values).any(axis=0)
-    nearest = distance_transform_edt(lost, return_distances=False, return_indices=True)
-    values = {"known": (field["known"].dims, field["known"].values[near], field["known"].attrs)}
+    missing = np.isnan(field["shift"].values).any(axis=0)
+    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    values = {"known": (field["known"].dims, field["known"].values[squares], field["known"].attrs)}
     for name in ("shift", "shift_std"):
         filled = field[name].values[:, nearest[0], nearest[1]]
-        wide = side * np.stack(
-            [map_coordinates(one, places, order=1, mode="nearest") for one in filled]
+        shift = side * np.stack(
+            [map_coordinates(part, places, order=1, mode="nearest") for part in filled]
         )
-        values[name] = (field[name].dims, np.where(lost[near], np.nan, wide), field[name].attrs)
-    here = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
-    return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)
+        full = np.where(missing[squares], np.nan, shift)
+        values[name] = (field[name].dims, full, field[name].attrs)
+    coordinates = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
+    return xr.Dataset(values, coords={"axis": field["axis"], **coordinates}, attrs=field.attrs)

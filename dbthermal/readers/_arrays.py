@@ -79,7 +79,7 @@ def array(
     recordings.check_unit(unit, label)
     recordings.check_number(memory, "memory")
 
-    own = dict[str, Any]()
+    attributes = dict[str, Any]()
 
     def check(values: Any, dims: Sequence[Any], times: Any = None) -> None:
         for dim, names in zip(dims, _DIMS, strict=False):
@@ -87,13 +87,13 @@ def array(
                 rule = "Must be (time, y, x): rename or transpose"
                 raise ValueError(f"Invalid dims {[*dims]} of '{label}'. {rule}.")
         attrs = getattr(values, "attrs", {})
-        own.update({name: attrs[name] for name in _ATTRIBUTES if name in attrs})
-        for scale in {"scale_factor", "add_offset"} & own.keys():
+        attributes.update({name: attrs[name] for name in _ATTRIBUTES if name in attrs})
+        for scale in {"scale_factor", "add_offset"} & attributes.keys():
             raise ValueError(f"Invalid '{scale}' of '{label}'. Must be counts as measured.")
         dtype = getattr(values, "dtype", np.dtype(object))
         _check(getattr(values, "shape", ()), dtype, memory, label)
-        said = own.get("units", own.get("unit", unit))
-        recordings.check_unit(said.decode() if isinstance(said, bytes) else str(said), label)
+        text = attributes.get("units", attributes.get("unit", unit))
+        recordings.check_unit(text.decode() if isinstance(text, bytes) else str(text), label)
         if times is not None:
             _check_times(times, clock, label)
 
@@ -101,7 +101,7 @@ def array(
         values = source
         if not isinstance(source, str | Path):
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            times = [one for one in coords if containers.are_times(one.name, one)]
+            times = [axis for axis in coords if containers.are_times(axis.name, axis)]
             check(source, containers.dims_of(source), *times[:1])
         elif containers.kind_of(Path(source)):
             values = containers.read(Path(source), name, check, memory, stack)
@@ -109,13 +109,13 @@ def array(
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
-    filed = isinstance(source, str | Path) and np.any(counts & 0xFF)  # others tell nothing
-    if filed and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
+    judged = isinstance(source, str | Path) and np.any(counts & 0xFF)  # others tell nothing
+    if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
-    fills = [own[name] for name in ("_FillValue", "missing_value") if name in own]
+    fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
-    return recordings.clocked(counts, clock, label, format="array", **schema.origin(own))
+    return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
 def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:
@@ -128,23 +128,23 @@ def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: st
 
 def _check_times(times: Any, clock: Clock, name: str) -> None:
     """Raise ValueError for an array's own times that do not rise, or that the clock contradicts."""
-    own, unit = np.asarray(times[...]), times.attrs.get("units", "s")
+    values, unit = np.asarray(times[...]), times.attrs.get("units", "s")
     unit = (unit.decode() if isinstance(unit, bytes) else str(unit)).partition(" since ")[0]
-    if own.dtype.kind in "mM":
-        own, unit = (own - own[0]) / np.timedelta64(1, "s"), "s"
-    if own.dtype.kind not in "iuf":
+    if values.dtype.kind in "mM":
+        values, unit = (values - values[0]) / np.timedelta64(1, "s"), "s"
+    if values.dtype.kind not in "iuf":
         return
     if (unit := _UNITS.get(unit, unit)) not in _SECONDS:
         raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
-    seconds = (own.astype(np.float64) - own[0]) * _SECONDS[unit]
+    seconds = (values.astype(np.float64) - values[0]) * _SECONDS[unit]
     stated = recordings.stamps(clock, len(seconds), name)
-    near = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
-    near &= np.diff(seconds, prepend=-1.0) > 0
-    if not near.all():
-        first = int(np.argmin(near))
-        found = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
+    agrees = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
+    agrees &= np.diff(seconds, prepend=-1.0) > 0
+    if not agrees.all():
+        first = int(np.argmin(agrees))
+        mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
         rule = "Must agree to half a frame, and rise: give clock= the times, or leave those out"
-        raise ValueError(f"Invalid times of '{name}': {found}. {rule}.")
+        raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
 
 
 def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:
@@ -174,6 +174,6 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any
     _check(shape, dtype, memory, name)
     size = 2 * int(np.prod(shape, dtype=object))
     if len(content := stream.read(size + 1)) != size:
-        found = f"{len(content)} bytes or more of counts in '{name}'"
-        raise ValueError(f"Truncated or damaged {found}. Must be {size}, as its header says.")
+        size_read = f"{len(content)} bytes or more of counts in '{name}'"
+        raise ValueError(f"Truncated or damaged {size_read}. Must be {size}, as its header says.")
     return np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")

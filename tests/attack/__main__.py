@@ -5,13 +5,10 @@ import os
 import re
 import subprocess
 import sys
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from attack.runner import CLASSES, attack_all, only, table
-
-_MARKS = ("<!-- attack: begin -->", "<!-- attack: end -->")
+from attack.runner import CLASSES, attack_all, bad, only, table
 
 
 def main() -> int:
@@ -19,39 +16,40 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m attack", description=__doc__)
     parser.add_argument("--inputs", type=int, default=300, help="number of inputs, of all classes")
     parser.add_argument("--seed", type=int, default=1, help="first seed of every class")
-    parser.add_argument("--only", help="class, or class:seed to repeat one input")
+    parser.add_argument("--only", default="", help="class, or class:seed to repeat one input")
     parser.add_argument("--write", type=Path, help="page whose marked table is written anew")
     options = parser.parse_args()
-    name, _, seed = (options.only or "").partition(":")
+    name, _, seed = options.only.partition(":")
     if seed:
         print(only(name, int(seed)))
         return 0
-    names = [one for one in CLASSES if one in (name or one)]
-    start, tallies = time.monotonic(), {}
-    for one, tally in attack_all(names, options.inputs, options.seed):
-        tallies[one] = tally
-        print(f"{one}: {tally.counts()} {tally.seconds:.0f} s", flush=True)
-    lines = table(tallies)
-    print("\n".join(lines), f"\n{time.monotonic() - start:.0f} s")
-    for tally in tallies.values():
-        print("\n".join(tally.bad_lines()), end="\n" if tally.bad else "")
+    found = {}
+    for one, verdicts in attack_all(
+        [n for n in CLASSES if n in (name or n)], options.inputs, options.seed
+    ):
+        found[one] = verdicts
+        print(
+            *bad(one, options.seed, verdicts),
+            f"{one}: {len(verdicts)} inputs",
+            sep="\n",
+            flush=True,
+        )
+    print(*table(found), sep="\n")
     if options.write:
-        write(options.write, lines, f"--inputs {options.inputs} --seed {options.seed}")
-    return int(any(kind == "silent" for tally in tallies.values() for _, kind, _ in tally.bad))
+        write(options.write, table(found), f"--inputs {options.inputs} --seed {options.seed}")
+    return int(any(one.kind == "silent" for some in found.values() for one in some))
 
 
 def write(page: Path, lines: list[str], command: str) -> None:
     """Put a table between the marks of a page."""
-    begin, end = _MARKS
+    begin, end = "<!-- attack: begin -->", "<!-- attack: end -->"
     data = ", with the public spectra" if os.environ.get("DBTHERMAL_DATA") else ""
     git = ["git", "-C", str(page.resolve().parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     stamp = f"{datetime.now(UTC):%Y-%m-%d}, commit {commit or 'unknown'}"
-    said = f"`python -m attack {command}`{data}, {stamp}:"
-    text = "\n".join([begin, said, "", *lines, "", end])
-    content = page.read_text(encoding="utf-8")
+    text = "\n".join([begin, f"`python -m attack {command}`{data}, {stamp}:", "", *lines, "", end])
     marked = re.compile(f"{begin}.*{end}", re.DOTALL)
-    page.write_text(marked.sub(lambda _: text, content), encoding="utf-8")
+    page.write_text(marked.sub(lambda _: text, page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,20 +1,21 @@
 """Hostile arguments beside a capture: the reflections' shift, and what completes a result."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from attack.arrays import FLOOR, Rng, judge, response_of
-from attack.oracle import Attack, Verdict
-from attack.scenes import SLOPE, Scene, clock, counts_of, pick
-from attack.stages import wrong
+from attack.arrays import FLOOR, response_of, solving
+from attack.damage import ALL, TURNED, Rng, Table, cut, hurt, hurt_one
+from attack.oracle import Attack, Verdict, wrong
+from attack.scenes import SLOPE, Scene, clock, leaving, pick
 from dbthermal import separation
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-GLASS: Final = np.array([0.86, 0.72])
+GLASS: Final = xr.DataArray([0.86, 0.72], {"band": ["8-14", "9.5"]}, "band")
 COMPLETED: Final = sum(1 << bit for bit in (16, 17, 18, 19))
 """Bits of the status that tell completed from measured."""
 
@@ -27,20 +28,14 @@ def _picture(
     rng, time, bands = np.random.default_rng(seed), clock(110), ("8-14", "9.5")
     noise = SLOPE * np.array([0.03, 0.35])
     field = smooth_shift(shape, shift, 0.2 * shift)
-    pair = xr.DataArray(GLASS, dims="band", coords={"band": list(bands)})
-    drawn = Picture(shape=shape, walkers=7, still=still).draw(time, pair, rng, field)
+    drawn = Picture(shape=shape, walkers=7, still=still).draw(time, GLASS, rng, field)
     warm, cold = (drawn[f"{who}_temperature"].values for who in ("object", "background"))
-    counts = [
-        share * counts_of(band, warm) + (1 - share) * counts_of(band, part)
-        for band, share, part in zip(bands, GLASS, cold, strict=True)
-    ]
-    counts += noise[:, None, None, None] * rng.standard_normal((2, *warm.shape))
-    emissivity = np.broadcast_to(GLASS[:, None, None], (2, *shape)).copy()
-    made = Scene(bands, time, warm, cold[0], emissivity, noise)
+    seen = zip(bands, GLASS.values, cold, strict=True)
+    counts = np.stack([leaving(band, share, warm, part) for band, share, part in seen])
+    counts += noise[:, None, None, None] * rng.standard_normal(counts.shape)
+    emissivity = np.broadcast_to(GLASS.values[:, None, None], (2, *shape)).copy()
     place = {"y": np.arange(shape[0]) + 3.0, "x": np.arange(shape[1]) + 7.0}
-    film = (("band", "time", "y", "x"), np.asarray(counts, np.float32), {"units": "count"})
-    coordinates = {"band": list(bands), "time": ("time", time, {"units": "s"}), **place}
-    made.capture = xr.Dataset({"counts": film}, coordinates, {"origin": "simulated"})
+    made = Scene(bands, time, warm, cold[0], emissivity, noise).film(counts, **place)
     pixel = {"units": "pixel"}
     parts = {
         "shift": (("axis", "y", "x"), field.astype(np.float32), pixel),
@@ -51,44 +46,29 @@ def _picture(
     return made, xr.Dataset(parts, {"axis": ["y", "x"], **place}, attrs)
 
 
-def _with(field: xr.Dataset, name: str, change: Callable[[Any], Any]) -> xr.Dataset:
-    """The field with the values of a variable changed."""
-    values = change(field[name].values.copy())
-    return field.assign({name: (field[name].dims, values, field[name].attrs)})
+def _patch(_: Rng, field: xr.Dataset, **values: float) -> xr.Dataset:
+    """A patch of other values in some variables."""
+    field = field.copy(deep=True)
+    for name, value in values.items():
+        field[name][..., 10:20, 15:30] = value
+    return field
 
 
-def _patch(value: float) -> Callable[[Any], Any]:
-    """A patch of other values."""
-
-    def change(values: Any) -> Any:
-        values[..., 10:20, 15:30] = value
-        return values
-
-    return change
-
-
-_FIELDS: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
+_FIELDS: Final[Table] = {
+    **ALL,
     "nothing": lambda _, one: one,
-    "of another size": lambda _, one: one.isel(x=slice(0, 30)),
-    "of another window": lambda _, one: one.assign_coords(x=one["x"] + 2),
-    "of other bands": lambda _, one: one.assign_attrs(bands=["10.6"]),
+    "for other bands": lambda _, one: one.assign_attrs(bands=["10.6"]),
     "of another reference": lambda _, one: one.assign_attrs(reference_band="9.5", bands=["8-14"]),
     "beyond the image": lambda _, one: one.assign(shift=one["shift"] * 40),
-    "NaN where known": lambda _, one: _with(one, "shift", _patch(np.nan)),
-    "infinite": lambda _, one: _with(one, "shift", _patch(np.inf)),
-    "all NaN": lambda _, one: _with(one, "shift", lambda v: v * np.nan),
-    "a hole": lambda _, one: _with(_with(one, "shift", _patch(np.nan)), "known", _patch(0)),
-    "noisy": lambda rng, one: _with(one, "shift", lambda v: v + rng.normal(0, 3, v.shape)),
-    "a step": lambda _, one: _with(one, "shift", _patch(9.0)),
-    "without deviation": lambda _, one: one.drop_vars("shift_std"),
-    "deviation negative": lambda _, one: _with(one, "shift_std", _patch(-1.0)),
-    "deviation NaN": lambda _, one: _with(one, "shift_std", _patch(np.nan)),
-    "axes turned": lambda _, one: one.isel(axis=[1, 0]),
-    "axes unnamed": lambda _, one: one.drop_vars("axis"),
-    "transposed": lambda _, one: one.transpose(),
-    "of another unit": lambda _, one: one.assign(shift=one["shift"].assign_attrs(units="m")),
-    "text": lambda _, one: one.assign(shift=one["shift"].astype(str)),
-    "an array": lambda _, one: one["shift"],
+    "NaN where known": partial(_patch, shift=np.nan),
+    "infinite patch": partial(_patch, shift=np.inf),
+    "all NaN": lambda _, one: one.assign(shift=one["shift"] * np.nan),
+    "a hole": partial(_patch, known=0, shift=np.nan),
+    "noisy": lambda rng, one: one.assign(shift=one["shift"] + rng.normal(0, 3, one["shift"].shape)),
+    "a step": partial(_patch, shift=9.0),
+    "deviation negative": partial(_patch, shift_std=-1.0),
+    "deviation NaN": partial(_patch, shift_std=np.nan),
+    "axes turned": cut(axis=TURNED),
     "a number": lambda rng, _: float(rng.normal()),
     "turned round": lambda _, one: one.assign(shift=-one["shift"]),
 }
@@ -97,17 +77,15 @@ _FIELDS: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
 def shifts(rng: Rng) -> Attack:
     """`solve` with a field of the reflections' shift that is damaged in each of its parts."""
     made, field = _picture(int(rng.integers(1, 4)), 2.4, shape=(20, 32))
-    what = pick(rng, sorted(_FIELDS))
-    spoilt, response = _FIELDS[what](rng, field), response_of(made)
-    method = pick(rng, ["subspace"] * 5 + ["apparent"])
-
-    def act() -> Any:
-        return separation.solve(made.capture, response, method, reflection_shift=spoilt)
+    what, spoilt = hurt(rng, _FIELDS, field)
+    method, response = pick(rng, ["subspace"] * 5 + ["apparent"]), response_of(made)
 
     names = ("shift|axis|known|band|pixel|reflection_shift|dims|coordinate|'x'",)
     limit = "a wrong shift is not seen everywhere" if what in ("a step", "turned round") else ""
-    good = what == "nothing" and method == "subspace"
-    return Attack(f"shift {what}", act, lambda found: judge(made, found), names, good, limit)
+    good, more = what == "nothing" and method == "subspace", {"reflection_shift": spoilt}
+    return replace(
+        solving(f"shift {what}", made, response, method, *names, good=good, **more), limit=limit
+    )
 
 
 @cache
@@ -117,55 +95,49 @@ def _incomplete(seed: int) -> tuple[Scene, dict[str, Any]]:
     response = response_of(made)
     result = separation.solve(made.capture, response)
     labels = xr.zeros_like(made.capture["counts"][0, 0], dtype=int).drop_vars(["band", "time"])
-    pair = xr.DataArray(GLASS, dims="band", coords={"band": list(made.bands)})
     given = {"result": result, "corrected": made.capture, "response": response}
-    return made, {**given, "materials": labels, "surroundings": 295.15, "prior": pair}
+    return made, {**given, "materials": labels, "surroundings": 295.15, "prior": GLASS}
 
 
-def _mirrored(result: xr.Dataset) -> xr.Dataset:
-    return result.isel(x=slice(None, None, -1)).assign_coords(x=result["x"])
+def _of(value: Any) -> Callable[[Rng, Any], Any]:
+    return lambda _, __: value
 
 
-_ARGUMENTS: Final[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
-    "nothing": ("prior", lambda one: one),
-    "no prior": ("prior", lambda _: None),
-    "a prior of 1.2": ("prior", lambda one: one + 0.4),
-    "a prior NaN": ("prior", lambda one: one.where(one > 0.8)),
-    "a prior of other bands": ("prior", lambda one: one.assign_coords(band=["a", "b"])),
-    "an unknown material": ("prior", lambda _: "unobtainium"),
-    "a prior without dims": ("prior", lambda one: one[0]),
-    "a prior that is text": ("prior", lambda one: one.astype(str)),
-    "degrees Celsius": ("surroundings", lambda _: 22.0),
-    "surroundings NaN": ("surroundings", lambda _: np.nan),
-    "surroundings infinite": ("surroundings", lambda _: np.inf),
-    "surroundings in text": ("surroundings", lambda _: "room"),
-    "surroundings over time": ("surroundings", lambda _: xr.DataArray(np.full(5, 295.0), dims="t")),
-    "labels of another shape": ("materials", lambda one: one.isel(x=slice(0, 9))),
-    "labels of another window": ("materials", lambda one: one.assign_coords(x=one["x"] + 4)),
-    "labels in float": ("materials", lambda one: one + 0.5),
-    "a result of another window": ("result", lambda one: one.assign_coords(y=one["y"] + 4)),
-    "a result of another size": ("result", lambda one: one.isel(y=slice(0, 9))),
-    "a result of other frames": ("result", lambda one: one.isel(time=slice(20, None))),
-    "a result of other bands": ("result", lambda one: one.assign_coords(band=["a", "b"])),
-    "a result of another scene": ("result", _mirrored),
-    "a result without values": ("result", lambda one: one.where(False)),
-    "a result without status": ("result", lambda one: one.drop_vars("status")),
-    "raw counts": ("corrected", lambda one: one.round().astype("uint16")),
-    "another response": ("response", lambda one: one.isel(band=[0])),
-    "no response": ("response", lambda _: None),
+_ARGUMENTS: Final[Mapping[str, Table]] = {
+    "prior": {
+        **ALL,
+        "nothing": lambda _, one: one,
+        "left out": _of(None),
+        "of 1.2": lambda _, one: one + 0.4,
+        "without dims": lambda _, one: one[0],
+        "of an unknown material": _of("unobtainium"),
+    },
+    "surroundings": {
+        "in degrees Celsius": _of(22.0),
+        "NaN": _of(np.nan),
+        "infinite": _of(np.inf),
+        "in text": _of("room"),
+        "over time": _of(xr.DataArray(np.full(5, 295.0), dims="t")),
+    },
+    "materials": {**ALL, "in float": lambda _, one: one + 0.5},
+    "result": {
+        **ALL,
+        "of other frames": cut(time=slice(20, None)),
+        "of another scene": lambda _, one: one.isel(x=TURNED).assign_coords(x=one["x"]),
+        "without values": lambda _, one: one.where(False),
+    },
+    "corrected": {**ALL, "raw": lambda _, one: one.round().astype("uint16")},
+    "response": {**ALL, "missing": _of(None)},
 }
 
 
 def completions(rng: Rng) -> Attack:
     """`complete` with one argument damaged: never a completed value that passes as measured."""
     made, given = _incomplete(int(rng.integers(1, 4)))
-    what = pick(rng, sorted(_ARGUMENTS))
-    name, change = _ARGUMENTS[what]
-    arguments = {**given, name: change(given[name])}
-    result = arguments["result"]
+    what, arguments = hurt_one(rng, _ARGUMENTS, given)
 
     def check(found: xr.Dataset) -> Verdict:
-        before, after = (one["object_temperature"].values for one in (result, found))
+        before, after = (one["object_temperature"].values for one in (arguments["result"], found))
         had, has = np.isfinite(before), np.isfinite(after)
         marked = (found["status"].values & COMPLETED) != 0
         if np.any((before != after) & had):
@@ -177,6 +149,8 @@ def completions(rng: Rng) -> Attack:
         share = off.sum() / max((marked & has).sum(), 1)
         return wrong(f"{share:.0%} of what is completed off", where=bool(share > 0.01))
 
-    names = "prior|material|label|pool|surroundings|result|counts|response|band|status|dims|'x'|'y'"
-    act, good = lambda: separation.complete(**arguments), what in ("nothing", "no prior")
+    names = "prior|material|label|pool|surroundings|result|corrected|counts|response|band|status|"
+    names += "temperature|emissivity|separated|dims|'x'|'y'"
+    good = what in ("prior nothing", "prior left out")
+    act = lambda: separation.complete(**arguments)  # noqa: E731
     return Attack(f"complete: {what}", act, check, (names,), good)

@@ -4,11 +4,9 @@ import re
 import signal
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import dbthermal
@@ -33,17 +31,22 @@ _REFUSALS: Final = (ValueError, TypeError, OSError)
 # Of the libraries, those that name what does not fit: a model's field, a coordinate.
 _ROOMS: Final = [re.escape(f"{Path(str(m.__file__)).parent}/") for m in (dbthermal, reproduction)]
 _OURS: Final = re.compile("|".join([*_ROOMS, "/pydantic/|/xarray/structure/alignment"]))
-_WORK: Final = ("right", "refused", "flagged", "silent")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of an accepted input, with its pixels without a flag and the wrong ones."""
+    """What became of an input, of `GOOD`, `BAD` or `LIMIT`, with its pixels without a flag."""
 
     kind: str
     note: str = ""
     unflagged: int = 0
-    wrong: int = 0
+    wrong: int = 0  # of the unflagged
+    what: str = ""
+
+
+def wrong(note: str, *, where: bool = True) -> Verdict:
+    """Silent, if it is so."""
+    return Verdict("silent", note, 1, 1) if where else Verdict("right")
 
 
 @dataclass(frozen=True)
@@ -62,26 +65,19 @@ class Attack:
     good: bool = False
     limit: str = ""
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of one input, of `GOOD` or `BAD`."""
-
-    kind: str
-    what: str
-    note: str = ""
-    megabytes: float = 0.0
-    unflagged: int = 0
-    wrong: int = 0
+    def missing(self, text: str) -> list[str]:
+        """Names that a text should contain, and does not."""
+        low = text.lower()
+        return [one for one in self.names if not any(n in low for n in one.lower().split("|"))]
 
 
 class Late(BaseException):
     """The input took longer than `SECONDS`."""
 
 
-def carry_out(attack: Attack) -> Outcome:
+def carry_out(attack: Attack) -> Verdict:
     """Make the attack, and judge what happens."""
-    _reset_peak()
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins here
     before = _memory("VmRSS")
     with warnings.catch_warnings(record=True) as leaked:
         warnings.simplefilter("always")
@@ -92,83 +88,54 @@ def carry_out(attack: Attack) -> Outcome:
     used = _memory("VmHWM") - before
     if verdict.kind == "silent" and attack.limit:
         verdict = Verdict(LIMIT, attack.limit)
-    if verdict.kind in _WORK and used > MEGABYTES:
+    if verdict.kind in (*GOOD, "silent") and used > MEGABYTES:
         verdict = Verdict("memory", f"{used:.0f} MB")
     if verdict.kind in GOOD and leaked:
-        verdict = _warned(leaked, attack)
-    return Outcome(verdict.kind, attack.what, verdict.note, used, verdict.unflagged, verdict.wrong)
-
-
-def _warned(leaked: list[warnings.WarningMessage], attack: Attack) -> Verdict:
-    """A warning that names the thing is a flag, any other one leaks from a library."""
-    texts = [f"{one.category.__name__}: {one.message}" for one in leaked]
-    unnamed = [text for text in texts if not attack.names or _missing(text, attack)]
-    return Verdict("warning", unnamed[0]) if unnamed else Verdict("flagged", texts[0])
-
-
-def _missing(text: str, attack: Attack) -> list[str]:
-    """Names that a text should contain, and does not."""
-    low = text.lower()
-    return [one for one in attack.names if not any(n in low for n in one.lower().split("|"))]
+        # A warning that names the thing is a flag, any other one leaks from a library.
+        texts = [f"{one.category.__name__}: {one.message}" for one in leaked]
+        unnamed = [text for text in texts if not attack.names or attack.missing(text)]
+        verdict = Verdict("warning", unnamed[0]) if unnamed else Verdict("flagged", texts[0])
+    return replace(verdict, what=attack.what)
 
 
 def _verdict(attack: Attack) -> Verdict:
+    signal.signal(signal.SIGPROF, _stop)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
-        with _within(SECONDS):
-            result = attack.act()
+        result = attack.act()
     except Late:
         return Verdict("hang", f"more than {SECONDS} s of the processor")
     except MemoryError as error:
         return Verdict("memory", str(error))
-    except Warning as error:
-        return Verdict("warning", f"{type(error).__name__}: {error} {_place(error)}")
     except Exception as error:  # noqa: BLE001 - every error is an outcome
-        return refusal(error, attack)
+        return _refusal(error, attack)
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return attack.judge(result)
 
 
-def refusal(error: Exception, attack: Attack) -> Verdict:
+def _stop(*_: object) -> None:
+    raise Late
+
+
+def _refusal(error: Exception, attack: Attack) -> Verdict:
     """Judge an error: it is of a documented kind, raised by the package, and names the thing."""
-    text = f"{type(error).__name__}: {error}"
-    other = isinstance(error, (LookupError, ArithmeticError))
-    documented = isinstance(error, _REFUSALS) and not other
+    text, frame = f"{type(error).__name__}: {error}", traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{frame.filename}:{frame.lineno}"
+    if isinstance(error, Warning):
+        return Verdict("warning", f"{text} [{place}]")
+    documented = isinstance(error, _REFUSALS)
+    documented &= not isinstance(error, (LookupError, ArithmeticError))
     # Some functions look things up by name, and say so.
     documented |= isinstance(error, KeyError) and "Must" in text
-    missing = _missing(str(error), attack)
-    where = _place(error)
-    if not documented or missing:
-        rule = f"; names none of '{missing[0]}'" if missing else ""
-        return Verdict("traceback", f"{text} {where}{rule}")
-    if not _OURS.search(where) and not (isinstance(error, OSError) and error.filename):
-        return Verdict("traceback", f"{text} {where}; not the package's own words")
-    return Verdict("rejected" if attack.good else "refused", text)
-
-
-def _place(error: BaseException) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"[{frames[-1].filename}:{frames[-1].lineno}]" if frames else "[]"
-
-
-@contextmanager
-def _within(seconds: float) -> Iterator[None]:
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise Late(number, frame)
-
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
-
-
-def _reset_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    ours = _OURS.search(place) or (isinstance(error, OSError) and error.filename)
+    missing = attack.missing(str(error))
+    if documented and ours and not missing:
+        return Verdict("rejected" if attack.good else "refused", text)
+    return Verdict("traceback", f"{text} [{place}]; names missing: {missing}")
 
 
 def _memory(name: str) -> float:
-    """Resident memory of this process, or its peak since the reset [MB]."""
-    text = Path("/proc/self/status").read_text(encoding="ascii")
-    found = re.search(rf"{name}:\s+(\d+) kB", text)
+    """Resident memory of this process, or its peak [MB]."""
+    found = re.search(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
     return int(found[1]) / 1024 if found else 0.0

@@ -5,7 +5,7 @@ pass before it, in the image formation e U(x) + (1 - e) U(y).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
@@ -47,6 +47,12 @@ def counts_of(band: str, temperature: npt.ArrayLike) -> Array:
     return np.asarray(_spline(band)(np.asarray(temperature)))
 
 
+def leaving(band: str, emissivity: npt.ArrayLike, warm: Array, cold: Array) -> Array:
+    """Counts of what leaves an object and is seen in a band."""
+    share = np.asarray(emissivity)
+    return share * counts_of(band, warm) + (1 - share) * counts_of(band, cold)
+
+
 def blackbody(bands: tuple[str, ...], temperature: Array = CALIBRATED) -> xr.DataArray:
     """Counts (band, temperature) of a blackbody."""
     return xr.DataArray(
@@ -80,17 +86,30 @@ class Scene:
         """Copy of the counts, to spoil."""
         return np.array(self.capture["counts"].values)
 
-    def with_counts(self, counts: npt.NDArray[Any]) -> "Scene":
-        """The scene with spoilt counts."""
+    def with_counts(self, counts: npt.NDArray[Any]) -> xr.Dataset:
+        """The capture with spoilt counts."""
         array = self.capture["counts"]
-        changed = self.capture.assign(counts=(array.dims, counts, array.attrs))
-        return replace(self, capture=changed)
+        return self.capture.assign(counts=(array.dims, counts, array.attrs))
 
     def put(self, place: Any, value: Any) -> xr.Dataset:
-        """The capture with a value, or what a function makes of the counts, at a place of them."""
+        """The capture with values at a place of the counts."""
         counts = self.counts()
-        counts[place] = value(counts) if callable(value) else value
-        return self.with_counts(counts).capture
+        counts[place] = value
+        return self.with_counts(counts)
+
+    def clean(self) -> Array:
+        """Counts without noise, of exposures at one moment."""
+        parts = zip(self.bands, self.emissivity, strict=True)
+        return np.stack([leaving(band, e, self.warm, self.cold) for band, e in parts])
+
+    def film(self, counts: npt.NDArray[Any], **coords: Any) -> "Scene":
+        """The scene with a capture of some counts."""
+        self.capture = xr.Dataset(
+            {"counts": (("band", "time", "y", "x"), counts.astype("f4"), {"units": "count"})},
+            {"band": list(self.bands), "time": ("time", self.time, {"units": "s"}), **coords},
+            {"origin": "simulated"},
+        )
+        return self
 
 
 def pick(rng: np.random.Generator, options: Sequence[Any]) -> Any:
@@ -152,17 +171,9 @@ def scene(
     late = _films(seed, time, grid, delay) if delay else (warm, cold)
     counts = np.empty((bands, *warm.shape))
     for place, band in enumerate(names):
-        x, y = late if place else (warm, cold)
-        share = emissivity[place]
-        counts[place] = share * counts_of(band, x) + (1 - share) * counts_of(band, y)
-        counts[place] += rng.normal(0, noise[place], x.shape)
+        counts[place] = leaving(band, emissivity[place], *(late if place else (warm, cold)))
+        counts[place] += rng.normal(0, noise[place], warm.shape)
     warm, cold = (film.reshape(-1, *shape) for film in (warm, cold))
     maps = np.broadcast_to(emissivity[:, None, None], (bands, *shape)).copy()
     made = Scene(names, time, warm, cold, maps, noise, delay)
-    values = counts.reshape(bands, -1, *shape).astype(np.float32)
-    made.capture = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), values, {"units": "count"})},
-        {"band": list(names), "time": ("time", time, {"units": "s"})},
-        {"origin": "simulated"},
-    )
-    return made
+    return made.film(counts.reshape(bands, -1, *shape))

@@ -1,25 +1,22 @@
 """Hostile arrays into the steps beside the separation: clocks, corrections, calibration."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import gaussian_filter
 
-from attack.oracle import Attack, Verdict
-from attack.scenes import SLOPE, Array, Scene, blackbody, clock, counts_of, scene
+from attack.arrays import gap
+from attack.damage import ALL, TURNED, Rng, Table, band_spoilt, cut, hurt, hurt_one
+from attack.oracle import Attack, Verdict, wrong
+from attack.scenes import SLOPE, Array, Scene, blackbody, clock, counts_of, pick, scene
 from dbthermal import alignment, calibration, correction
 from dbthermal import response as responses
 
-Rng = np.random.Generator
-RIGHT: Final = Verdict("right")
 _CLOCK: Final = ("offset|time|frame|pixel|gap|clock|band",)
-
-
-def wrong(note: str, *, where: bool = True) -> Verdict:
-    """Silent, if it is so."""
-    return Verdict("silent", note, 1, 1) if where else RIGHT
 
 
 def offset(rng: Rng) -> Attack:
@@ -44,7 +41,13 @@ def align(rng: Rng) -> Attack:
     def judge(result: xr.Dataset) -> Verdict:
         if abs(result.attrs["time_offset"][1] - expected) > 0.025:
             return wrong(f"offset {result.attrs['time_offset'][1]:.3f} s, truly {expected:.3f} s")
-        return _compare(result, made)
+        # Both bands on the second one's clock must show the scene of one moment.
+        truth = xr.DataArray(made.clean(), {"time": made.time}, ("band", "time", "y", "x"))
+        apart = abs(result["counts"].values - truth.interp(time=result["time"].values).values)
+        error = [np.quantile(np.append(one[np.isfinite(one)], 0.0), 0.99) for one in apart]
+        # The line between two frames misses a moving body's edge by up to a kelvin.
+        excess = error > 5 * made.noise + 1.5 * SLOPE
+        return wrong(f"counts off by {error}, noise {made.noise}", where=bool(excess.any()))
 
     more: dict[str, Any] = {"offset": expected, "clock": "9.5"} if given else {}
     what = f"align {delay:.1f} frames, {sorted(more)}: {what}"
@@ -54,102 +57,60 @@ def align(rng: Rng) -> Attack:
 def _cameras(rng: Rng, delay: float, frames: int) -> tuple[str, Scene, xr.Dataset, float]:
     """Loss, scene whose second camera exposes later, its capture with the loss, frames to find."""
     made = scene(rng, shape=(8, 12), time=clock(frames), ratio=3.0, delay=delay / 10)
-    what = str(rng.choice(list(_LOSSES)))
-    return what, made, _LOSSES[what](rng, made), 0.0 if what == "stamps of that delay" else delay
+    what, spoilt = hurt(rng, _LOSSES, made)
+    return what, made, spoilt, 0.0 if what == "stamps of that delay" else delay
 
 
-def _compare(result: xr.Dataset, made: Scene) -> Verdict:
-    """Both bands on the second one's clock must show the scene of one moment."""
-    counts, times = result["counts"].values, result["time"].values
-    inside = (times >= made.time[0]) & (times <= made.time[-1])
-    error = np.full(len(made.bands), 0.0)
-    for place, band in enumerate(made.bands):
-        share = made.emissivity[place]
-        truth = share * counts_of(band, made.warm) + (1 - share) * counts_of(band, made.cold)
-        at = np.stack([np.interp(times, made.time, one) for one in truth.reshape(len(truth), -1).T])
-        difference = counts[place].reshape(times.size, -1)[inside] - at.T[inside]
-        finite = np.abs(difference[np.isfinite(difference)])
-        error[place] = np.quantile(finite, 0.99) if finite.size else 0.0
-    # The line between two frames misses a moving body's edge by up to a kelvin.
-    excess = error > 5 * made.noise + 1.5 * SLOPE
-    return wrong(f"counts off by {error}, noise {made.noise}", where=bool(excess.any()))
-
-
-def _block(rng: Rng, made: Scene) -> xr.Dataset:
-    length = made.time.size
-    first, lost = int(rng.integers(5, length // 2)), int(rng.choice([10, 30, length // 3]))
-    return made.put((int(rng.integers(2)), slice(first, first + lost)), np.nan)
-
-
-def _copied(rng: Rng, made: Scene) -> xr.Dataset:
-    first, lost = int(rng.integers(5, made.time.size // 2)), int(rng.choice([5, 20, 40]))
-    return made.put((1, slice(first, first + lost)), lambda counts: counts[1, first - 1])
-
-
-def _stamped(capture: xr.Dataset, made: Scene, second: Array) -> xr.Dataset:
+def _stamped(made: Scene, second: Array) -> xr.Dataset:
     stamps = (("band", "time"), np.stack([made.time, second]), {"units": "s"})
-    return capture.assign(exposure_time=stamps)
+    return made.capture.assign(exposure_time=stamps)
 
 
-def _half(rng: Rng, made: Scene) -> xr.Dataset:
-    """One camera begins late or ends early, with stamps that say so."""
-    end = int(rng.integers(40, made.time.size))
-    second = np.where(np.arange(made.time.size) < end, made.time, np.nan)
-    return _stamped(made.put((1, slice(end, None)), np.nan), made, second)
-
-
-def _jump(rng: Rng, made: Scene) -> xr.Dataset:
-    """One camera loses frames with neither copy nor NaN, starts anew an hour later, or earlier."""
-    frames = made.time.size
-    place, lost = int(rng.integers(40, frames - 40)), int(rng.choice([5, 20]))
+def _lost(rng: Rng, made: Scene, shift: int) -> xr.Dataset:
+    """One camera's frames from a moment on come so much earlier, NaN behind, with their stamps."""
     second, counts = made.time.copy(), made.counts()
-    later = float(rng.choice([0, -30, 3600]))
-    if later:
-        return _stamped(made.capture, made, second + later * (np.arange(frames) >= place))
+    place = int(rng.integers(40, second.size - 40))
     for values in (second, counts[1]):
-        values[place : frames - lost] = values[place + lost :]
-        values[frames - lost :] = np.nan
-    return _stamped(made.with_counts(counts).capture, made, second)
+        values[place:] = np.roll(values[place:], -shift, axis=0)
+        values[max(place, len(values) - shift) :] = np.nan
+    made.capture = made.with_counts(counts)
+    return _stamped(made, second)
 
 
 def _pause(rng: Rng, made: Scene) -> xr.Dataset:
     """Both pause for an hour or a day; the scene waits."""
-    place = int(rng.integers(30, made.time.size - 30))
-    length = float(rng.choice([600, 3600, 86400]))
-    made.time = made.time + length * (np.arange(made.time.size) >= place)
+    made.time = gap(rng, made.time, 600, 3600, 86400)
     return made.capture.assign_coords(time=("time", made.time, {"units": "s"}))
 
 
 def _foreign(rng: Rng, made: Scene) -> xr.Dataset:
     lost = rng.random(made.time.size) < 0.99
-    return _stamped(made.capture, made, np.where(lost, rng.choice([np.nan, np.inf]), made.time))
+    return _stamped(made, np.where(lost, pick(rng, [np.nan, np.inf]), made.time))
 
 
-_LOSSES: Final[Mapping[str, Callable[[Rng, Scene], xr.Dataset]]] = {
+_LOSSES: Final[Table] = {
     "nothing lost": lambda _, made: made.capture,
-    "a block NaN": _block,
-    "a block of copies": _copied,
-    "one camera ends early": _half,
-    "a clock jumps": _jump,
+    "a block NaN": partial(band_spoilt, what="block NaN"),
+    "a block of copies": partial(band_spoilt, what="block held"),
+    "scattered NaN": partial(band_spoilt, what="scattered NaN"),
+    "one band still": partial(band_spoilt, what="everywhere held"),
+    "one camera ends early": lambda rng, made: _lost(rng, made, made.time.size),
+    "frames lost": lambda rng, made: _lost(rng, made, pick(rng, [5, 20])),
+    "a clock jumps": lambda rng, made: _stamped(made, gap(rng, made.time, -30, 3600)),
     "both pause": _pause,
     "stamps damaged": _foreign,
-    "scattered NaN": lambda rng, made: made.put(rng.random(made.counts().shape) < 0.1, np.nan),
-    "one band still": lambda _, made: made.put(1, lambda counts: counts[1].mean(axis=0)),
-    "stamps of that delay": lambda _, m: _stamped(m.capture, m, m.time + m.delay),
+    "stamps of that delay": lambda _, m: _stamped(m, m.time + m.delay),
 }
 
 
 def register(rng: Rng) -> Attack:
-    """`register` of small, NaN, flat and unlike views, and foreign transforms into `align`."""
-    rows, columns = (int(rng.choice([8, 24, 40, 48])) for _ in range(2))
-    x, y = np.meshgrid(np.arange(columns + 8), np.arange(rows + 8))
-    texture = np.zeros(x.shape)
-    for _ in range(12):
-        texture += rng.normal() * np.sin(x * rng.uniform(0.05, 0.5) + y * rng.uniform(0.05, 0.5))
+    """`register` of small, NaN, flat and unlike views."""
+    rows, columns = rng.choice([8, 24, 40, 48], 2)
+    texture = 8 * gaussian_filter(rng.normal(size=(rows + 8, columns + 8)), 2.5)
     shift = rng.integers(0, 3, 2)
     moved = texture[4 - shift[0] :, 4 - shift[1] :][:rows, :columns]
     views = np.stack([texture[4:-4, 4:-4], moved])
-    what = str(rng.choice(["good", "NaN", "infinite", "flat", "unlike", "huge"]))
+    what = pick(rng, ["good", "NaN", "infinite", "flat", "unlike", "huge"])
     if what in ("NaN", "infinite"):
         views[1, rng.integers(rows), rng.integers(columns)] = np.nan if what == "NaN" else np.inf
     if what in ("flat", "unlike"):
@@ -176,76 +137,63 @@ def correct_capture(rng: Rng) -> Attack:
     parts = {"gain": gain, "offset": 0 * gain, "bad": np.zeros(gain.shape, bool)}
     maps = {n: (("band", "y", "x"), p) for n, p in parts.items()}
     fit = xr.Dataset(maps, {"band": list(made.bands)})
-    what = str(rng.choice(list(_CORRECTIONS)))
-    capture, fit = _CORRECTIONS[what](rng, made.with_counts(raw), fit)
+    recorded = replace(made, capture=made.with_counts(raw))
+    what, given = hurt_one(rng, _CORRECTIONS, {"capture": recorded, "correction": fit})
+    if isinstance(given["capture"], Scene):
+        given["capture"] = recorded.capture
 
     def judge(result: xr.Dataset) -> Verdict:
-        good = (result["status"].values == 0)[None, None] & np.isfinite(result["counts"].values)
-        error = np.abs(np.where(good, result["counts"].values - made.counts(), 0))
-        off = error > made.noise[:, None, None, None] + 2
-        note = f"{off.sum()} samples off by up to {error.max():.0f} counts"
+        good = (result["status"] == 0) & np.isfinite(result["counts"])
+        truth = made.capture["counts"].sel(band=result["band"])
+        noise = xr.DataArray(made.noise, {"band": list(made.bands)}, "band")
+        error = abs(result["counts"] - truth.values).where(good, 0)
+        off = (error > noise.sel(band=result["band"]) + 2).values
+        note = f"{off.sum()} samples off by up to {float(error.max()):.0f} counts"
         return wrong(note, where=bool(off.mean() > 1e-3))
 
     names = ("counts|gain|offset|bad|band|correction|capture|pixel|time|flag|shutter|frame",)
-    act = lambda: correction.correct_capture(capture, fit)  # noqa: E731
-    return Attack(f"correct_capture: {what}", act, judge, names, what in ("nothing", "more bands"))
+    act = lambda: correction.correct_capture(**given)  # noqa: E731
+    good = what in ("capture nothing", "correction more bands")
+    return Attack(f"correct_capture: {what}", act, judge, names, good)
 
 
-Pair = tuple[xr.Dataset, xr.Dataset]
+def _value(rng: Rng, fit: xr.Dataset, value: float) -> xr.Dataset:
+    """Another gain or offset of one pixel."""
+    fit = fit.copy(deep=True)
+    fit[pick(rng, ["gain", "offset"])][int(rng.integers(2)), 2, 3] = value
+    return fit
 
 
-def _raw(rng: Rng, made: Scene, fit: xr.Dataset, *, spoil: str) -> Pair:
-    """Counts of one band spoilt."""
-    first, end, band = (int(rng.integers(*ends)) for ends in ((10, 60), (62, 90), (0, 2)))
-    if spoil == "saturated":
-        return made.put((band, rng.random(made.counts()[band].shape) < 0.2), 65535), fit
-    if spoil == "stuck":
-        return made.put((band, slice(None), 3, 4), 65535), fit
-    value = 0 if spoil == "zero" else lambda counts: counts[band, first]
-    return made.put((band, slice(first, end)), value), fit
-
-
-def _map_with(rng: Rng, made: Scene, fit: xr.Dataset, *, value: float) -> Pair:
-    name = str(rng.choice(["gain", "offset"]))
-    values = fit[name].values.copy()
-    values[int(rng.integers(2)), 2, 3] = value
-    return made.capture, fit.assign({name: (fit[name].dims, values)})
-
-
-def _flagged(rng: Rng, made: Scene, fit: xr.Dataset) -> Pair:
+def _flagged(rng: Rng, made: Scene) -> xr.Dataset:
     flags = rng.integers(0, 2, (2, made.time.size)).astype(np.uint16)
     attrs: dict[str, Any] = {"flag_masks": np.array([1], np.uint16), "flag_meanings": "other"}
-    return made.capture.assign(frame_flags=(("band", "time"), flags, attrs)), fit
+    return made.capture.assign(frame_flags=(("band", "time"), flags, attrs))
 
 
-def _wider(_: Rng, made: Scene, fit: xr.Dataset) -> Pair:
-    other = fit.isel(band=[0]).assign_coords(band=["c"])
-    return made.capture, xr.concat([fit, other], "band")
+def _wider(_: Rng, fit: xr.Dataset) -> xr.Dataset:
+    return xr.concat([fit, fit.isel(band=[0]).assign_coords(band=["c"])], "band")
 
 
-def _elsewhere(_: Rng, made: Scene, fit: xr.Dataset) -> Pair:
-    columns = np.arange(16.0)
-    return made.capture.assign_coords(x=columns), fit.assign_coords(x=columns + 5)
+def _of_capture(damage: Callable[[Rng, Any], Any]) -> Callable[[Rng, Scene], Any]:
+    return lambda rng, made: damage(rng, made.capture)
 
 
-_CORRECTIONS: Final[Mapping[str, Callable[[Rng, Scene, xr.Dataset], Pair]]] = {
-    "nothing": lambda _, made, fit: (made.capture, fit),
-    "saturated": partial(_raw, spoil="saturated"),
-    "frozen": partial(_raw, spoil="frozen"),
-    "a stuck pixel": partial(_raw, spoil="stuck"),
-    "frames of zeros": partial(_raw, spoil="zero"),
-    "gain NaN": partial(_map_with, value=np.nan),
-    "gain infinite": partial(_map_with, value=np.inf),
-    "of another size": lambda _, made, fit: (made.capture, fit.isel(x=slice(0, 9))),
-    "of other bands": lambda _, made, fit: (made.capture, fit.assign_coords(band=["a", "b"])),
-    "bands turned round": lambda _, made, fit: (made.capture, fit.isel(band=[1, 0])),
-    "more bands": _wider,
-    "of another window": _elsewhere,
-    "counts in float": lambda _, made, fit: (made.capture.astype(float), fit),
-    "no counts": lambda _, made, fit: (made.capture.drop_vars("counts"), fit),
-    "no bad": lambda _, made, fit: (made.capture, fit.drop_vars("bad")),
-    "strange flags": _flagged,
-    "few frames": lambda rng, m, fit: (m.capture.isel(time=slice(0, int(rng.integers(0, 3)))), fit),
+_RAW: Final = ("scattered full", "pixels full", "block held", "block zero", "everywhere held")
+_CORRECTIONS: Final[Mapping[str, Table]] = {
+    "capture": {
+        "nothing": lambda _, made: made.capture,
+        **{what: partial(band_spoilt, what=what) for what in _RAW},
+        **{name: _of_capture(damage) for name, damage in ALL.items()},
+        "counts in float": lambda _, made: made.capture.astype(float),
+        "strange flags": _flagged,
+        "few frames": lambda rng, made: made.capture.isel(time=slice(0, int(rng.integers(0, 3)))),
+    },
+    "correction": {
+        **ALL,
+        "gain NaN": partial(_value, value=np.nan),
+        "gain infinite": partial(_value, value=np.inf),
+        "more bands": _wider,
+    },
 }
 
 
@@ -256,13 +204,12 @@ def fit_response(rng: Rng) -> Attack:
     counts = blackbody(bands, temperature)
     counts = counts + xr.DataArray(rng.normal(0, noise / 10, counts.shape), dims=counts.dims)
     counts.attrs["units"] = "count"
-    what = str(rng.choice(list(_FITS)))
-    spoilt = _FITS[what](rng, counts)
+    what, spoilt = hurt(rng, _FITS, counts)
     given = xr.DataArray([noise, noise], dims="band", coords={"band": list(bands)})
 
     def judge(fitted: xr.Dataset) -> Verdict:
         off = 0.0
-        for band in bands:
+        for band in {*bands} & {*fitted["band"].values.tolist()}:
             found = responses.curve(fitted, band).inverse(counts_of(band, temperature))
             off = max(off, float(np.max(np.abs(np.nan_to_num(found - temperature, nan=99)))))
         return wrong(f"{off:.2f} K off", where=off > 0.1 + 5 * noise / SLOPE / 10)
@@ -273,43 +220,41 @@ def fit_response(rng: Rng) -> Attack:
     return Attack(f"fit_response: {what}, {sorted(more)}", act, judge, names, what == "good")
 
 
-def _bent(rng: Rng, counts: xr.DataArray, spoil: str) -> xr.DataArray:
+def _bent(rng: Rng, counts: xr.DataArray, bend: Callable[[Rng, Array, float], Any]) -> xr.DataArray:
     """Sweep of one band that follows no blackbody."""
-    values = counts.values.copy()
-    number, part = values.shape[1], values[int(rng.integers(2))]
-    place, span = int(rng.integers(number)), np.ptp(part)
-    if spoil == "saturates":
-        knee = np.quantile(part, 0.7)
-        part[:] = np.where(part > knee, knee + (part - knee) * 0.05, part)
-    elif spoil == "outlier":
-        part[place] += rng.choice([-1, 1]) * rng.uniform(0.02, 0.05) * span
-    elif spoil == "swapped":
-        part[[place, (place + 1) % number]] = part[[(place + 1) % number, place]]
-    elif spoil == "no curve":
-        part[:] = part[0] + span * ((part - part[0]) / span) ** float(rng.choice([0.5, 3, 6]))
-    elif spoil == "wave":
-        part += 0.02 * span * np.sin(np.arange(number) * 2)
+    values, band = counts.values.copy(), int(rng.integers(2))
+    values[band] = bend(rng, values[band], float(np.ptp(values[band])))
     return counts.copy(data=values)
 
 
-def _celsius(_: Rng, counts: xr.DataArray, zero: float = 0.0) -> xr.DataArray:
-    kelvin = counts["temperature"].values
-    attrs = {} if zero else {"units": "degC"}
-    return counts.assign_coords(temperature=("temperature", kelvin - zero, attrs))
+def _swapped(rng: Rng, part: Array, _: float) -> Array:
+    number = np.arange(part.size)
+    order = np.argsort(number + 1.5 * (number == rng.integers(part.size - 1)))
+    return np.asarray(part[order])
 
 
-_BENT: Final = ("saturates", "outlier", "swapped", "no curve", "wave")
-_FITS: Final[Mapping[str, Callable[[Rng, xr.DataArray], Any]]] = {
+def _outlier(rng: Rng, part: Array, span: float) -> Array:
+    size = pick(rng, [-1, 1]) * rng.uniform(0.02, 0.05) * span
+    return np.asarray(part + size * (np.arange(part.size) == rng.integers(part.size)))
+
+
+_BENT: Final[dict[str, Callable[[Rng, Array, float], Any]]] = {
+    "saturates": lambda _, part, __: part - 0.95 * np.maximum(part - np.quantile(part, 0.7), 0),
+    "outlier": _outlier,
+    "swapped": _swapped,
+    "no curve": lambda rng, p, span: p[0] + span * ((p - p[0]) / span) ** pick(rng, [0.5, 3, 6]),
+    "wave": lambda _, part, span: part + 0.02 * span * np.sin(np.arange(part.size) * 2),
+}
+_FITS: Final[Table] = {
+    **ALL,
     "good": lambda _, one: one,
-    **{name: partial(_bent, spoil=name) for name in _BENT},
-    "in degrees Celsius": partial(_celsius, zero=273.15),
-    "kelvin off by one degree Celsius": _celsius,
-    "a value NaN": lambda rng, one: one.where(rng.random(one.shape) > 0.1),
-    "falling": lambda _, one: one.isel(temperature=slice(None, None, -1)),
-    "three temperatures": lambda _, one: one.isel(temperature=slice(0, 3)),
-    "a temperature twice": lambda _, one: one.isel(temperature=[0, 1, 1, 2, 3, 4]),
-    "text": lambda _, one: one.astype(str),
-    "transposed": lambda _, one: one.transpose(),
-    "no array": lambda _, one: one.values,
-    "another unit": lambda _, one: one.assign_attrs(units="W"),
+    **{name: partial(_bent, bend=bend) for name, bend in _BENT.items()},
+    "in degrees Celsius": lambda _, one: one.assign_coords(temperature=one["temperature"] - 273.15),
+    "said to be Celsius": lambda _, one: one.assign_coords(
+        temperature=one["temperature"].assign_attrs(units="degC")
+    ),
+    "some NaN": lambda rng, one: one.where(rng.random(one.shape) > 0.1),
+    "falling": cut(temperature=TURNED),
+    "three temperatures": cut(temperature=slice(0, 3)),
+    "a temperature twice": cut(temperature=[0, 1, 1, 2, 3, 4]),
 }

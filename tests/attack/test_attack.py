@@ -12,7 +12,7 @@ from hostile_files import seed_of_week
 
 from attack import oracle
 from attack.oracle import Attack, Verdict, carry_out
-from attack.runner import CLASSES, Worker, attack_all, table
+from attack.runner import CLASSES, Worker, attack_all, bad, table
 
 SHORT, WEEKLY, LONG = 200, 1500, 6000
 """Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
@@ -23,7 +23,7 @@ def worker() -> Iterator[Worker]:
     """A process for the attacks."""
     made = Worker()
     yield made
-    made.close()
+    made.pool.shutdown()
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -31,8 +31,7 @@ def test_short_attack(worker: Worker, name: str) -> None:
     """No input of a class ends badly."""
     total = sum(share for _, share in CLASSES.values())
     number = 2 if name == "kills" else max(3, SHORT * CLASSES[name][1] // total)
-    outcomes = {seed: worker.run(name, seed) for seed in range(1, number + 1)}
-    assert not {seed: one for seed, one in outcomes.items() if one.kind in oracle.BAD}
+    assert not bad(name, 1, [worker.run(name, seed) for seed in range(1, number + 1)])
 
 
 @pytest.mark.parametrize(
@@ -49,11 +48,10 @@ def test_many_attacks(number: int, seed: int) -> None:
     pixels is not surely above it: wrong pixels come by inputs, so the sum of their squares is the
     variance of their number.
     """
-    tallies = dict(attack_all(list(CLASSES), number, seed))
-    print(f"DBTHERMAL_SEED={seed_of_week()}, first seed {seed}", *table(tallies), sep="\n")
-    for tally in tallies.values():
-        print(*tally.bad_lines(), sep="\n")
-    outcomes = [one for tally in tallies.values() for one in tally.outcomes.values()]
+    found = dict(attack_all(list(CLASSES), number, seed))
+    print(f"DBTHERMAL_SEED={seed_of_week()}, first seed {seed}", *table(found), sep="\n")
+    print(*(line for name, some in found.items() for line in bad(name, seed, some)), sep="\n")
+    outcomes = [one for some in found.values() for one in some]
     assert sum(one.kind in oracle.BAD for one in outcomes) <= 0.01 * len(outcomes)
     assert sum(one.kind == "silent" for one in outcomes) <= 0.005 * len(outcomes)
     judged = [one for one in outcomes if one.unflagged > 1]  # pixels; of others, one is the whole
@@ -66,29 +64,22 @@ def test_many_attacks(number: int, seed: int) -> None:
     assert whole <= 0.001 * len(outcomes)
 
 
-def _raise(error: Exception) -> Callable[[], Any]:
-    def act() -> None:
-        raise error
-
-    return act
-
-
-def _warn() -> None:
-    warnings.warn("a library's own", UserWarning, stacklevel=1)
+def _raise(error: Exception) -> None:
+    raise error
 
 
 @pytest.mark.parametrize(
     ("act", "kind"),
     [
         (lambda: None, "right"),
-        (_raise(KeyError("counts")), "traceback"),
-        (_raise(IndexError("counts")), "traceback"),
-        (_raise(ValueError("Invalid time. Must rise.")), "traceback"),
-        (_raise(ValueError("Invalid counts.")), "traceback"),  # not raised by the package
-        (_raise(FileNotFoundError(2, "none", "counts.zarr")), "refused"),
-        (_raise(MemoryError("counts")), "memory"),
-        (_raise(RuntimeWarning("counts")), "warning"),
-        (_warn, "warning"),
+        (partial(_raise, KeyError("counts")), "traceback"),
+        (partial(_raise, IndexError("counts")), "traceback"),
+        (partial(_raise, ValueError("Invalid time. Must rise.")), "traceback"),
+        (partial(_raise, ValueError("Invalid counts.")), "traceback"),  # not raised by the package
+        (partial(_raise, FileNotFoundError(2, "none", "counts.zarr")), "refused"),
+        (partial(_raise, MemoryError("counts")), "memory"),
+        (partial(_raise, RuntimeWarning("counts")), "warning"),
+        (partial(warnings.warn, "a library's own"), "warning"),
         (lambda: bytearray(b"1") * 10**9, "memory"),
     ],
 )
@@ -100,7 +91,7 @@ def test_oracle(act: Callable[[], Any], kind: str) -> None:
 
 def test_dead_process_is_told(worker: Worker) -> None:
     """A process that an attack kills is told as a crash, and made anew."""
-    os.kill(worker.process.pid or 0, 9)
+    os.kill(worker.pool.submit(os.getpid).result(), 9)
     assert worker.run("bits", 1).kind == "crash"
     assert worker.run("bits", 1).kind != "crash"
 
@@ -108,11 +99,6 @@ def test_dead_process_is_told(worker: Worker) -> None:
 def test_time_of_the_processor_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """What works without end is a hang; what waits for a while, as on a busy machine, is not."""
     monkeypatch.setattr(oracle, "SECONDS", 0.1)
-
-    def endless() -> None:
-        while True:
-            pass
-
-    assert carry_out(Attack("", endless, lambda _: Verdict("right"))).kind == "hang"
-    wait = partial(time.sleep, 0.3)
-    assert carry_out(Attack("", wait, lambda _: Verdict("right"))).kind == "right"
+    works, waits = (lambda: [one for one in iter(int, 1) if one]), partial(time.sleep, 0.3)
+    for act, kind in ((works, "hang"), (waits, "right")):
+        assert carry_out(Attack("", act, lambda _: Verdict("right"))).kind == kind

@@ -19,9 +19,9 @@ from dbthermal.instruments.recording import Limits, Preview, open_capture
 
 LIMITS, LIMIT = Limits(chunk=30, reserve=0, queue=3), 600.0
 SWEEP = from_yaml(
-    replaced(("[300.0, 290.0, 310.0]", "[300.0]"), ("duration: 0.15", "duration: 0.6"))
+    replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.6"))
 )
-SCENE = from_yaml(replaced(("duration: 0.15", "duration: 0.9"), text=scene_text()))
+SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text()))
 
 
 def recorded(folder: Path) -> dict[str, str]:
@@ -58,34 +58,45 @@ def spin() -> None:
 
 
 @contextmanager
-def busy_core() -> Iterator[None]:
-    """Run on one core, where the system can tell a process so, which other processes keep busy."""
-    if not hasattr(os, "sched_setaffinity"):
-        pytest.skip("the system does not bind a process to a core")
-    before, context = os.sched_getaffinity(0), multiprocessing.get_context("spawn")
-    os.sched_setaffinity(0, {min(before)})
-    busy = [context.Process(target=spin, daemon=True) for _ in range(2)]
+def load(processes: int) -> Iterator[None]:
+    """Keep the computer busy with some processes."""
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=spin, daemon=True) for _ in range(processes)]
+    for process in busy:
+        process.start()
     try:
-        for process in busy:
-            process.start()
         yield
     finally:
-        os.sched_setaffinity(0, before)
         for process in busy:
             process.kill()
             process.join()
 
 
+@contextmanager
+def single_core() -> Iterator[None]:
+    """Run on one core, where the system can tell a process so."""
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("the system does not bind a process to a core")
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
 def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Path) -> None:
-    """Every file of a sweep and of a scene is the same, at rest and on one core under load."""
+    """Every file of a sweep and of a scene is the same, at rest, under load and on one core."""
     first = recorded(tmp_path / "rest")
     assert len(first) > 100
-    with busy_core():
+    with load(2):
         assert recorded(tmp_path / "load") == first
+    with single_core():
+        assert recorded(tmp_path / "core") == first
     capture = open_capture(tmp_path / "load" / "scene.zarr")
     assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
     totals = capture.attrs["totals"]
-    assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 90, "9.5": 91}
+    assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}
     assert all(total["refused"] == total["lost"] == 0 for total in totals.values())
 
 

@@ -75,6 +75,24 @@ def test_firmware_download_is_waited_for(rig: LoggerBench) -> None:
         rig.driver.open()
 
 
+# What the vendor's header says of each error number, in a word.
+MEANINGS = (
+    *("no error", "operating system", "no channels", "argument", "version", "mode", "enumerated"),
+    *("respond", "firmware", "EEPROM", "not found", "threading", "pipes", "calibration", "picopp"),
+    *("function of Pico's driver", "communication"),
+)
+
+
+def test_each_error_is_explained(rig: LoggerBench) -> None:
+    """Each of the 16 error numbers is an exception with its published meaning."""
+    rig.ready()
+    assert len(tc08.ERRORS) == len(MEANINGS) == 17
+    for code in range(1, 17):
+        rig.unit.faults.errors["usb_tc08_get_single"] = code
+        with pytest.raises(TC08Error, match=f"single reading: error {code}, .*{MEANINGS[code]}"):
+            rig.driver.single()
+
+
 @pytest.mark.parametrize("function", ["open_unit_async", "open_unit_progress", "set_channel"])
 def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -> None:
     """A step that fails is an error, and leaves no channel half set."""

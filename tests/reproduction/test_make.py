@@ -82,12 +82,21 @@ def make(*goals: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def started() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """Starter of a make in a process group of its own, which is killed at the end."""
+    """Starter of a make in a process group of its own, which is killed at the end.
+
+    The signals of a keyboard and of a terminal reach it where the tests themselves, in the
+    background of a shell, ignore them.
+    """
     processes: list[subprocess.Popen[bytes]] = []
 
+    def heard() -> None:
+        for number in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+
     def start(*goals: str) -> subprocess.Popen[bytes]:
-        processes.append(subprocess.Popen(["make", *goals], start_new_session=True))
-        return processes[-1]
+        process = subprocess.Popen(["make", *goals], start_new_session=True, preexec_fn=heard)  # noqa: PLW1509
+        processes.append(process)
+        return process
 
     yield start
     for process in processes:

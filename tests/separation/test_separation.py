@@ -85,7 +85,8 @@ def test_error_bars_are_true(pair: tuple[float, float], amplitude: float) -> Non
         if name in (OBJECT, "reflection_ratio"):
             assert wide == pytest.approx(1.0, abs=0.2)
         else:
-            assert 0.2 < wide < 1.2
+            least = 0.35 if name == "emissivity" and amplitude == 3.0 else 0.2
+            assert least < wide < 1.2
         if name != "background_temperature":
             assert abs(bias) < 0.2
 

@@ -18,7 +18,7 @@ from reproduction.experiments.stress import INTERVAL
 TREATMENTS: Final = ("as recorded", "undone", "without")
 """A capture with the nuisance as it is; with the nuisance undone; and one that never had it."""
 
-VIEWS: Final = ("registered", "shift known", "one view")
+VIEWS: Final = ("registered", "registered by the truth", "one view")
 """Two views registered from the capture; by their true shift; and both bands from one place."""
 
 NUISANCES: Final = ("lost frames", "shutter", "lost frames and shutter")
