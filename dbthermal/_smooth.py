@@ -7,7 +7,7 @@ then has polynomials in pieces of the time.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,10 @@ CHANGE_POINT: Final = 3.0
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
+# Functions that hold most of what changes, and pixels of which they are made: people who walk by
+# for 35 s have 97 % of the energy of their reflections in 32 of 350.
+_LEADING: Final = 32
+_TOLD_BY: Final = 600
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,12 @@ class Subspace:
         """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
         columns = namespace(order).arange(self.functions.shape[1], device=order.device)
         return columns[:, np.newaxis] < order + self.steps
+
+
+def leading(samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
+    some = samples[:: max(1, len(samples) // _TOLD_BY)]
+    return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:_LEADING].T)
 
 
 def subspace(

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._products import BORDER, ROWS, Movie, products
@@ -26,10 +27,6 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
-# Functions of time that are matched, and pixels from which they are made: people who walk by for
-# 35 s have 97 % of the energy of their reflections in 32 of 350.
-_PLANES: Final = 32
-_TOLD_BY: Final = 600
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
@@ -132,12 +129,6 @@ def _whole_pixels(
     return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
-def leading(samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Orthonormal functions of time (time, plane) that hold most of samples (pixel, time)."""
-    some = samples[:: max(1, len(samples) // _TOLD_BY)]
-    return np.linalg.svd(some, full_matrices=False)[2][:_PLANES].T
-
-
 def inside(places: Array, valid: Mask) -> Mask:
     """Places (2, ...) that lie on valid pixels of an image."""
     near = np.rint(places)
@@ -209,7 +200,7 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
         part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
         for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
     )
-    functions = leading(first.reshape(-1, first.shape[2]))
+    functions = smooth.leading(first.reshape(-1, first.shape[2]))
     first, *others = (part @ functions for part in (first, *others))
     freedom = movies.freedom * functions.shape[1] / functions.shape[0]
     rough, share = _whole_pixels(first, others, freedom, reach)

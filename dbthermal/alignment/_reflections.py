@@ -12,6 +12,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from threadpoolctl import threadpool_limits
 
+from dbthermal import _smooth as smooth
 from dbthermal import noise as noises
 from dbthermal import response as responses
 from dbthermal import schema
@@ -235,7 +236,7 @@ class _Capture:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
         rapid = _rapid(signals.reshape(-1, signals.shape[-1]), smoothing)
-        return _rapid(matching.leading(rapid).T, smoothing).T
+        return _rapid(smooth.leading(rapid).T, smoothing).T
 
     def planes(self, functions: Array) -> list[Movie]:
         """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""

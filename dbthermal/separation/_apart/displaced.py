@@ -9,15 +9,15 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import correlate1d, distance_transform_edt, map_coordinates
-from scipy.sparse import csr_array, diags_array, kron
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.sparse import csr_array
 
 from dbthermal import _samples as samples
 from dbthermal import schema
@@ -42,8 +42,6 @@ _FEW: Final = 0.5
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some twenty times [byte].
 _KEPT: Final = 2**30
-# Deviations of the blur beyond which it has no weight.
-TAIL: Final = 3.0
 
 
 T = TypeVar("T")
@@ -61,7 +59,6 @@ class Displacement:
     resample: csr_array  # weights at p of the pixels around, p + d(p) = r (r, pixel); 0 without p
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
-    blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
     read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
     shelf: Shelf | None = field(default_factory=shelf)  # of captures whose films are on disk
@@ -77,17 +74,16 @@ class Displacement:
     def source(self, rows: slice) -> slice:
         """Rows of the image that hold some rows, and what the second camera shows of them."""
         width = self.shape[1]
-        rows = self.around(rows)
         first, last = self.resample.indptr[[rows.start * width, rows.stop * width]]
         used = self.resample.indices[first:last] // width
         if used.size == 0:
             return rows
         return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
 
-    def around(self, rows: slice) -> slice:
-        """Rows of which some rows are made by the blur."""
-        reach = int(np.ceil(TAIL * self.blur))
-        return slice(max(rows.start - reach, 0), min(rows.stop + reach, self.shape[0]))
+    @property
+    def moves(self) -> bool:
+        """Some reflection is seen at another place."""
+        return bool(self.resample.nnz > self.resample.shape[0])
 
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the pixels of some rows of the source, for those of some rows."""
@@ -211,7 +207,7 @@ def paired(
     The source is read if they are not kept; all pixels are kept of a small capture alone, and some
     pixels of any capture whose films are on disk.
     """
-    films, key = displacement.read, (rows.start, rows.stop, displacement.blur)
+    films, key = displacement.read, (rows.start, rows.stop)
     every, chosen = (*key, None), (*key, None if isinstance(some, slice) else some.tobytes())
     if chosen in displacement.shelved:
         counts, usable, valid, status, gain = (get() for get in displacement.shelved[chosen])
@@ -252,10 +248,6 @@ def read(
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
     `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
-    if displacement.blur > 0.0:
-        more, sharp = displacement.around(rows), replace(displacement, blur=0.0)
-        sharp_rows = read(block, sharp, more, source, fewest, grains)
-        return _blurred(displacement, rows, block["time"].values.astype(np.float64), *sharp_rows)
     reference, others = displacement.reference, displacement.others
     own = displacement.source(rows)
     first = block.isel(
@@ -311,70 +303,6 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
     y, x = np.divmod(used, pixels // (rows.stop - rows.start))
     places = {"y": y + rows.start, "x": x}
     return used, {name: xr.DataArray(one, dims="pixel") for name, one in places.items()}
-
-
-def _blurred(
-    displacement: Displacement,
-    rows: slice,
-    time: Array,
-    counts: Array,
-    valid: Mask,
-    status: Bits,
-    gain: Array,
-) -> tuple[Array, Mask, Bits, Array]:
-    """Rows around as `read` gives them, blurred alike over the pixels that are usable."""
-    more, width = displacement.around(rows), displacement.shape[1]
-    counts, known = quality.bridge(counts, valid, time)
-    here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
-    usable = ~quality.unusable(status)
-    key = (rows.start, rows.stop, displacement.blur)
-    inverse, *noise = displacement.once(key, lambda: _of_blur(displacement, rows, usable))
-
-    def smoothed(values: Array) -> Array:
-        """The weights applied to values (time, pixel), along one axis after the other."""
-        values = values.reshape(len(values), -1, width)
-        for axis in (1, 2):
-            values = np.asarray(correlate1d(values, taps, axis, mode="constant"))
-        return np.asarray(values.reshape(len(values), -1)[:, here] * inverse)
-
-    reach = int(TAIL * displacement.blur)
-    taps = _gaussian(slice(reach, reach + 1), slice(2 * reach + 1), displacement.blur)[0]
-    known = known & usable
-    every = known[:1] if np.all(known == known[:1]) else known  # the same in all frames
-    share = np.maximum(smoothed(np.where(every, 1.0, 0.0)), _NO_WEIGHT)
-    blurred = np.stack([smoothed(one * known) / share for one in counts])
-    # The noise of independent samples, times what was measured of shared one.
-    own, both, before = noise
-    measured = np.divide(gain[1, here], before, out=np.ones_like(before), where=before > 0.0)
-    return blurred, valid[:, here], status[here], np.stack([own, both * measured])
-
-
-def _of_blur(displacement: Displacement, rows: slice, usable: Mask) -> Array:
-    """
-    Blur of some rows (4, pixel): its scale, and the noise [1] that it, both and resampling leave.
-
-    Of the pixels that are usable, of the rows around.
-    """
-    more, width = displacement.around(rows), displacement.shape[1]
-    here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
-    along = [(rows, more), (slice(width), slice(width))]
-    plain = csr_array(kron(*(_gaussian(*one, displacement.blur) for one in along)))
-    weights = plain @ diags_array(1.0 * usable)
-    total = weights.sum(axis=1)
-    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=usable[here])
-    weights = csr_array(diags_array(inverse) @ weights)
-    paired = displacement.weights(more, displacement.source(rows))
-    own, both, before = (
-        np.sqrt(np.asarray((one**2).sum(axis=1)).ravel())
-        for one in (weights, weights @ paired, paired)
-    )
-    return np.stack([inverse, own, both, before[here]])
-
-
-def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
-    """Weights (row, row among) of a Gaussian, 0 in its tail."""
-    away = np.subtract.outer(np.arange(rows.stop)[rows], np.arange(among.stop)[among]) / deviation
-    return np.where(abs(away) <= TAIL, np.exp(-0.5 * away**2), 0.0)
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:

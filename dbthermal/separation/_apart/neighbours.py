@@ -13,20 +13,29 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.special import chdtri
 
 from dbthermal.schema import Status
-from dbthermal.separation._apart.displaced import TAIL
 from dbthermal.separation._apart.equations import Floats, Mask
+from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
+from dbthermal.separation._pooling.ratios import Image
+from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance
-from dbthermal.separation._tiles import Material
+from dbthermal.separation._tiles import Material, Survey
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
+# Flags with which a pixel does not tell a ratio, whatever its neighbours are, and those of which it
+# tells none for its material.
+_UNKNOWN: Final = np.uint32(
+    Status.NO_BACKGROUND_MOTION | Status.GRAY | Status.NONPHYSICAL_EMISSIVITY
+)
+_BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
@@ -35,38 +44,29 @@ _SOME: Final = 0.1
 _AROUND: Final = 0.125
 
 
-def blurred(inputs: Inputs) -> Inputs | None:
-    """Inputs with the bands blurred alike; None where the field of the shift is zero."""
-    displacement = inputs.displacement
-    assert displacement is not None
-    if displacement.resample.nnz <= displacement.resample.shape[0]:
-        return None
-    return replace(inputs, displacement=replace(displacement, blur=BLUR))
-
-
-def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
+def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     """
-    Ratios (band, pixel) of a result of blurred bands, as those of each pixel's own material.
+    Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
 
     Their variance is times the reduced chi-square about the mean of those around. A pixel that
     shows its bands apart takes that mean, with the variance of the ratios around beside their mean.
     """
-    noise, status = inputs.noise[inputs.bands], result["status"].values
-    shape = (len(inputs.bands), *status.shape)
-    ratio, std = (
-        result[name].values[inputs.bands].astype(np.float64)
-        for name in ("reflection_ratio", "reflection_ratio_std")
-    )
-    known = ((status & ~np.uint32(Status.CONSTANT_OBJECT)) == 0) & np.all(std[1:] > 0, axis=0)
-    std[0] = 1.0
-    weight = np.divide(1.0, std**2, out=np.zeros(shape), where=np.broadcast_to(known, shape))
+    noise, scatters = inputs.noise[inputs.bands], planes.scatters(BLUR)
+    shape = (len(noise), *status.shape)
+    ratio = scatters.ratio
+    variance = scatters.variance(ratio)
+    known = (status & _UNKNOWN) == 0
+    known &= planes.usable & np.all(np.isfinite(variance), axis=0).reshape(status.shape)
+    ratio, variance = ratio.reshape(shape), variance.reshape(shape)
+    weight = np.divide(1.0, variance, out=np.zeros(shape), where=known & (variance > 0))
+    weight[0] = known
     mean = _mean(ratio, weight, _WIDE)
     chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), known, _WIDE)
-    apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & (
+    apart = scatters.apart.reshape(status.shape) & (
         gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
     )
     variance = np.where(
-        apart, _mean((ratio - mean) ** 2, weight, _WIDE), std**2 * np.maximum(chi, 1)
+        apart, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
     )
     ratio = np.where(apart, mean, np.where(known, ratio, np.nan)).reshape(len(noise), -1)
     inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
@@ -81,30 +81,55 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
     )
 
 
-def materials(inputs: Inputs, threads: Executor, bar: Any) -> Material | None:
+def materials(
+    inputs: Inputs, planes: Planes, alone: xr.Dataset, threads: Executor, bar: Any
+) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
-    Surveyed are the pixels that no neighbour's blur reaches. What twice the blur changes may be as
-    much again beyond it: a variance. A material too narrow for it has that of the others.
+    Of the pixels that no neighbour's blur reaches. What twice the blur changes may be as much again
+    beyond it: a variance. A material too narrow for it has that of the others.
     """
-    displacement = inputs.displacement
-    assert displacement is not None
     assert inputs.labels is not None
-    labels, found = inputs.labels.reshape(displacement.shape), None
+    labels, noise = inputs.labels.reshape(planes.usable.shape), inputs.noise[inputs.bands]
+    material = None
     for blur in (0.0, BLUR, 2.0 * BLUR):
         size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
-        alike = replace(inputs, displacement=replace(displacement, blur=blur))
-        surveyed = np.where(inner, labels, -1).ravel()
-        more = pool.materials(alike, threads, bar, surveyed=surveyed)
-        if more is not None:  # else all materials are too narrow
-            found = more if found is None else _blurred(found, more, inputs)
-    if found is None:
+        places = np.flatnonzero(pool.select(np.where(inner & planes.usable, labels, -1).ravel()))
+        if places.size:  # else all materials are too narrow
+            image = Image(inputs.labels, places, planes.usable.shape[1])
+            survey = _survey(planes.scatters(blur), alone, noise, places)
+            wider = pool.estimate(image, inputs.labels[places], survey, noise)
+            material = wider if material is None else _blurred(material, wider, inputs)
+    if material is None:
         return None
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
-    variance, none = found.inverse_energy + found.spread, np.zeros_like(found.spread)
-    found = replace(found, inverse_energy=variance, spread=none)
-    return pool.materials(inputs, threads, bar, known=found)
+    variance, none = material.inverse_energy + material.spread, np.zeros_like(material.spread)
+    material = replace(material, inverse_energy=variance, spread=none)
+    return pool.materials(inputs, threads, bar, known=material)
+
+
+def _survey(
+    scatters: Scatters, alone: xr.Dataset, noise: Floats, places: npt.NDArray[np.intp]
+) -> Survey:
+    """Survey of some pixels by their planes; of those of a sound model."""
+    status = alone["status"].values.ravel()[places]
+    emissivity = alone["emissivity"].sel(band=alone.attrs["reference_band"]).values
+    value = np.where(status == 0, emissivity.ravel()[places], np.nan)
+    sound = (status & _BROKEN) == 0
+    scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
+    frames = np.where(sound, scatters.freedom[places], 0.0)
+    return Survey(
+        scatter=scatter,
+        frames=frames,
+        rapid_scatter=np.stack([scatter, scatter]),
+        rapid_frames=np.stack([frames, frames]),
+        ratio=scatters.ratio[:, places],
+        null_weights=np.zeros((len(noise), places.size)),
+        emissivity=value,
+        noise_variance=np.ones(places.size),
+        drift_variance=np.zeros(places.size),
+    )
 
 
 def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import xarray as xr
 
-from dbthermal.separation._apart import joint, neighbours
+from dbthermal.separation._apart import joint, neighbours, planes
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._tiles import Material
 
@@ -23,20 +23,23 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 """Labels (pixel) of materials, of what is told of those before."""
 
 # Turns of the materials and the object of each camera's own place.
-_TURNS: Final = 3
+_TURNS: Final = int(__import__("os").environ.get("TURNS", "3"))
 
 
 def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
-    """Separate without materials, by the ratios of bands that are blurred alike."""
+    """Separate without materials, then by the ratios of bands that are blurred alike."""
+    assert inputs.displacement is not None
+    each(inputs, None)
     material, blur = None, 0.0
-    alike = None if inputs.method.survey is None else neighbours.blurred(inputs)
-    if alike is not None:
-        each(alike, None)
-        material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
-    each(inputs, material)
+    if inputs.method.survey is not None and inputs.displacement.moves:
+        maps = planes.project(inputs, result, threads)
+        material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
     both = joint.solve(inputs, result, threads, blur=blur)
     if both is not None:
-        each(replace(inputs, difference=both.difference), material)
+        inputs = replace(inputs, difference=both.difference)
+    if both is not None or material is not None:
+        each(inputs, material)
+    if both is not None:
         both.finish()
 
 
@@ -54,8 +57,10 @@ def pooled(
     The first are told with the object of pixels alone, and may be off as these are; the second,
     which may regroup them, with that of the first; and the last with that of what they are then.
     """
-    survey = partial(neighbours.materials, threads=threads, bar=bar)
     both: joint.Joint | None = joint.from_result(inputs, before)
+    inputs = replace(inputs, difference=both.difference)
+    maps = planes.project(inputs, before, threads)
+    survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
     for turn in range(_TURNS):
         # Without the difference the backgrounds, which bend the bands apart, are far off.
         both = None if both is None else both.kept()
