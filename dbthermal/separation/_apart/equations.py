@@ -10,6 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
 from scipy.sparse import csr_array, diags_array
+from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
@@ -20,6 +21,7 @@ from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart.displaced import Displacement, without
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.reflection_ratio import (
+    CHANCE,
     HIGHEST_ORDER,
     null_combination,
     ratio_variance,
@@ -215,7 +217,7 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
         forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
-        bends=_bends([inputs.curves[band] for band in inputs.bands]),
+        bends=bends([inputs.curves[band] for band in inputs.bands]),
     )
 
 
@@ -227,17 +229,39 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def _bends(curves: list[Curve]) -> Floats:
+def bends(curves: list[Curve]) -> Floats:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)
     own = first.signal(temperature)
     place = own - first.reference
-    bends = np.zeros((len(curves) - 1, _DEGREE + 1))
-    for bend, one in zip(bends, curves[1:], strict=True):
+    result = np.zeros((len(curves) - 1, _DEGREE + 1))
+    for bend, one in zip(result, curves[1:], strict=True):
         fit = Polynomial.fit(place, one.signal(temperature) - own, _DEGREE).convert()
         bend[: fit.coef.size] = fit.coef  # without the last ones that are zero
-    return bends
+    return result
+
+
+def other_band(bend: Floats, signal: Floats) -> Floats:
+    """Signal u_m(x) [K] of u_1(x), by the polynomial of their difference."""
+    result = np.full_like(signal, bend[-1])
+    for coefficient in bend[-2::-1]:
+        result *= signal
+        result += signal.dtype.type(coefficient)
+    return result + signal
+
+
+def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats, Mask]:
+    """Emissivities (band, pixel) [1] of each pixel's material; and where that tells them.
+
+    Not beside a gray body, which has no combination without background.
+    """
+    ratio = np.where(np.isfinite(material.ratio), material.ratio, ratio_of(raw))
+    variance = null_combination(ratio, inputs.noise[inputs.bands])[1]
+    sharp = material.inverse_energy * variance < 1.0 / chdtri(len(raw) - 1, CHANCE)
+    ratio = np.where(sharp, ratio, ratio_of(raw))
+    first = np.where(np.isfinite(material.emissivity) & sharp, material.emissivity, raw[0])
+    return np.asarray(1.0 - ratio * (1.0 - first)), sharp & np.isfinite(material.ratio[-1])
 
 
 def told(film: Floats) -> tuple[Mask, Mask]:

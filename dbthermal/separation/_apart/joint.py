@@ -20,7 +20,6 @@ with the weights :math:`(1 - g) g^j`.
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -28,15 +27,15 @@ import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, copied, empty, release
-from dbthermal.response import Curve
+from dbthermal._arrays import Array, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours
 from dbthermal.separation._apart.equations import Floats, Mask, Whole
+from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
 from dbthermal.separation._tiles import Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
@@ -51,10 +50,9 @@ _FRAMES: Final = 8
 _LOOKED_AT: Final = 32
 _MATTERS: Final = 0.2
 _MOST: Final = 0.99
-# Frames for each polynomial that tell a smooth film, pixels that are written at once, and the share
-# of a deviation below which it is no matter that a film is not smooth.
+# Frames for each polynomial that tell a smooth film, and the share of a deviation below which it is
+# no matter that a film is not smooth.
 _NODES: Final = 2
-_AT_ONCE: Final = 2048
 _NO_MATTER: Final = 0.1
 # Draws of noise by which the deviations are propagated, and the variance over that of a pixel alone
 # from which the iteration is taken to grow.
@@ -63,47 +61,84 @@ _GROWN: Final = 1e3
 
 
 @dataclass(frozen=True)
+class Frames:
+    """Frames at which a film is solved: a few of one that is smooth, else all."""
+
+    nodes: Whole  # (node)
+    weights: Floats | None  # of the nodes in each frame (frame, node); None of all frames
+
+    @property
+    def smooth(self) -> bool:
+        """The film changes smoothly: a few frames tell all."""
+        return self.weights is not None
+
+    @classmethod
+    def of(cls, result: xr.Dataset) -> "Frames":
+        """Frames that tell the object of a result.
+
+        Polynomials through nodes that lie close together near the ends, as Chebyshev's do, repeat a
+        film that is one of them. Where they are off by more than a share of its deviation, in more
+        than a few of the samples, the object changes rapidly.
+        """
+        film, std = (
+            result[name].values.reshape(result.sizes["time"], -1)
+            for name in ("object_temperature", "object_temperature_std")
+        )
+        time, every = result["time"].values, np.arange(len(film))
+        functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        count = _NODES * functions.shape[1]
+        place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
+        nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
+        weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
+        some = looked_at(time.size)
+        apart = np.abs(weights[some] @ film[nodes] - film[some]) / std[some]
+        if nodes.size == time.size or not np.nanquantile(apart, _MOST) < _NO_MATTER:
+            return cls(every, None)
+        return cls(nodes, weights)
+
+    def parts(self) -> list[slice]:
+        """Nodes that are solved together."""
+        return [slice(at, at + _FRAMES) for at in range(0, self.nodes.size, _FRAMES)]
+
+
+def looked_at(frames: int) -> Whole:
+    """Some of the frames, evenly spaced."""
+    return np.unique(np.linspace(0, frames - 1, _LOOKED_AT).astype(np.intp))
+
+
+@dataclass(frozen=True)
 class Joint:
-    """Object of all pixels, of which each camera sees another place; its films are in a result."""
+    """Object of all pixels, of which each camera sees another place."""
 
     inputs: Inputs
-    result: xr.Dataset  # its object temperature is x(r), its background temperature x(p)
+    frames: Frames
+    signals: Floats  # of the object at r and at p (2, node, pixel) [K]; NaN unknown
     emissivity: Floats  # of which it is made (band, pixel) [1]
     factor: Floats  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(
-        self, rows: slice, some: slice | Whole, frames: slice | Whole = slice(None)
-    ) -> Floats:
+    def difference(self, rows: slice, some: slice | Whole) -> Floats:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
-        here, beside = (
-            self.result[f"{one}_temperature"].values[frames, rows]
-            for one in ("object", "background")
-        )
-        here, beside = (
-            one.reshape(len(one), -1)[:, some].astype(np.float64) for one in (here, beside)
-        )
-        pixels = slice(rows.start * self.result.sizes["x"], rows.stop * self.result.sizes["x"])
-        parts = []
-        for one, place in zip(self.emissivity[1:], self.inputs.bands[1:], strict=True):
-            curve = self.inputs.curves[place]
-            parts.append(one[pixels][some] * (curve.signal(beside) - curve.signal(here)))
-        return np.asarray(np.nan_to_num(parts, nan=0.0))
+        width = self.inputs.capture.sizes["x"]
+        pixels = np.arange(rows.start * width, rows.stop * width)[some]
+        return self.at(slice(None), pixels)
 
-    def kept(self) -> "Joint":
-        """Return it with films of its own: those of the result may be written anew."""
-        own = {
-            name: (("time", "y", "x"), copied(self.result[name].values))
-            for name in ("object_temperature", "background_temperature")
-        }
-        return replace(self, result=xr.Dataset(own))
+    def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
+        """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
+        signals, weights, parts = self.signals[..., pixels], self.frames.weights, []
+        bends = system.bends([self.inputs.curves[band] for band in self.inputs.bands])
+        for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
+            change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
+            change = np.nan_to_num(share.astype(np.float32) * change)
+            parts.append(change[frames] if weights is None else weights[frames] @ change)
+        return np.asarray(parts)
 
-    def finish(self) -> None:
-        """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
-        displacement, status = self.inputs.displacement, self.result["status"].values
+    def finish(self, result: xr.Dataset) -> None:
+        """Give the object of a result its deviation, in place; flag what is unsettled."""
+        displacement, status = self.inputs.displacement, result["status"].values
         assert displacement is not None
-        time, std = self.inputs.capture["time"].values, self.result["object_temperature_std"].values
-        background = self.result["background_temperature"].values
+        time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
+        background = result["background_temperature"].values
         basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
         every = []
         for part in self.inputs.blocks:
@@ -132,9 +167,9 @@ class Joint:
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
         status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
-        for name in self.result.data_vars:
+        for name in result.data_vars:
             if str(name).startswith(("object", "background", "emissivity")):
-                self.result[name].values[..., grown] = np.nan
+                result[name].values[..., grown] = np.nan
             release()
 
 
@@ -143,6 +178,7 @@ def solve(
     result: xr.Dataset,
     threads: Executor,
     *,
+    maps: Planes | None = None,
     material: Material | None = None,
     before: Joint | None = None,
     blur: float = 0.0,
@@ -150,155 +186,126 @@ def solve(
     """
     Solve the equations of all pixels, from a result that takes x(p) for x(r).
 
-    Or from one of inputs with the difference of a solution `before`, and with emissivities that are
-    pooled by `material`. Writes x(r) as the object temperature and x(p) as the background
-    temperature of the result. None, and nothing is written, where the object hardly differs between
-    the two places.
+    Or from one of inputs with the difference of a solution `before`. Of an object that changes
+    smoothly the combination without background is that of the `maps`, at the ratios of a material,
+    else that of the result. None where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film, there, stds = (
-            result[name].values.reshape(result.sizes["time"], -1)
-            for name in ("object_temperature", "background_temperature", "object_temperature_std")
-        )
-        raw = system.first_emissivity(inputs, result)
-        solved = np.all(np.isfinite(raw), axis=0) & system.told(film)[0]
+        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
+        raw, frames = system.first_emissivity(inputs, result), Frames.of(result)
+        by_maps = maps is not None and frames.smooth
+        solved = system.told(film)[0]
+        if by_maps and material is not None:
+            raw, given = system.of_material(inputs, raw, material)
+            solved |= given & maps.usable.ravel()
+        solved &= np.all(np.isfinite(raw), axis=0)
         equations = system.equations(inputs, system.inside(raw), solved)
-        some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
+        places, some = equations.solved, looked_at(len(film))
         first, steps, change, variance = system.first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
-        weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
+        target: Callable[[Whole], tuple[Floats, Floats]]
+        if by_maps:
+            assert maps is not None
+            combined, size = _combined(inputs, maps, raw, material, places)
 
-        def moved(frames: slice | Whole) -> Floats:
-            """Part (solved, frame) [K] of q that the inputs of the result were without."""
-            apart = 0.0 if before is None else before.difference(every, places, frames).T
-            return np.asarray(np.sum(weights.T[places, np.newaxis] * apart, axis=2))
+            def target(at: Whole) -> tuple[Floats, Floats]:
+                """Combination without background and a start (solved, frame) [K], by the maps."""
+                q = np.ascontiguousarray((maps.object_part[at] @ combined).T, np.float32)
+                return q, q
+        else:
+            shares = system.coefficients(inputs, raw, solved)[:, places]
+            weights = system.weights(inputs, raw)[1:, places]
+            stds = result["object_temperature_std"].values.reshape(film.shape)[some]
+            # In units of the deviation or, of a method without one, of the noise.
+            stds = np.where(np.isfinite(stds[:, places]), stds[:, places], inputs.noise.min())
+            size = np.sqrt(np.mean(stds**2, axis=0))
+            film = system.bridge(film.copy(), solved)
 
-        shares, places = system.coefficients(inputs, raw, solved), equations.solved
-        both = partial(_both, curve, shares[:, places])
-        few = system.bridge(film[some], solved)[:, places], moved(some), change(some)
+            def target(at: Whole) -> tuple[Floats, Floats]:
+                """Combination without background and a start (solved, frame) [K], by the film."""
+                signal = np.asarray(curve.signal(film[at][:, places]) - curve.reference)
+                signal = np.ascontiguousarray(signal.T, dtype=np.float32)
+                q = shares[0][:, np.newaxis] * signal
+                q += equations.packed.other_bands(shares[1:], signal)
+                if before is not None:  # part of q that the inputs of the result were without
+                    q += np.einsum("bp,btp->pt", weights, before.at(at, places))
+                return q, signal
 
-        def looked_at(equations: system.Equations) -> tuple[Floats, Floats]:
-            """Object's signals (solved, some frame) [K] at both places."""
-            return both(*few, equations)[:2]
+        def both(at: Whole, equations: system.Equations) -> tuple[Floats, Floats, Floats]:
+            """Object at both places and the last step (solved, frame) [K] of some frames."""
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
+                return equations.packed.solve(*target(at), change(at))
 
-        here, beside = looked_at(equations)
-        # In units of the deviation or, of a method without one, of the noise.
-        std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
-        share = np.abs(shares[1:, places].sum(axis=0) * (beside - here).T) / std[:, places]
-        if not np.any(solved) or np.nanquantile(share, _MOST) <= _MATTERS:
+        here, beside, _ = both(some, equations)
+        others = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
+        share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
+        if places.size == 0 or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
         emissivity, (of_slope, of_ratio) = system.inside(raw), np.zeros((2, solved.size))
-        if material is not None:
+        if material is not None and np.isfinite(material.emissivity).any():
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
             band = first[:, places], steps[:, places]
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, looked_at, band
+                inputs, result, raw, solved, equations, lambda it: both(some, it)[:2], band
             )
-            here, beside = looked_at(equations)
-        system.bridge(film, solved)
+            here, beside, _ = both(some, equations)
+        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
         unsettled = np.zeros(solved.size, dtype=bool)
-        nodes, spread = _nodes(film, result["time"].values, std, places, some)
-        parts = [nodes[part] for part in _parts(nodes)]
-        results = threads.map(
-            lambda part: both(film[part][:, places], moved(part), change(part), equations), parts
-        )
-        signals = np.empty((2, nodes.size, places.size), np.float32)
-        for part, (*pair, step) in zip(_parts(nodes), results, strict=True):
-            signals[:, part] = np.swapaxes(pair, 1, 2)
+        parts = frames.parts()
+        found = threads.map(lambda part: both(frames.nodes[part], equations), parts)
+        for part, (*pair, step) in zip(parts, found, strict=True):
+            signals[:, part, places] = np.swapaxes(pair, 1, 2)
             unsettled[places] |= step > 10.0 * system.CONVERGED
-        for whole, signal in zip((film, there), signals, strict=True):
-            _write(whole, places, curve, signal, spread)
-        release()
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
         off *= equations.spread(np.mean((beside - here) ** 2, axis=1))
-        size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
-        factor = _factor(inputs, equations, size, variance, blur)
-    return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
+        sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
+        factor = _factor(inputs, equations, np.array(sizes), variance, blur)
+    return Joint(inputs, frames, signals, emissivity, factor, unsettled | np.isnan(factor))
+
+
+def _combined(
+    inputs: Inputs, maps: Planes, raw: Floats, material: Material | None, places: Whole
+) -> tuple[Floats, Floats]:
+    """Coefficients (column, solved) of the combination without background, and its deviation [K].
+
+    The deviation is that of the noise and, of ratios of single pixels, of these.
+    """
+    noise, ratio = inputs.noise[inputs.bands], system.ratio_of(raw)[:, places]
+    weights = null_combination(ratio, noise)[0]
+    combined, variance = maps.combined(weights, places)
+    if material is not None and np.isnan(material.emissivity).all():
+        std = np.sqrt(np.nan_to_num(material.inverse_energy[places]))
+        off = ratio + std * np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)
+        off[0] = 1.0
+        change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
+        variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
+    return combined, np.sqrt(variance)
 
 
 def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
     """Object of both places of a result that is solved already."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = copied(result["object_temperature"].values).reshape(result.sizes["time"], -1)
-        emissivity = system.inside(system.first_emissivity(inputs, result))
+        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
+        emissivity, frames = (
+            system.inside(system.first_emissivity(inputs, result)),
+            Frames.of(result),
+        )
         solved = np.all(np.isfinite(emissivity), axis=0) & system.told(film)[0]
         equations = system.equations(inputs, emissivity, solved)
-        change = system.first_band(inputs, equations.loose, np.zeros(1, dtype=np.intp))[2]
-        curve, there = inputs.curves[inputs.bands[0]], empty(film.shape, film.dtype)
-        places = equations.solved
-        system.bridge(film, solved)
-        for part in _parts(film):
-            signal = curve.signal(film[part, places]).T - curve.reference
-            beside = equations.packed.beside(signal, change(part))
-            there[part] = np.nan
-            there[part, places] = curve.temperature(beside.T + curve.reference)
-            release()
-    shape, unsettled = result["object_temperature"].shape, np.zeros(solved.size, dtype=bool)
-    films = {
-        name: (("time", "y", "x"), part.reshape(shape))
-        for name, part in (("object_temperature", film), ("background_temperature", there))
-    }
-    return Joint(inputs, xr.Dataset(films), emissivity, np.ones(solved.size), unsettled)
-
-
-def _parts(film: Floats | Whole) -> list[slice]:
-    """Frames of a film that are solved together."""
-    return [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
-
-
-def _nodes(
-    film: Floats, time: Array, std: Floats, places: Whole, some: Whole
-) -> tuple[Whole, Floats | None]:
-    """Frames (node) that tell a smooth film, and weights (frame, node) of these; else all, None.
-
-    Polynomials through the nodes, which lie close together near the ends as Chebyshev's do, repeat
-    a film that is one of them. Where they are off by more than a share of the deviation (some
-    frame, pixel), in more than a few of the samples, the object changes rapidly.
-    """
-    order = min(HIGHEST_ORDER, time.size // 4)
-    ends = np.cos(np.pi * (np.arange(_NODES * order) + 0.5) / (_NODES * order))
-    place = time[0] + 0.5 * (1.0 - ends) * (time[-1] - time[0])
-    nodes = np.unique(np.abs(time - place[:, np.newaxis]).argmin(axis=1))
-    functions = smooth.subspace(time, order).functions
-    weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
-    few, apart = weights[some] @ film[nodes][:, places], 0.0
-    apart = np.abs(few - film[some][:, places]) / std[:, places]
-    if nodes.size == time.size or not np.nanquantile(apart, _MOST) < _NO_MATTER:
-        return np.arange(time.size), None
-    return nodes, weights
-
-
-def _write(
-    film: Floats, places: Whole, curve: Curve, signal: Floats, weights: Floats | None
-) -> None:
-    """Write a film of temperatures, of signals (node, solved pixel) and their weights, in place."""
-    for start in range(0, places.size, _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
-        kelvin = curve.temperature(signal[:, part] + curve.reference).astype(np.float32)
-        film[:, places[part]] = kelvin if weights is None else weights @ kelvin
-    film[:, ~np.isin(np.arange(film.shape[1]), places)] = np.nan
-
-
-def _both(
-    curve: Curve,
-    shares: Floats,
-    alone: Floats,
-    moved: Floats,
-    change: Floats,
-    equations: system.Equations,
-) -> tuple[Floats, Floats, Floats]:
-    """Object at both places and the last step [K], of a film (frame, pixel) by its shares."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread it runs in
-        signal = curve.signal(alone) - curve.reference
-        signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-        packed = equations.packed
-        target = shares[0][:, np.newaxis] * signal + packed.other_bands(shares[1:], signal)
-        target += moved
-        return packed.solve(target, signal, change)
+        change = system.first_band(inputs, equations.loose, looked_at(len(film)))[2]
+        curve, places = inputs.curves[inputs.bands[0]], equations.solved
+        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
+        nodes = system.bridge(film[frames.nodes], solved)
+        for part in frames.parts():
+            signal = (curve.signal(nodes[part][:, places]) - curve.reference).T
+            beside = equations.packed.beside(signal, change(frames.nodes[part]))
+            signals[:, part, places] = signal.T, beside.T
+    unsettled = np.zeros(solved.size, dtype=bool)
+    return Joint(inputs, frames, signals, emissivity, np.ones(solved.size), unsettled)
 
 
 def _emissivities(

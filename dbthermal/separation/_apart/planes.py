@@ -38,6 +38,7 @@ _DEGREE: Final = 7
 _LEAST_SHARE: Final = 1e-3
 # Deviations of noise across the axis of the ratios from which the bands are apart.
 _APART: Final = 8.0
+_TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,28 @@ class Planes:
     """Reflected signals along functions of time, the bands paired by what they reflect."""
 
     maps: npt.NDArray[np.float32]  # (band, function, y, x) [K]
+    smooth: npt.NDArray[np.float32]  # straight signals on smooth functions (band, column, pixel)
+    object_part: Array  # these functions, less the steps of the camera in them (time, column)
+    steps: int  # columns of every order, beside the constant
     noise: Array  # of a band's samples, resampled or not (2, band, y, x) [K]
     freedom: Array  # sum of the functions' squares (y, x)
     usable: Mask  # (y, x)
+
+    def combined(self, weights: Array, pixels: Any) -> tuple[Array, Array]:
+        """Combination (column, pixel) [K] of the bands by weights, and its variance at a frame.
+
+        Of each pixel so many functions as the Bayesian information criterion says, plus one.
+        """
+        whole = np.einsum("bp,bcp->cp", weights, self.smooth[..., pixels])
+        noise = self.noise[0].reshape(len(weights), -1)[:, pixels]
+        variance = np.maximum(((weights * noise) ** 2).sum(axis=0), _TINY)
+        frames, orders = len(self.object_part), len(whole) - self.steps
+        energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
+        lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
+        cost = energy[lowest:] + np.arange(lowest, orders)[:, np.newaxis] * np.log(frames)
+        order = np.minimum(lowest + cost.argmin(axis=0) + int(__import__("os").environ.get("PLUS","1")), orders)
+        whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
+        return whole, variance * (order + self.steps) / frames
 
     def scatters(self, blur: float = 0.0) -> Scatters:
         """Scatter of each pixel, of maps that are blurred by a deviation [pixel]."""
@@ -109,12 +129,13 @@ class Planes:
 
 def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
     """Planes of a capture, of the object and background in a result of it."""
-    bands, shape = inputs.bands, result["status"].shape
-    functions = _functions(inputs)
-    maps = np.zeros((len(bands), functions.shape[1], *shape), np.float32)
-    noise, freedom = np.ones((2, len(bands), *shape)), np.ones(shape)
-    usable = np.zeros(shape, dtype=bool)
-    before = inputs.noise[bands] / _interpolated(inputs)[bands]
+    bands, (height, width) = inputs.bands, result["status"].shape
+    rapid, columns = _functions(inputs), _smooth_functions(inputs.capture)
+    maps = np.zeros((len(bands), rapid.shape[1], height, width), np.float32)
+    straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
+    noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
+    usable = np.zeros((height, width), dtype=bool)
+    noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
     responses = _polynomials([inputs.curves[band] for band in bands])
     films = [result[name].values for name in ("object_temperature", "background_temperature")]
     emissivity = result["emissivity"].values[bands]
@@ -122,63 +143,62 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
     def block(rows: slice) -> None:
         for cut in tiles.cut(inputs, rows):
             for frames, pixels, tile in cut.parts:
-                row, column = (
-                    place[pixels] + part.start
-                    for place, part in zip(
-                        np.divmod(np.arange(pixels.size), cut.window[1].stop - cut.window[1].start),
-                        cut.window,
-                        strict=True,
-                    )
-                )
-                rest = functions[frames]
-                basis = _smooth_functions(tile.time, tile.segment)
-                rest = rest - basis @ (basis.T @ rest)
-                signals = np.ascontiguousarray(tile.signals)
+                places = cut.places[pixels]
+                row, column = np.divmod(places, width)
+                # Functions of frames that some pixels lack: no longer orthogonal to the smooth.
+                few = columns.functions[frames]
+                inverse = np.linalg.solve(few.T @ few, few.T)
+                rest = rapid[frames] - few @ (inverse @ rapid[frames])
                 x, y = (film[frames][:, row, column] for film in films)
-                shares = emissivity[:, row, column].astype(np.float64)
-                _take_out(signals, x, y, np.nan_to_num(shares), *responses)
+                shares = np.nan_to_num(emissivity[:, row, column].astype(np.float64))
+                signals = np.ascontiguousarray(tile.signals)
+                _take_out(signals, y, shares, *responses, False)
+                for band, signal in enumerate(signals):
+                    straight[band][:, places] = inverse @ signal
+                if inputs.difference is not None:
+                    more = inputs.difference(cut.window[0], slice(None))[:, frames]
+                    there = np.searchsorted(cut.places, places)
+                    for band, part in enumerate(more, 1):
+                        straight[band][:, places] += inverse @ part[:, there]
+                _take_out(signals, x, shares, *responses, True)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = rest.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
-                noise[1][:, row, column] = before[:, np.newaxis]
                 freedom[row, column] = np.sum(rest**2)
                 usable[row, column] = True
         release()
 
     list(threads.map(block, inputs.blocks))
-    return Planes(maps, noise, freedom, usable)
+    return Planes(maps, straight, columns.object_part, columns.steps, noise, freedom, usable)
 
 
 @compiled
 def _take_out(
     signals: Array,
-    x: npt.NDArray[np.float32],
-    y: npt.NDArray[np.float32],
+    temperature: npt.NDArray[np.float32],
     emissivity: Array,
     coefficients: Array,
     middle: float,
     half: float,
+    emitted: bool,
 ) -> None:
-    """Take the object and the bend of the background out of signals (band, time, pixel) [K]."""
+    """Take out of signals (band, time, pixel) [K] what is emitted, or the bend of the background.
+
+    Of a temperature (time, pixel) [K]; nothing where there is none.
+    """
     bands, frames, pixels = signals.shape
     last = coefficients.shape[1] - 1
-    for t in range(frames):
-        for p in range(pixels):
-            at_object, at_background = (x[t, p] - middle) / half, (y[t, p] - middle) / half
-            known, bent = np.isfinite(at_object), np.isfinite(at_background)
-            for band in range(bands):
-                emitted, bend = coefficients[band, last], 0.0
+    for band in range(0 if emitted else 1, bands):
+        series = coefficients[band].copy()
+        if not emitted:
+            series -= coefficients[0]
+        for t in range(frames):
+            for p in range(pixels):
+                place, value = (temperature[t, p] - middle) / half, series[last]
                 for degree in range(last - 1, -1, -1):
-                    emitted = emitted * at_object + coefficients[band, degree]
-                if band > 0:
-                    for degree in range(last, -1, -1):
-                        difference = coefficients[band, degree] - coefficients[0, degree]
-                        bend = bend * at_background + difference
-                share = emissivity[band, p]
-                if known:
-                    signals[band, t, p] -= share * emitted
-                if bent:
-                    signals[band, t, p] -= (1.0 - share) * bend
+                    value = value * place + series[degree]
+                share = emissivity[band, p] if emitted else 1.0 - emissivity[band, p]
+                signals[band, t, p] -= share * value if value == value else 0.0
 
 
 def _polynomials(curves: list[Curve]) -> tuple[Array, float, float]:
@@ -199,18 +219,19 @@ def _interpolated(inputs: Inputs) -> Array:
     return np.asarray(capture["noise_factor"].values if "noise_factor" in capture else whole)
 
 
-def _smooth_functions(time: Array, segment: Any) -> Array:
-    """Smooth functions of time (time, column), with the steps of the camera."""
+def _smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
+    """Smooth functions of the frames of a capture, with the steps of the camera."""
+    time = capture["time"].values[frames].astype(np.float64)
+    segment = capture["segment"].values[frames].astype(np.intp) if "segment" in capture else None
     order = min(reflection_ratio.HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=segment).functions
+    return smooth.subspace(time, order, segment=segment)
 
 
 def _functions(inputs: Inputs) -> Array:
     """Functions (time, function) of most of the rapid changes of the reference band."""
     capture = inputs.capture
     counts, frames = quality.sample(capture, _SAMPLE)
-    segment = capture["segment"].values.astype(np.intp)[frames] if "segment" in capture else None
-    basis = _smooth_functions(capture["time"].values.astype(np.float64)[frames], segment)
+    basis = _smooth_functions(capture, frames).functions
     signals = counts[inputs.bands[0]]
     rapid = smooth.leading((signals - basis @ (basis.T @ signals)).T)
     functions = np.zeros((frames.size, rapid.shape[1]))

@@ -23,24 +23,26 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 """Labels (pixel) of materials, of what is told of those before."""
 
 # Turns of the materials and the object of each camera's own place.
-_TURNS: Final = int(__import__("os").environ.get("TURNS", "3"))
+_TURNS: Final = 1
 
 
 def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
     """Separate without materials, then by the ratios of bands that are blurred alike."""
     assert inputs.displacement is not None
     each(inputs, None)
-    material, blur = None, 0.0
+    material, blur, maps = None, 0.0, None
     if inputs.method.survey is not None and inputs.displacement.moves:
         maps = planes.project(inputs, result, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
-    both = joint.solve(inputs, result, threads, blur=blur)
+        if not joint.Frames.of(result).smooth:
+            each(inputs, material)
+    both = joint.solve(inputs, result, threads, maps=maps, material=material, blur=blur)
     if both is not None:
         inputs = replace(inputs, difference=both.difference)
     if both is not None or material is not None:
         each(inputs, material)
     if both is not None:
-        both.finish()
+        both.finish(result)
 
 
 def pooled(
@@ -62,17 +64,18 @@ def pooled(
     maps = planes.project(inputs, before, threads)
     survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
     for turn in range(_TURNS):
-        # Without the difference the backgrounds, which bend the bands apart, are far off.
-        both = None if both is None else both.kept()
-        inputs = replace(inputs, difference=None if both is None else both.difference)
-        inputs, material = regrouped(inputs, survey, regroup if turn == 1 else None)
-        each(inputs, material)
-        both = joint.solve(inputs, result, threads, material=material, before=both)
-        if both is None and turn > 0:  # the object hardly differs between the places
-            return
+        inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
+        source = before
+        if not both.frames.smooth:
+            each(inputs, material)
+            source = result
+        both = joint.solve(inputs, source, threads, maps=maps, material=material, before=both)
+        if both is None:  # the object hardly differs between the places
+            break
+        inputs = replace(inputs, difference=both.difference)
+    each(inputs, material)
     if both is not None:
-        each(replace(inputs, difference=both.difference), material)
-        both.finish()
+        both.finish(result)
 
 
 def regrouped(
