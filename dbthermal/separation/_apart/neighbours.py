@@ -30,11 +30,7 @@ from dbthermal.separation._tiles import Material, Survey
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
-# Flags with which a pixel does not tell a ratio, whatever its neighbours are, and those of which it
-# tells none for its material.
-_UNKNOWN: Final = np.uint32(
-    Status.NO_BACKGROUND_MOTION | Status.GRAY | Status.NONPHYSICAL_EMISSIVITY
-)
+# Flags of a model that does not hold: the pixel tells nothing of its material.
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
@@ -55,16 +51,17 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     shape = (len(noise), *status.shape)
     ratio = scatters.ratio
     variance = scatters.variance(ratio)
-    known = (status & _UNKNOWN) == 0
+    apart = scatters.apart.reshape(status.shape)
+    # Before the difference between the places is known, flags of the object say nothing.
+    unsound = Status.NO_BACKGROUND_MOTION if inputs.difference is None else ~Status.CONSTANT_OBJECT
+    known = ((status & np.uint32(unsound & 0xFFFFFFFF)) == 0) & ~apart
     known &= planes.usable & np.all(np.isfinite(variance), axis=0).reshape(status.shape)
     ratio, variance = ratio.reshape(shape), variance.reshape(shape)
     weight = np.divide(1.0, variance, out=np.zeros(shape), where=known & (variance > 0))
     weight[0] = known
     mean = _mean(ratio, weight, _WIDE)
     chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), known, _WIDE)
-    apart = scatters.apart.reshape(status.shape) & (
-        gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
-    )
+    apart &= gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
     variance = np.where(
         apart, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
     )
@@ -116,7 +113,7 @@ def _survey(
     status = alone["status"].values.ravel()[places]
     emissivity = alone["emissivity"].sel(band=alone.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
-    sound = (status & _BROKEN) == 0
+    sound = ((status & _BROKEN) == 0) & ~scatters.apart[places]
     scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
     frames = np.where(sound, scatters.freedom[places], 0.0)
     return Survey(

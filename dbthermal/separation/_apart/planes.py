@@ -23,6 +23,7 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, release
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
+from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
@@ -138,7 +139,10 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
     noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
     responses = _polynomials([inputs.curves[band] for band in bands])
     films = [result[name].values for name in ("object_temperature", "background_temperature")]
-    emissivity = result["emissivity"].values[bands]
+    emissivity = result["emissivity"].values[bands].astype(np.float64)
+    # A background beyond the response has no bend that is known.
+    beyond = (result["status"].values & np.uint32(Status.OUTSIDE_RESPONSE)) != 0
+    emissivity[:, beyond] = np.nan
 
     def block(rows: slice) -> None:
         for cut in tiles.cut(inputs, rows):
@@ -150,7 +154,7 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
                 inverse = np.linalg.solve(few.T @ few, few.T)
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
                 x, y = (film[frames][:, row, column] for film in films)
-                shares = np.nan_to_num(emissivity[:, row, column].astype(np.float64))
+                shares = emissivity[:, row, column]
                 signals = np.ascontiguousarray(tile.signals)
                 _take_out(signals, y, shares, *responses, False)
                 for band, signal in enumerate(signals):
@@ -198,7 +202,8 @@ def _take_out(
                 for degree in range(last - 1, -1, -1):
                     value = value * place + series[degree]
                 share = emissivity[band, p] if emitted else 1.0 - emissivity[band, p]
-                signals[band, t, p] -= share * value if value == value else 0.0
+                value *= share
+                signals[band, t, p] -= 0.0 if np.isnan(value) else value
 
 
 def _polynomials(curves: list[Curve]) -> tuple[Array, float, float]:

@@ -30,13 +30,20 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
     """Separate without materials, then by the ratios of bands that are blurred alike."""
     assert inputs.displacement is not None
     each(inputs, None)
-    material, blur, maps = None, 0.0, None
+    material, blur, maps, both = None, 0.0, None, None
+    smooth = joint.Frames.of(result).smooth
     if inputs.method.survey is not None and inputs.displacement.moves:
+        if not smooth:  # what one camera sees to rise the other sees at another time
+            both = joint.solve(inputs, result, threads)
+            inputs = inputs if both is None else replace(inputs, difference=both.difference)
+            each(inputs, None)
         maps = planes.project(inputs, result, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
-        if not joint.Frames.of(result).smooth:
+        if not smooth:
             each(inputs, material)
-    both = joint.solve(inputs, result, threads, maps=maps, material=material, blur=blur)
+    both = joint.solve(
+        inputs, result, threads, maps=maps, material=material, before=both, blur=blur
+    )
     if both is not None:
         inputs = replace(inputs, difference=both.difference)
     if both is not None or material is not None:
