@@ -24,10 +24,8 @@ CHANGE_POINT: Final = 3.0
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
-# Functions that hold most of what changes, and pixels of which they are made: people who walk by
-# for 35 s have 97 % of the energy of their reflections in 32 of 350.
-_LEADING: Final = 32
-_TOLD_BY: Final = 600
+# Pixels of which the functions of what changes are made, for each of these.
+_FOR_EACH: Final = 8
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,10 @@ class Subspace:
         return columns[:, np.newaxis] < order + self.steps
 
 
-def leading(samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
-    some = samples[:: max(1, len(samples) // _TOLD_BY)]
-    return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:_LEADING].T)
+    some = samples[:: max(1, len(samples) // (_FOR_EACH * count))]
+    return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:count].T)
 
 
 def subspace(

@@ -27,6 +27,7 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+_PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
@@ -200,7 +201,7 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
         part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
         for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
     )
-    functions = smooth.leading(first.reshape(-1, first.shape[2]))
+    functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES)
     first, *others = (part @ functions for part in (first, *others))
     freedom = movies.freedom * functions.shape[1] / functions.shape[0]
     rough, share = _whole_pixels(first, others, freedom, reach)

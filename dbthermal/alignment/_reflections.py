@@ -33,6 +33,9 @@ _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations, and
 # a chi-square by the shorter one's data of no more than so many times that of the shorter one's own
 # windows: of a field with rims it is 3 to 9, and objects that heat rapidly gave 30 to 8000.
+# Functions of time that are matched: with 128 for 350 frames fields are as near to the truth as
+# with all (of 36 scenes, median of the errors .055 pixel; with 32 .060, with all .057).
+_PLANES: Final = 128
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _MORE: Final = 1.25
 _AGREE: Final = 2.25
@@ -236,7 +239,7 @@ class _Capture:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
         rapid = _rapid(signals.reshape(-1, signals.shape[-1]), smoothing)
-        return _rapid(smooth.leading(rapid).T, smoothing).T
+        return _rapid(smooth.leading(rapid, _PLANES).T, smoothing).T
 
     def planes(self, functions: Array) -> list[Movie]:
         """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""

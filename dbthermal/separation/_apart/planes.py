@@ -32,8 +32,8 @@ from dbthermal.separation._subspace import reflection_ratio
 TAIL: Final = 3.0
 """Deviations of the blur beyond which it has no weight."""
 
-# Pixels whose rapid changes make the functions, and degree of the responses' polynomials.
-_SAMPLE: Final = 1024
+# Functions of the rapid changes, pixels that make them, and degree of the responses' polynomials.
+_PLANES, _SAMPLE = 48, 1024
 _DEGREE: Final = 7
 # Share of a neighbourhood without which a blurred pixel is none [1].
 _LEAST_SHARE: Final = 1e-3
@@ -238,7 +238,7 @@ def _functions(inputs: Inputs) -> Array:
     counts, frames = quality.sample(capture, _SAMPLE)
     basis = _smooth_functions(capture, frames).functions
     signals = counts[inputs.bands[0]]
-    rapid = smooth.leading((signals - basis @ (basis.T @ signals)).T)
+    rapid = smooth.leading((signals - basis @ (basis.T @ signals)).T, _PLANES)
     functions = np.zeros((frames.size, rapid.shape[1]))
     functions[frames] = rapid
     return functions

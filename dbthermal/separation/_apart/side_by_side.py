@@ -23,7 +23,7 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 """Labels (pixel) of materials, of what is told of those before."""
 
 # Turns of the materials and the object of each camera's own place.
-_TURNS: Final = 1
+_TURNS: Final = 2
 
 
 def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
