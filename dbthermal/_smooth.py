@@ -70,8 +70,10 @@ class Subspace:
 
 def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
-    some = samples[:: max(1, len(samples) // (_FOR_EACH * count))]
-    return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:count].T)
+    some = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
+    if len(some) < some.shape[1]:
+        return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:count].T)
+    return np.asarray(np.linalg.eigh(some.T @ some)[1][:, : -count - 1 : -1])
 
 
 def subspace(

@@ -23,7 +23,7 @@ from dbthermal._arrays import Array
 
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
 _SPACING: Final = 6.0
-_NODES: Final = 18
+_NODES: Final = 13
 _FREEDOM: Final = 3.0  # degrees of freedom of a bending's distribution
 # Penalties that are tried, over the mean information of a node; and over the last one.
 _PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)

@@ -113,17 +113,19 @@ def _whole_pixels(
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
     energies = [np.einsum("yxt,yxt->yx", it, it).astype(np.float64) for it in (padded, *others)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
-    for down, right in np.ndindex(2 * reach[0] + 1, 2 * reach[1] + 1):
-        there = slice(down, down + height), slice(right, right + width)
-        if right == 0:  # a row's pairs of pixels at once: faster than those in reach
-            pairs = [padded[there[0]] @ part.transpose(0, 2, 1) for part in others]
-        gain = np.zeros(best.shape)
-        for pair in pairs:
-            cross = pair.diagonal(-right, 1, 2).astype(np.float64)
-            gain += np.maximum(gaussian_filter(cross, WINDOW), 0.0) ** 2
-        gain /= np.maximum(gaussian_filter(energies[0][there], WINDOW), freedom)
-        better = gain > best
-        best[better], where[0][better], where[1][better] = gain[better], down, right
+    windows = (0.0, WINDOW, WINDOW)
+    for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
+        rows = slice(down, down + height)
+        gain = np.zeros((2 * reach[1] + 1, height, width))
+        for part in others:
+            pairs = padded[rows] @ part.transpose(0, 2, 1)
+            cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(len(gain))])
+            gain += np.maximum(gaussian_filter(cross.astype(np.float64), windows), 0.0) ** 2
+        there = [energies[0][rows, right : right + width] for right in range(len(gain))]
+        gain /= np.maximum(gaussian_filter(np.stack(there), windows), freedom)
+        right, highest = gain.argmax(axis=0), gain.max(axis=0)
+        better = highest > best
+        best[better], where[0][better], where[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
     chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
     share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
@@ -216,12 +218,12 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
             "third of the image."
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
-    field = None
+    field, centres = None, movies.centres()
     for _ in range(8):
-        off = 0.0 if field is None else np.sum((field.on(movies.centres()) - target) ** 2, axis=0)
+        off = 0.0 if field is None else np.sum((field.on(centres) - target) ** 2, axis=0)
         kept = weight / (1.0 + off / (1.0 * movies.factor) ** 2) ** 2
         tensor = np.stack([kept, 0.0 * kept, kept])
-        field = spline.fitted(Information(tensor, kept * target), movies.centres())
+        field = spline.fitted(Information(tensor, kept * target), centres)
     assert field is not None
     return field
 
