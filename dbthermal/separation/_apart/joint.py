@@ -73,6 +73,7 @@ class Frames:
         return self.weights is not None
 
     @classmethod
+    @np.errstate(invalid="ignore", divide="ignore")
     def of(cls, result: xr.Dataset) -> "Frames":
         """Frames that tell the object of a result.
 
@@ -177,6 +178,7 @@ def solve(
     inputs: Inputs,
     result: xr.Dataset,
     threads: Executor,
+    frames: Frames,
     *,
     maps: Planes | None = None,
     material: Material | None = None,
@@ -192,7 +194,7 @@ def solve(
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        raw, frames = system.first_emissivity(inputs, result), Frames.of(result)
+        raw = system.first_emissivity(inputs, result)
         by_maps = maps is not None and frames.smooth
         solved = system.told(film)[0]
         if by_maps and material is not None:
@@ -286,14 +288,11 @@ def _combined(
     return combined, np.sqrt(variance)
 
 
-def from_result(inputs: Inputs, result: xr.Dataset) -> Joint:
+def from_result(inputs: Inputs, result: xr.Dataset, frames: Frames) -> Joint:
     """Object of both places of a result that is solved already."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        emissivity, frames = (
-            system.inside(system.first_emissivity(inputs, result)),
-            Frames.of(result),
-        )
+        emissivity = system.inside(system.first_emissivity(inputs, result))
         solved = np.all(np.isfinite(emissivity), axis=0) & system.told(film)[0]
         equations = system.equations(inputs, emissivity, solved)
         change = system.first_band(inputs, equations.loose, looked_at(len(film)))[2]

@@ -61,6 +61,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     weight[0] = known
     mean = _mean(ratio, weight, _WIDE)
     chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), known, _WIDE)
+    apart |= ~known & planes.usable & ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0)
     apart &= gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
     variance = np.where(
         apart, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)

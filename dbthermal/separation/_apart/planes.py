@@ -102,7 +102,9 @@ class Planes:
         energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
         lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
         cost = energy[lowest:] + np.arange(lowest, orders)[:, np.newaxis] * np.log(frames)
-        order = np.minimum(lowest + cost.argmin(axis=0) + int(__import__("os").environ.get("PLUS","1")), orders)
+        order = np.minimum(
+            lowest + cost.argmin(axis=0) + int(__import__("os").environ.get("PLUS", "1")), orders
+        )
         whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
         return whole, variance * (order + self.steps) / frames
 

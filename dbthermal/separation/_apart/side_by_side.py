@@ -31,18 +31,18 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
     assert inputs.displacement is not None
     each(inputs, None)
     material, blur, maps, both = None, 0.0, None, None
-    smooth = joint.Frames.of(result).smooth
+    frames = joint.Frames.of(result)
     if inputs.method.survey is not None and inputs.displacement.moves:
-        if not smooth:  # what one camera sees to rise the other sees at another time
-            both = joint.solve(inputs, result, threads)
+        if not frames.smooth:  # what one camera sees to rise the other sees at another time
+            both = joint.solve(inputs, result, threads, frames)
             inputs = inputs if both is None else replace(inputs, difference=both.difference)
             each(inputs, None)
         maps = planes.project(inputs, result, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
-        if not smooth:
+        if not frames.smooth:
             each(inputs, material)
     both = joint.solve(
-        inputs, result, threads, maps=maps, material=material, before=both, blur=blur
+        inputs, result, threads, frames, maps=maps, material=material, before=both, blur=blur
     )
     if both is not None:
         inputs = replace(inputs, difference=both.difference)
@@ -66,17 +66,20 @@ def pooled(
     The first are told with the object of pixels alone, and may be off as these are; the second,
     which may regroup them, with that of the first; and the last with that of what they are then.
     """
-    both: joint.Joint | None = joint.from_result(inputs, before)
+    frames = joint.Frames.of(before)
+    both: joint.Joint | None = joint.from_result(inputs, before, frames)
     inputs = replace(inputs, difference=both.difference)
     maps = planes.project(inputs, before, threads)
     survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
     for turn in range(_TURNS):
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
-        if not both.frames.smooth:
+        if not frames.smooth:
             each(inputs, material)
             source = result
-        both = joint.solve(inputs, source, threads, maps=maps, material=material, before=both)
+        both = joint.solve(
+            inputs, source, threads, frames, maps=maps, material=material, before=both
+        )
         if both is None:  # the object hardly differs between the places
             break
         inputs = replace(inputs, difference=both.difference)
