@@ -40,6 +40,7 @@ _SOME: Final = 0.1
 _AROUND: Final = 0.125
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     """
     Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
@@ -79,6 +80,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     )
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def materials(
     inputs: Inputs, planes: Planes, alone: xr.Dataset, threads: Executor, bar: Any
 ) -> Material | None:

@@ -51,11 +51,13 @@ class Scatters:
     noise: Array  # by which it is whitened (band, pixel) [K]
 
     @property
+    @np.errstate(invalid="ignore", divide="ignore")
     def ratio(self) -> Array:
         """Reflection ratios (band, pixel) [1]: the principal axis."""
         axis = np.linalg.eigh(np.moveaxis(self.scatter, -1, 0))[1][..., -1].T * self.noise
         return np.asarray(axis / axis[0])
 
+    @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def variance(self, ratio: Array) -> Array:
         """Variance (band, pixel) [1] of ratios (eq. 4); infinite where nothing is reflected."""
         whitened = ratio / self.noise
@@ -90,6 +92,7 @@ class Planes:
     freedom: Array  # sum of the functions' squares (y, x)
     usable: Mask  # (y, x)
 
+    @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def combined(self, weights: Array, pixels: Any) -> tuple[Array, Array]:
         """Combination (column, pixel) [K] of the bands by weights, and its variance at a frame.
 
