@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 from scipy.special import chdtri
 
 from dbthermal.schema import Status
+from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart.equations import Floats, Mask
 from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
 from dbthermal.separation._inputs import Inputs
@@ -86,12 +87,12 @@ def materials(
 ) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
-    Of the pixels that no neighbour's blur reaches. What twice the blur changes may be as much again
+    Of the pixels that no neighbour's blur reaches. What the blur changes may be as much again
     beyond it: a variance. A material too narrow for it has that of the others.
     """
     assert inputs.labels is not None
     labels, noise = inputs.labels.reshape(planes.usable.shape), inputs.noise[inputs.bands]
-    material = None
+    material = sharp = None
     for blur in (0.0, BLUR, 2.0 * BLUR):
         size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
@@ -100,7 +101,8 @@ def materials(
             image = Image(inputs.labels, places, planes.usable.shape[1])
             survey = _survey(planes.scatters(blur), alone, noise, places)
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
-            material = wider if material is None else _blurred(material, wider, inputs)
+            sharp = wider if sharp is None else sharp
+            material = wider if material is None else _blurred(sharp, material, wider, inputs)
     if material is None:
         return None
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
@@ -132,11 +134,11 @@ def _survey(
     )
 
 
-def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
-    """Materials with the ratios at more blur, and what it changes as a variance of them."""
+def _blurred(sharp: Material, less: Material, more: Material, inputs: Inputs) -> Material:
+    """Materials with the ratios at more blur, and what all of it changes as their variance."""
     known = np.isfinite(more.ratio[-1])
-    both = known & np.isfinite(less.ratio[-1])
-    change = more.ratio / less.ratio - 1.0
+    both = known & np.isfinite(sharp.ratio[-1])
+    change = more.ratio / sharp.ratio - 1.0
     usual = np.median(np.abs(change[:, both]), axis=1, keepdims=True) if both.any() else 0.0
     ratio = np.where(known, more.ratio, less.ratio)
     variance = (np.where(both, change, usual) * ratio) ** 2
@@ -144,6 +146,16 @@ def _blurred(less: Material, more: Material, inputs: Inputs) -> Material:
     inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
     spread = np.where(known, more.spread, less.spread)
     return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def emissivities(inputs: Inputs, result: xr.Dataset) -> Floats:
+    """Emissivities (band, pixel) [1] of a result that lean on those around, inside of (0, 1)."""
+    raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
+    variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
+    known = (result["status"].values.ravel() == 0) & (variance > 0)
+    first = shared(raw[0], variance, known, result["status"].shape)[0]
+    return system.inside(1.0 - system.ratio_of(raw) * (1.0 - first))
 
 
 def shared(

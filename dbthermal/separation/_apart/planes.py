@@ -23,9 +23,9 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, release
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
-from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._apart import equations as system
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import reflection_ratio
 
@@ -133,8 +133,8 @@ class Planes:
         return Scatters(scatter, freedom, noise)
 
 
-def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
-    """Planes of a capture, of the object and background in a result of it."""
+def project(inputs: Inputs, result: xr.Dataset, emissivity: Array, threads: Executor) -> Planes:
+    """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
     rapid, columns = _functions(inputs), _smooth_functions(inputs.capture)
     maps = np.zeros((len(bands), rapid.shape[1], height, width), np.float32)
@@ -142,12 +142,9 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
     noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
-    responses = _polynomials([inputs.curves[band] for band in bands])
-    films = [result[name].values for name in ("object_temperature", "background_temperature")]
-    emissivity = result["emissivity"].values[bands].astype(np.float64)
-    # A background beyond the response has no bend that is known.
-    beyond = (result["status"].values & np.uint32(Status.OUTSIDE_RESPONSE)) != 0
-    emissivity[:, beyond] = np.nan
+    response = _polynomial(inputs.curves[bands[0]])
+    bends = system.bends([inputs.curves[band] for band in bands])
+    film = result["object_temperature"].values.reshape(len(rapid), -1)
 
     def block(rows: slice) -> None:
         for cut in tiles.cut(inputs, rows):
@@ -158,10 +155,9 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
                 few = columns.functions[frames]
                 inverse = np.linalg.solve(few.T @ few, few.T)
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
-                x, y = (film[frames][:, row, column] for film in films)
-                shares = emissivity[:, row, column]
+                x, shares = film[frames][:, places], emissivity[:, places]
                 signals = np.ascontiguousarray(tile.signals)
-                _take_out(signals, y, shares, *responses, False)
+                _straighten(signals, x, shares, *response, bends)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
@@ -169,7 +165,7 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
                     there = np.searchsorted(cut.places, places)
                     for band, part in enumerate(more, 1):
                         straight[band][:, places] += inverse @ part[:, there]
-                _take_out(signals, x, shares, *responses, True)
+                _without_object(signals, x, shares, *response, bends)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = rest.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
@@ -182,44 +178,69 @@ def project(inputs: Inputs, result: xr.Dataset, threads: Executor) -> Planes:
 
 
 @compiled
-def _take_out(
+def _polynomial_at(series: Array, place: float) -> float:
+    """Polynomial of rising coefficients."""
+    value = series[series.size - 1]
+    for degree in range(series.size - 2, -1, -1):
+        value = value * place + series[degree]
+    return value
+
+
+@compiled
+def _straighten(
     signals: Array,
-    temperature: npt.NDArray[np.float32],
+    film: npt.NDArray[np.float32],
     emissivity: Array,
-    coefficients: Array,
+    response: Array,
     middle: float,
     half: float,
-    emitted: bool,
+    bends: Array,
 ) -> None:
-    """Take out of signals (band, time, pixel) [K] what is emitted, or the bend of the background.
+    """Take the bend of the background out of signals (band, time, pixel) [K], in place.
 
-    Of a temperature (time, pixel) [K]; nothing where there is none.
+    The background is what the first band holds beside an object (time, pixel) [K]; where that is
+    not known nothing is taken out.
     """
     bands, frames, pixels = signals.shape
-    last = coefficients.shape[1] - 1
-    for band in range(0 if emitted else 1, bands):
-        series = coefficients[band].copy()
-        if not emitted:
-            series -= coefficients[0]
-        for t in range(frames):
-            for p in range(pixels):
-                place, value = (temperature[t, p] - middle) / half, series[last]
-                for degree in range(last - 1, -1, -1):
-                    value = value * place + series[degree]
-                share = emissivity[band, p] if emitted else 1.0 - emissivity[band, p]
-                value *= share
-                signals[band, t, p] -= 0.0 if np.isnan(value) else value
+    low, high = _polynomial_at(response, -1.0), _polynomial_at(response, 1.0)
+    for t in range(frames):
+        for p in range(pixels):
+            share = emissivity[0, p]
+            emitted = share * _polynomial_at(response, (film[t, p] - middle) / half)
+            background = min(max((signals[0, t, p] - emitted) / (1.0 - share), low), high)
+            for band in range(1, bands):
+                bend = (1.0 - emissivity[band, p]) * _polynomial_at(bends[band - 1], background)
+                signals[band, t, p] -= 0.0 if np.isnan(bend) else bend
 
 
-def _polynomials(curves: list[Curve]) -> tuple[Array, float, float]:
-    """Signals less the reference (band, degree) of temperatures over a middle and a half [K]."""
-    low, high = curves[0].lowest, curves[0].highest
+@compiled
+def _without_object(
+    signals: Array,
+    film: npt.NDArray[np.float32],
+    emissivity: Array,
+    response: Array,
+    middle: float,
+    half: float,
+    bends: Array,
+) -> None:
+    """Take an object (time, pixel) [K] out of signals (band, time, pixel) [K], in place."""
+    bands, frames, pixels = signals.shape
+    for t in range(frames):
+        for p in range(pixels):
+            signal = _polynomial_at(response, (film[t, p] - middle) / half)
+            for band in range(bands):
+                bend = _polynomial_at(bends[band - 1], signal) if band > 0 else 0.0
+                emitted = emissivity[band, p] * (signal + bend)
+                signals[band, t, p] -= 0.0 if np.isnan(emitted) else emitted
+
+
+def _polynomial(curve: Curve) -> tuple[Array, float, float]:
+    """Signal less the reference (degree) of temperatures over a middle and a half [K]."""
+    low, high = curve.lowest, curve.highest
     kelvin = np.linspace(low, high, 64)
-    fits = [
-        Polynomial.fit(kelvin, curve.signal(kelvin) - curve.reference, _DEGREE, [low, high])
-        for curve in curves
-    ]
-    return np.array([fit.coef for fit in fits]), 0.5 * (low + high), 0.5 * (high - low)
+    signal = curve.signal(kelvin) - curve.reference
+    series = Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef
+    return series, 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _interpolated(inputs: Inputs) -> Array:

@@ -37,7 +37,8 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
             both = joint.solve(inputs, result, threads, frames)
             inputs = inputs if both is None else replace(inputs, difference=both.difference)
             each(inputs, None)
-        maps = planes.project(inputs, result, threads)
+        shares = neighbours.emissivities(inputs, result)
+        maps = planes.project(inputs, result, shares, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
         if not frames.smooth:
             each(inputs, material)
@@ -68,10 +69,11 @@ def pooled(
     """
     frames = joint.Frames.of(before)
     both: joint.Joint | None = joint.from_result(inputs, before, frames)
-    inputs = replace(inputs, difference=both.difference)
-    maps = planes.project(inputs, before, threads)
-    survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
+    shares = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
+        inputs = replace(inputs, difference=both.difference)
+        maps = planes.project(inputs, before, shares, threads)
+        survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
@@ -81,7 +83,10 @@ def pooled(
             inputs, source, threads, frames, maps=maps, material=material, before=both
         )
         if both is None:  # the object hardly differs between the places
+            inputs = replace(inputs, difference=None)
             break
+        shares = both.emissivity
+    if both is not None:
         inputs = replace(inputs, difference=both.difference)
     each(inputs, material)
     if both is not None:
