@@ -98,7 +98,10 @@ def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, A
     for top in range(0, shape[0], _ROWS):
         rows = slice(top, top + _ROWS)
         background = result["background_temperature"].isel(y=rows).values
-        excess[rows] = background.mean(axis=0) - np.median(background, axis=0)
+        # Sorted along contiguous samples, which is far faster than a median along the first axis.
+        ordered = np.sort(np.ascontiguousarray(np.moveaxis(background, 0, -1)), axis=-1)
+        median = ordered[..., [(frames - 1) // 2, frames // 2]].mean(axis=-1)
+        excess[rows] = background.mean(axis=0) - median
         deviation[rows] = result["background_temperature_std"].isel(y=rows).values.mean(axis=0)
         release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
