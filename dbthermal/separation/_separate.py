@@ -40,10 +40,10 @@ _UNMEASURED: Final = np.uint32(schema.UNMEASURED)
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
 # displacement is looked for [pixel]; chance below and pixels or frames from which it is one, and by
 # how many times a window's changes have to exceed the noise, in variance.
-_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 24), 4, 2.0
+_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 16), 4, 2.0
 _CHANCE, _LEAST, _LEAST_LATE, _STRONG = 1e-3, 0.3, 0.1, 3.0
 # Pixels that tell the functions of time, and share of its samples that a pixel must have.
-_TOLD_BY, _COMMON = 200, 0.9
+_TOLD_BY, _COMMON = 100, 0.9
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
@@ -260,19 +260,19 @@ def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
     inputs = check(corrected, response, get_method("subspace"), "subspace")
     bands, time = inputs.bands[:2], corrected["time"].values
     every = slice(None, None, max(1, time.size // _FRAMES))
-    counts, inside = corrected["counts"].isel(band=bands, time=every), _measured(corrected)
+    counts, inside = corrected["counts"].isel(time=every), _measured(corrected)
+    times = time[every]
     slopes = np.array([inputs.curves[band].reference_slope for band in bands], dtype=np.float32)
 
     def films(rows: slice, columns: slice) -> Array:
         """Films (band, time, pixel) [K] of some pixels."""
-        part = counts.isel(y=rows, x=columns).values / slopes[:, np.newaxis, np.newaxis, np.newaxis]
-        return _filled(part.reshape(*part.shape[:2], -1))
+        part = counts.isel(y=rows, x=columns).values[bands]
+        return _filled(part.reshape(2, times.size, -1) / slopes[:, np.newaxis, np.newaxis])
 
     height, width = (one.stop - one.start for one in inside)
     step = max(1, int(np.sqrt(height * width / _TOLD_BY)))
     some = films(*(slice(one.start, one.stop, step) for one in inside))[0].T
     segment = inputs.capture["segment"].values[every] if "segment" in inputs.capture else None
-    times = time[every]
     functions = []
     for order in (min(HIGHEST_ORDER, times.size // 4), times.size // 4):
         curves = smooth.subspace(times, order, segment=segment).functions

@@ -75,12 +75,13 @@ def hold(
     constant = np.where(told & ~sound, _around(square * variance, both | (stay & sound)), 0.0)
     factor, film = square * both, pooled["object_temperature_std"].values
     maps = [(pooled[name].values, part.values) for name, part in alone.items() if "x" in part.dims]
-    for row, wider in enumerate((factor > 0) | (constant > 0)):
-        std, added = film[:, row, wider], np.nan_to_num(single[:, row, wider])
-        widened = std**2 + factor[row, wider] * added**2 + constant[row, wider]
-        film[:, row, wider] = np.sqrt(widened)
+    wider = (factor > 0) | (constant > 0)
+    for row in np.flatnonzero((wider | stay).any(axis=1)):
+        here, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
+        added = factor[row, here] * np.nan_to_num(single[:, row, here]) ** 2 + constant[row, here]
+        film[:, row, here] = np.sqrt(film[:, row, here] ** 2 + added)
         for target, part in maps:
-            target[..., row, stay[row]] = part[..., row, stay[row]]
+            target[..., row, alike] = part[..., row, alike]
         release()
 
 
