@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
-from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -260,18 +259,20 @@ def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
     inputs = check(corrected, response, get_method("subspace"), "subspace")
     bands, time = inputs.bands[:2], corrected["time"].values
     every = slice(None, None, max(1, time.size // _FRAMES))
-    counts, inside = corrected["counts"].isel(time=every), _measured(corrected)
+    counts, inside = corrected["counts"].variable[:, every], _measured(corrected)
     times = time[every]
     slopes = np.array([inputs.curves[band].reference_slope for band in bands], dtype=np.float32)
 
-    def films(rows: slice, columns: slice) -> Array:
-        """Films (band, time, pixel) [K] of some pixels."""
-        part = counts.isel(y=rows, x=columns).values[bands]
-        return _filled(part.reshape(2, times.size, -1) / slopes[:, np.newaxis, np.newaxis])
+    def films(*places: tuple[slice, slice]) -> Array:
+        """Films (band, time, pixel) [K] of the pixels at some rows and columns."""
+        parts = (counts[:, :, rows, columns].values[bands] for rows, columns in places)
+        film = np.concatenate([part.reshape(2, times.size, -1) for part in parts], axis=2)
+        return _filled(film / slopes[:, np.newaxis, np.newaxis])
 
     height, width = (one.stop - one.start for one in inside)
     step = max(1, int(np.sqrt(height * width / _TOLD_BY)))
-    some = films(*(slice(one.start, one.stop, step) for one in inside))[0].T
+    rows, columns = (slice(one.start, one.stop, step) for one in inside)
+    some = films((rows, columns))[0].T
     segment = inputs.capture["segment"].values[every] if "segment" in inputs.capture else None
     functions = []
     for order in (min(HIGHEST_ORDER, times.size // 4), times.size // 4):
@@ -287,24 +288,25 @@ def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
     noise = side**2 * inputs.noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
     found: list[list[Array]] = [[] for _ in functions]
-    for top, left in product(tops, lefts):
-        film = films(slice(top, top + side), slice(left, left + side))
-        planes = (together @ film).reshape(2, -1, side, side)
-        planes = gaussian_filter(planes, (0.0, 0.0, _BLUR, _BLUR))
-        parts = np.split(planes, len(functions), axis=1)
+    for top in tops:
+        film = films(*((slice(top, top + side), slice(left, left + side)) for left in lefts))
+        planes = (together @ film).reshape(2, -1, len(lefts), side, side)
+        planes = gaussian_filter(planes, (0.0, 0.0, 0.0, _BLUR, _BLUR)).swapaxes(1, 2)
+        parts = np.split(planes, len(functions), axis=2)
         for equations, (first, second), rate in zip(found, parts, rates, strict=True):
-            late = np.tensordot(rate, first, 1)
-            design = np.stack([first, *np.gradient(first, axis=(1, 2)), late]).reshape(4, -1)
-            white = noise * np.array(
-                [len(rate), *[0.5 / _BLUR**2 * len(rate)] * 2, np.sum(rate**2)]
-            )
-            normal, right = design @ design.T - np.diag(white), design @ second.ravel()
-            if normal[0, 0] > _STRONG * white[0]:
-                ratio, cross = right[0] / normal[0, 0], normal[0, 1:]
-                tensor = normal[1:, 1:] - np.outer(cross, cross) / normal[0, 0]
-                rest = ratio * (right[1:] - ratio * cross)
-                equations.append(np.stack([*ratio**2 * tensor, rest]))
-    return [np.array(equations).reshape(-1, 4, 3) for equations in found]
+            late = np.einsum("ij,wjyx->wiyx", rate, first, optimize=True)
+            design = np.stack([first, *np.gradient(first, axis=(2, 3)), late], axis=1)
+            design, target = design.reshape(len(lefts), 4, -1), second.reshape(len(lefts), -1, 1)
+            each = len(rate) * np.array([1.0, *[0.5 / _BLUR**2] * 2, np.mean(rate**2) * len(rate)])
+            normal, right = design @ design.mT - np.diag(noise * each), design @ target
+            strong = normal[:, 0, 0] > _STRONG * noise * len(rate)
+            normal, right = normal[strong], right[strong]
+            size, cross = normal[:, :1, :1], normal[:, :1, 1:]
+            ratio = right[:, :1] / size
+            tensor = ratio**2 * (normal[:, 1:, 1:] - cross.mT * cross / size)
+            rest = ratio * (right[:, 1:].mT - ratio * cross)
+            equations.append(np.concatenate([tensor, rest], axis=1))
+    return [np.concatenate(equations) for equations in found]
 
 
 def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:

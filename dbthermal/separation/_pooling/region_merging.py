@@ -105,7 +105,9 @@ class Regions:
 
     def roots(self) -> Labels:
         """Roots (cell + 1,) of all cells, that of no cell first."""
-        return np.array([self.root(cell) for cell in range(self._parent.size)])
+        while np.any(self._parent != self._parent[self._parent]):
+            self._parent = self._parent[self._parent]
+        return self._parent.copy()
 
     def known(self) -> Mask:
         """Roots (cell + 1,) of regions with an estimate of the first feature."""
