@@ -72,18 +72,15 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     if not seen.any():  # too few pixels tell it
         return []
     names, found = [str(name) for name in counts["band"].values], list[str]()
-    slopes = np.array(
-        [responses.curve(response, name).reference_slope for name in names], films.dtype
-    )
+    slopes = np.array([[responses.curve(response, name).reference_slope] for name in names])
     with np.errstate(invalid="ignore"):
-        changes = (
-            np.where(known, np.diff(films, axis=1), np.nan) / slopes[:, np.newaxis, np.newaxis]
-        )
+        changes = np.where(known, np.diff(films, axis=1), np.nan)  # [count]
     # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
     ordered = np.sort(changes, axis=2)  # NaN last
     ranks = (np.array([0.25, 0.5, 0.75]) * np.maximum(number[:, np.newaxis] - 1, 0)).astype(np.intp)
-    low, middle, high = np.moveaxis(np.take_along_axis(ordered, ranks[np.newaxis], axis=2), 2, 0)
-    mean = np.nansum(changes, axis=2, dtype=np.float64) / np.maximum(number, 1)
+    quartiles = np.take_along_axis(ordered, ranks[np.newaxis], axis=2)
+    low, middle, high = np.moveaxis(quartiles, 2, 0) / slopes
+    mean = np.nansum(changes, axis=2, dtype=np.float64) / np.maximum(number, 1) / slopes
     noise = 0.5 * MAD * np.median((high - low)[:, seen], axis=1) / np.sqrt(known.shape[1])
     mean, median = (
         np.where(seen, one - median_filter(one, (1, _AROUND)), 0.0)
@@ -91,9 +88,8 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     )
     unseen = np.abs(mean) + _SIGMAS * noise[:, np.newaxis]
     for place, size in enumerate(np.abs(mean)):
-        alone = (size > _CERTAIN * noise[place]) & np.all(
-            np.delete(unseen, place, axis=0) < _SHARE * size, axis=0
-        )
+        alone = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
+        alone &= size > _CERTAIN * noise[place]
         # In proportion to what moves, as a median is not; which is the same if all pixels step.
         alone &= np.abs(median[place] - mean[place]) < _EVEN * size
         if alone.any():

@@ -32,10 +32,6 @@ from dbthermal.separation._tiles import Array, Material
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
-# Share of the pixels by which more must be without a flag with a shift than without.
-_APART: Final = 0.02
-# Bits of pixels around an object, which a registration leaves without samples.
-_UNMEASURED: Final = np.uint32(schema.UNMEASURED)
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
 # displacement is looked for [pixel]; chance below and pixels or frames from which it is one, and by
 # how many times a window's changes have to exceed the noise, in variance.
@@ -68,11 +64,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 ) -> xr.Dataset:
     """Separate emission and reflection in a capture, with an answer at every pixel.
 
-    Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
-    reflections move, or show slow changes displaced, with the shift between the cameras'
-    reflections (`alignment.reflection_shift`) if fewer are apart with it, or more have no flag;
-    then with the pixels of each material pooled (`materials`), held to what they tell alone; last,
-    what is still unknown is completed (`complete`).
+    Each pixel alone (`solve`); where the bands show rapid changes displaced all over the image,
+    with the shift between the cameras' reflections (`alignment.reflection_shift`); then with the
+    pixels of each material pooled (`materials`), held to what they tell alone; last, what is still
+    unknown is completed (`complete`).
 
     Parameters
     ----------
@@ -186,7 +181,7 @@ def _apart(
     known: xr.Dataset | None,
 ) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
     """First separation, the shift of the reflections if it needs one, and what is not explained."""
-    first, apart = known, cameras_apart(corrected, response)
+    apart = cameras_apart(corrected, response)
     if apart > 0.0:
         try:
             shift = alignment.reflection_shift(corrected, response)
@@ -194,22 +189,18 @@ def _apart(
             shift = None
         if shift is not None and seen_apart(shift):
             alone = one(reflection_shift=shift)
-            # An object that heats rapidly is apart in pixels that are paired by their reflections.
-            unpaired, moving = _pixels_apart(alone, shift)
-            explained = unpaired < apart * moving
-            if not explained:
-                first = one() if first is None else first
-                explained = _unflagged(alone) > _unflagged(first) + _APART
-            if explained:
-                return alone, shift, _unexplained(alone)
-    first = one() if first is None else first
+            return alone, shift, _unexplained(alone)
+    first = one() if known is None else known
     return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
 
 
 def _unexplained(alone: xr.Dataset) -> list[str]:
     """Doubt about a shift of the reflections with which bands are apart in many pixels."""
-    apart, moving = _pixels_apart(alone)
-    return [_UNEXPLAINED.format(apart / moving)] if apart > _MANY * moving else []
+    status = alone["status"].values
+    moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
+    apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
+    share = apart.sum() / max(moving.sum(), 1)
+    return [_UNEXPLAINED.format(share)] if share > _MANY else []
 
 
 def cameras_apart(corrected: xr.Dataset, response: xr.Dataset) -> float:
@@ -257,27 +248,24 @@ def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
     no object shows that heats within seconds, where reflections are as rapid.
     """
     inputs = check(corrected, response, get_method("subspace"), "subspace")
-    bands, time = inputs.bands[:2], corrected["time"].values
-    every = slice(None, None, max(1, time.size // _FRAMES))
+    every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
+    bands, time = inputs.bands[:2], corrected["time"].values[every]
     counts, inside = corrected["counts"].variable[:, every], _measured(corrected)
-    times = time[every]
     slopes = np.array([inputs.curves[band].reference_slope for band in bands], dtype=np.float32)
 
-    def films(*places: tuple[slice, slice]) -> Array:
+    def films(*places: tuple[slice, ...]) -> Array:
         """Films (band, time, pixel) [K] of the pixels at some rows and columns."""
-        parts = (counts[:, :, rows, columns].values[bands] for rows, columns in places)
-        film = np.concatenate([part.reshape(2, times.size, -1) for part in parts], axis=2)
+        parts = (counts[:, :, *place].values[bands] for place in places)
+        film = np.concatenate([part.reshape(2, time.size, -1) for part in parts], axis=2)
         return _filled(film / slopes[:, np.newaxis, np.newaxis])
 
     height, width = (one.stop - one.start for one in inside)
     step = max(1, int(np.sqrt(height * width / _TOLD_BY)))
-    rows, columns = (slice(one.start, one.stop, step) for one in inside)
-    some = films((rows, columns))[0].T
+    some = films(tuple(slice(one.start, one.stop, step) for one in inside))[0].T
     segment = inputs.capture["segment"].values[every] if "segment" in inputs.capture else None
-    functions = []
-    for order in (min(HIGHEST_ORDER, times.size // 4), times.size // 4):
-        curves = smooth.subspace(times, order, segment=segment).functions
-        functions.append(leading(some - some @ curves @ curves.T))
+    orders = min(HIGHEST_ORDER, time.size // 4), time.size // 4
+    curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
+    functions = [leading(some - some @ part @ part.T) for part in curves]
     rates = [part.T @ np.gradient(part, axis=0) for part in functions]
     together = np.concatenate(functions, axis=1).T.astype(np.float32)
     side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
@@ -313,11 +301,9 @@ def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:
     """Rows and columns with samples in some frames, as of an object in a part of the image."""
     every = slice(None, None, max(1, corrected.sizes["time"] // _ALONG))
     known = schema.measured(corrected["counts"].isel(time=every).values).all(axis=0).any(axis=0)
-    places = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
-    if not known.any():
-        places = [np.arange(size) for size in known.shape]
-    rows, columns = (slice(int(one[0]), int(one[-1]) + 1) for one in places)
-    return rows, columns
+    known |= not known.any()
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
 def _filled(films: Array) -> Array:
@@ -332,27 +318,3 @@ def _filled(films: Array) -> Array:
     frame = np.where(frame < 0, known.argmax(axis=0), frame)
     filled = np.take_along_axis(films, frame[np.newaxis], axis=1)
     return np.where(known.mean(axis=0) > _COMMON, filled, np.float32(0.0))
-
-
-def _unflagged(result: xr.Dataset) -> float:
-    """Share of the pixels with samples that have no flag."""
-    status = result["status"].values
-    measured = (status & _UNMEASURED) == 0
-    return float((status == 0).sum() / max(int(measured.sum()), 1))
-
-
-def _pixels_apart(result: xr.Dataset, shift: xr.Dataset | None = None) -> tuple[int, int]:
-    """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1.
-
-    With a shift of the reflections also those that have no pair, though not by the image's end.
-    """
-    status = result["status"].values
-    moving = (status & (_UNMEASURED | np.uint32(Status.NO_BACKGROUND_MOTION))) == 0
-    apart = (status & np.uint32(Status.BANDS_APART)) != 0
-    if shift is not None:
-        reach = np.nanmax(np.abs(shift["shift"].where(shift["known"]).values), axis=(1, 2))
-        down, right = np.minimum(np.ceil(reach).astype(int), np.array(status.shape) // 2)
-        inside = np.zeros(status.shape, dtype=bool)
-        inside[down : status.shape[0] - down, right : status.shape[1] - right] = True
-        apart |= inside & ((status & np.uint32(Status.NO_REFLECTION_PAIR)) != 0)
-    return int((apart & moving).sum()), max(int(moving.sum()), 1)

@@ -60,8 +60,7 @@ def mean_signals(
             with np.errstate(invalid="ignore"):  # without a sample
                 means[index, rows] = curve.linearise(sums.sum(axis=0) / frames[index, rows])
                 if index == 0:
-                    first, _, last = sums / numbers / curve.reference_slope
-                    change[rows] = last - first
+                    change[rows] = np.diff(curve.linearise(sums[::2] / numbers[::2]), axis=0)[0]
     # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
     inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
     variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
@@ -75,27 +74,27 @@ def mean_signals(
     return means, variances, change
 
 
-def reflected_difference(result: xr.Dataset, bands: list[int], pixels: Mask) -> tuple[Array, Array]:
+def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tuple[Array, Array]:
     r"""
     Reflection in the differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
 
     The median is the background at rest, which makes no edges. 0 without a background estimate:
-    that is where nothing moved; and of other pixels than some (y, x).
+    that is where nothing moved; and of other pixels than those (y, x).
     """
     share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * (
         1.0 - result["emissivity"].values[bands[0]]
     )
     films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
-    frames, (excess, deviation) = len(films[0]), np.zeros((2, *pixels.shape))
-    for row in np.flatnonzero(pixels.any(axis=1)):
-        film, std = (part[:, row, pixels[row]] for part in films)
+    frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
+    for row in np.flatnonzero(of.any(axis=1)):
+        film, std = (part[:, row, of[row]] for part in films)
         # Sorted along contiguous samples: far faster than a median along the first axis.
         ordered = np.sort(film.T.copy(), axis=1)
         median = ordered[:, [(frames - 1) // 2, frames // 2]].mean(axis=1)
-        excess[row, pixels[row]] = film.mean(axis=0) - median
-        deviation[row, pixels[row]] = std.mean(axis=0)
+        excess[row, of[row]] = film.mean(axis=0) - median
+        deviation[row, of[row]] = std.mean(axis=0)
         release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames

@@ -23,8 +23,7 @@ _MORE_AROUND: Final = 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _AROUND: Final = 1.5
 _SOME: Final = 1e-3
-# Frames, about, that tell how much an object differs.
-_FRAMES: Final = 64
+_FRAMES: Final = 64  # about as many tell how much an object differs
 
 
 def hold(
@@ -76,7 +75,7 @@ def hold(
     factor, film = square * both, pooled["object_temperature_std"].values
     maps = [(pooled[name].values, part.values) for name, part in alone.items() if "x" in part.dims]
     wider = (factor > 0) | (constant > 0)
-    for row in np.flatnonzero((wider | stay).any(axis=1)):
+    for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
         here, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
         added = factor[row, here] * np.nan_to_num(single[:, row, here]) ** 2 + constant[row, here]
         film[:, row, here] = np.sqrt(film[:, row, here] ** 2 + added)
