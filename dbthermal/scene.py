@@ -174,12 +174,12 @@ def _aligned(
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = joint.apart(corrected, scale, **options)
-        if field is not None and cameras_apart(aligned, response)[0] > 0.0:
+        if field is not None and cameras_apart(aligned, response) > 0.0:
             return aligned, field
         return aligned, None
     found = joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    if found.field is not None and not cameras_apart(aligned, response)[0] > 0.0:
+    if found.field is not None and not cameras_apart(aligned, response) > 0.0:
         # No delay of a shift that is not used.
         found = joint.compare(corrected, scale, **options, side_by_side=False)
         aligned = on_one_clock(corrected, **{**options, "offset": found.offset})

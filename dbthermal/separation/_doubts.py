@@ -13,7 +13,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._tiles import RANGE_SIGMAS
 
 _FRAMES: Final = 200  # about as many frames and pixels tell
-_PIXELS: Final = 10_000
+_PIXELS: Final = 2_500
 _OUTSIDE: Final = 0.01  # share of samples outside the calibration that is told
 _HARDLY: Final = 0.1  # share of the moving pixels
 _REASONS: Final = 3  # flags that are named
@@ -63,38 +63,40 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     step = max(1, int(np.sqrt(counts[0, 0].size / pixels)))
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(time.size)
     joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
-    means, medians, noise, found = [], [], [], list[str]()
     films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)
     # Samples of all bands: one clock's resampling leaves out those of one band where much moves.
     known = schema.measured(films).all(axis=0)
-    for name, film in zip(counts["band"].values, films, strict=True):
-        slope = responses.curve(response, str(name)).reference_slope
-        changes = np.diff(np.where(known, film / slope, np.nan), axis=0)
-        seen = joined & (np.isfinite(changes).sum(axis=1) > max(_FEWEST, 0.5 * changes.shape[1]))
-        if not seen.any():  # too few pixels tell it
-            return []
-        low, middle, high = np.zeros((3, seen.size))
-        low[seen], middle[seen], high[seen] = np.nanpercentile(changes[seen], [25, 50, 75], axis=1)
-        mean = np.zeros(seen.size)
-        mean[seen] = np.nanmean(changes[seen], axis=1)
-        # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
-        means.append(np.where(seen, mean - median_filter(mean, _AROUND), 0.0))
-        medians.append(np.where(seen, middle - median_filter(middle, _AROUND), 0.0))
-        width = np.median((high - low)[seen])
-        noise.append(0.5 * MAD * width / np.sqrt(changes.shape[1]))
-    # In proportion to what moves, as a median is not; which is the same if all pixels step.
-    unseen = np.abs(means) + _SIGMAS * np.array(noise)[:, np.newaxis]
-    for place, (mean, median) in enumerate(zip(means, medians, strict=True)):
-        size = np.abs(mean)
-        alone = (size > _CERTAIN * noise[place]) & np.all(
-            np.delete(unseen, place, axis=0) < _SHARE * size, axis=0
-        )
-        alone &= np.abs(median - mean) < _EVEN * size
+    known = known[1:] & known[:-1]
+    number = known.sum(axis=1)
+    seen = joined & (number > max(_FEWEST, 0.5 * known.shape[1]))
+    if not seen.any():  # too few pixels tell it
+        return []
+    names, found = [str(name) for name in counts["band"].values], list[str]()
+    slopes = np.array([[responses.curve(response, name).reference_slope] for name in names])
+    with np.errstate(invalid="ignore"):
+        changes = np.where(known, np.diff(films, axis=1), np.nan)  # [count]
+    # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
+    ordered = np.sort(changes, axis=2)  # NaN last
+    ranks = (np.array([0.25, 0.5, 0.75]) * np.maximum(number[:, np.newaxis] - 1, 0)).astype(np.intp)
+    quartiles = np.take_along_axis(ordered, ranks[np.newaxis], axis=2)
+    low, middle, high = np.moveaxis(quartiles, 2, 0) / slopes
+    mean = np.nansum(changes, axis=2, dtype=np.float64) / np.maximum(number, 1) / slopes
+    noise = 0.5 * MAD * np.median((high - low)[:, seen], axis=1) / np.sqrt(known.shape[1])
+    mean, median = (
+        np.where(seen, one - median_filter(one, (1, _AROUND)), 0.0)
+        for one in (np.where(seen, mean, 0.0), np.where(seen, middle, 0.0))
+    )
+    unseen = np.abs(mean) + _SIGMAS * noise[:, np.newaxis]
+    for place, size in enumerate(np.abs(mean)):
+        alone = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
+        alone &= size > _CERTAIN * noise[place]
+        # In proportion to what moves, as a median is not; which is the same if all pixels step.
+        alone &= np.abs(median[place] - mean[place]) < _EVEN * size
         if alone.any():
             frame = int(np.argmax(size * alone))
             found.append(
-                f"The level of band '{counts['band'].values[place]}' steps by "
-                f"{mean[frame]:.2g} K at {time[frame + 1]:g} s in all pixels, and no other "
+                f"The level of band '{names[place]}' steps by "
+                f"{mean[place, frame]:.2g} K at {time[frame + 1]:g} s in all pixels, and no other "
                 "band's does: a camera's own, which no error bar holds. Must be steady, or marked "
                 "(correction.mark_shutter)."
             )

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
-from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,6 +15,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import alignment, schema
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
+from dbthermal.alignment._matching import leading
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
@@ -32,18 +32,13 @@ from dbthermal.separation._tiles import Array, Material
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
-# Pixels, about, from which it is told whether bands are apart.
-_LOOKED_AT: Final = 2000
-# Share of the pixels with moving reflections whose bands are apart, from which a shift is sought,
-# if it is that by more than so many of its standard deviations.
-_APART, _SIGMAS = 0.02, 3.0
-# Bits of pixels around an object, which a registration leaves without samples.
-_UNMEASURED: Final = np.uint32(schema.UNMEASURED)
 # Frames, windows along either side, their sides [pixel], at least so many, and the blur in which a
-# displacement is looked for [pixel]; chance below and pixels from which it is one, and by how many
-# times a window's changes have to exceed the noise, in variance.
-_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 24), 4, 2.0
-_CHANCE, _LEAST, _STRONG = 1e-3, 0.3, 3.0
+# displacement is looked for [pixel]; chance below and pixels or frames from which it is one, and by
+# how many times a window's changes have to exceed the noise, in variance.
+_FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 16), 4, 2.0
+_CHANCE, _LEAST, _LEAST_LATE, _STRONG = 1e-3, 0.3, 0.1, 3.0
+# Pixels that tell the functions of time, and share of its samples that a pixel must have.
+_TOLD_BY, _COMMON = 100, 0.9
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
@@ -69,11 +64,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 ) -> xr.Dataset:
     """Separate emission and reflection in a capture, with an answer at every pixel.
 
-    Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
-    reflections move, or show slow changes displaced, with the shift between the cameras'
-    reflections (`alignment.reflection_shift`) if fewer are apart with it, or more have no flag;
-    then with the pixels of each material pooled (`materials`), held to what they tell alone; last,
-    what is still unknown is completed (`complete`).
+    Each pixel alone (`solve`); where the bands show rapid changes displaced all over the image,
+    with the shift between the cameras' reflections (`alignment.reflection_shift`); then with the
+    pixels of each material pooled (`materials`), held to what they tell alone; last, what is still
+    unknown is completed (`complete`).
 
     Parameters
     ----------
@@ -138,7 +132,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         alone = laid_on(alone, corrected, "the result alone", "the capture")
     given = alone
     if reflection_shift is None:
-        alone, reflection_shift, doubts = _apart(one, corrected, response, workers, alone)
+        alone, reflection_shift, doubts = _apart(one, corrected, response, alone)
         source = "none" if reflection_shift is None else "found"
     else:
         alone = one(reflection_shift=reflection_shift) if alone is None else alone
@@ -184,13 +178,10 @@ def _apart(
     one: Callable[..., xr.Dataset],
     corrected: xr.Dataset,
     response: xr.Dataset,
-    workers: int,
     known: xr.Dataset | None,
 ) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
     """First separation, the shift of the reflections if it needs one, and what is not explained."""
-    apart, good = 0.0, 0.0
-    if min(corrected.sizes.get(name, 0) for name in ("y", "x")) >= SMALLEST:  # solve refuses others
-        apart, good = cameras_apart(corrected, response, workers)
+    apart = cameras_apart(corrected, response)
     if apart > 0.0:
         try:
             shift = alignment.reflection_shift(corrected, response)
@@ -198,139 +189,132 @@ def _apart(
             shift = None
         if shift is not None and seen_apart(shift):
             alone = one(reflection_shift=shift)
-            # An object that heats rapidly is apart in pixels that are paired by their reflections.
-            left, moving = _pixels_apart(alone, shift)
-            if left / moving < apart or _unflagged(alone) > good + _APART:
-                return alone, shift, _unexplained(alone)
+            return alone, shift, _unexplained(alone)
     first = one() if known is None else known
     return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
 
 
 def _unexplained(alone: xr.Dataset) -> list[str]:
     """Doubt about a shift of the reflections with which bands are apart in many pixels."""
-    apart, moving = _pixels_apart(alone)
-    return [_UNEXPLAINED.format(apart / moving)] if apart > _MANY * moving else []
+    status = alone["status"].values
+    moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
+    apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
+    share = apart.sum() / max(moving.sum(), 1)
+    return [_UNEXPLAINED.format(share)] if share > _MANY else []
 
 
-def cameras_apart(
-    corrected: xr.Dataset, response: xr.Dataset, workers: int = 2
-) -> tuple[float, float]:
-    """Share of pixels with moving reflections whose bands are apart, 0 if that may be chance.
+def cameras_apart(corrected: xr.Dataset, response: xr.Dataset) -> float:
+    """Share of windows of the image in which the bands show rapid changes apart; 0 if none do.
 
-    Of some pixels, for all would take long; and the share of them without a flag. Slow reflections
-    are simultaneous within a frame though they are apart: then the share of windows displaced.
+    Displaced in the image, or in time. Both are seen if one alone is more than that of a poor
+    registration, and they are beyond chance by what they change without one window after another
+    (Hotelling's T-squared of the jackknife): an object's rapid changes displace a window, and so
+    does a border of materials, but not all windows alike.
     """
-    corrected, some = _measured(corrected)
-    some = solve(some, response, workers=workers)
-    apart, moving = _pixels_apart(some)
-    chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
-    share = apart / moving if apart / moving > _APART + chance else 0.0
-    return share or _displaced(corrected, response), _unflagged(some)
+    if min(corrected.sizes.get(name, 0) for name in ("y", "x")) < SMALLEST:  # solve refuses others
+        return 0.0
+    return max(_share_apart(each) for each in _displacements(corrected, response))
 
 
-def _measured(corrected: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Rows and columns with samples, as of an object in a part of the image; some pixels of it."""
-    step = _step(corrected)
-    some = corrected.isel(y=slice(None, None, step), x=slice(None, None, step)).load()
-    known = schema.measured(some["counts"].values).all(axis=0).any(axis=0)
-    if not known.any():
-        return corrected, some
-    places = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
-    (top, left), (bottom, right) = ([one[0] for one in places], [one[-1] + 1 for one in places])
-    inside = corrected.isel(y=slice(top * step, bottom * step), x=slice(left * step, right * step))
-    if (finer := _step(inside)) == step:
-        return inside, some.isel(y=slice(top, bottom), x=slice(left, right))
-    every = slice(None, None, finer)
-    return inside, inside.isel(y=every, x=every).load()
-
-
-def _step(corrected: xr.Dataset) -> int:
-    """Rows and columns from one to the next of some pixels that are looked at."""
-    pixels = corrected.sizes["y"] * corrected.sizes["x"]
-    return max(1, int(np.sqrt(pixels / _LOOKED_AT)))
-
-
-def _displaced(corrected: xr.Dataset, response: xr.Dataset) -> float:
-    """Share of windows of the image in which the bands show rapid changes displaced; 0 if none do.
-
-    Their common displacement is seen if it is more than that of a poor registration, and beyond
-    chance by what it changes without one window after another (Hotelling's T-squared of the
-    jackknife): an object's own rapid changes displace a window, and so does a border of materials.
-    """
-    each = _displacements(corrected, response)
-    windows, whole = len(each), each.sum(axis=0)
+def _share_apart(each: Array) -> float:
+    """Share of windows whose bands are apart, from normal equations A d = g (window, 4, 3)."""
+    windows, whole, size = len(each), each.sum(axis=0), each.shape[2]
     # All windows, and those without one after another, have to tell a displacement.
     told = np.concatenate([whole[np.newaxis], whole - each])
-    if windows < _FEWEST or np.linalg.eigvalsh(told[:, :2]).min() <= 0.0:
+    if windows < _FEWEST or np.linalg.eigvalsh(told[:, :size]).min() <= 0.0:
         return 0.0
-    shift, *without = (np.linalg.solve(one[:2], one[2]) for one in told)
+    shift, *without = (np.linalg.solve(one[:size], one[size]) for one in told)
     covariance = (windows - 1) ** 2 / windows * np.cov(np.transpose(without))
-    square = shift @ np.linalg.solve(covariance, shift)
-    chance = fdtrc(2, windows - 2, 0.5 * (windows - 2) / (windows - 1) * square)
-    if chance > _CHANCE or np.hypot(*shift) < _LEAST:
+    square, free = shift @ np.linalg.solve(covariance, shift), windows - size
+    chance = fdtrc(size, free, free / (windows - 1) / size * square)
+    in_image = np.linalg.solve(whole[:2, :2], whole[size, :2])
+    in_time = whole[size, 2] / whole[2, 2]
+    if chance > _CHANCE or (np.hypot(*in_image) < _LEAST and abs(in_time) < _LEAST_LATE):
         return 0.0
     # Windows whose residual is smaller with it: 2 d g - d A d > 0.
-    return float(np.mean((2.0 * each[:, 2] - each[:, :2] @ shift) @ shift > 0.0))
+    return float(np.mean((2.0 * each[:, size] - each[:, :size] @ shift) @ shift > 0.0))
 
 
-def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> Array:
-    r"""Normal equations A d = g (window, 3, 2) of the displacement of windows with rapid changes.
+def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
+    r"""Normal equations A d = g (window, 4, 3) of the displacement of windows with rapid changes.
 
-    Of the regression of one band on another and its gradient (Lucas and Kanade 1981), of both
-    blurred, with a ratio of each window that is eliminated, less what noise adds to them:
+    Down and right in the image [pixel], and in time [frame]: of the regression of one band on
+    another and its gradients (Lucas and Kanade 1981), of both blurred, with a ratio of each window
+    that is eliminated, less what noise adds to them:
 
     .. math:: z_2 = \kappa_w \, (z_1 + d \cdot \nabla z_1)
+
+    Compared are the functions of time that hold most of what no smooth object shows; and of what
+    no object shows that heats within seconds, where reflections are as rapid.
     """
     inputs = check(corrected, response, get_method("subspace"), "subspace")
     every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
-    counts, time = corrected["counts"].isel(time=every), corrected["time"].values[every]
-    functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
-    height, width = counts.shape[-2:]
+    bands, time = inputs.bands[:2], corrected["time"].values[every]
+    counts, inside = corrected["counts"].variable[:, every], _measured(corrected)
+    slopes = np.array([inputs.curves[band].reference_slope for band in bands], dtype=np.float32)
+
+    def films(*places: tuple[slice, ...]) -> Array:
+        """Films (band, time, pixel) [K] of the pixels at some rows and columns."""
+        parts = (counts[:, :, *place].values[bands] for place in places)
+        film = np.concatenate([part.reshape(2, time.size, -1) for part in parts], axis=2)
+        return _filled(film / slopes[:, np.newaxis, np.newaxis])
+
+    height, width = (one.stop - one.start for one in inside)
+    step = max(1, int(np.sqrt(height * width / _TOLD_BY)))
+    some = films(tuple(slice(one.start, one.stop, step) for one in inside))[0].T
+    segment = inputs.capture["segment"].values[every] if "segment" in inputs.capture else None
+    orders = min(HIGHEST_ORDER, time.size // 4), time.size // 4
+    curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
+    functions = [leading(some - some @ part @ part.T) for part in curves]
+    rates = [part.T @ np.gradient(part, axis=0) for part in functions]
+    together = np.concatenate(functions, axis=1).T.astype(np.float32)
     side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
     tops, lefts = (
-        np.linspace(0, size - side, min(_ALONG, size // side)).astype(int)
-        for size in (height, width)
+        one.start + np.linspace(0, size - side, min(_ALONG, size // side)).astype(int)
+        for one, size in zip(inside, (height, width), strict=True)
     )
-    found = []
-    for top, left in product(tops, lefts):
-        part = counts.isel(y=slice(top, top + side), x=slice(left, left + side)).values
-        rapid = []
-        for band in inputs.bands[:2]:
-            signal = inputs.curves[band].linearise(part[band].astype(np.float64))
-            signal = np.where(schema.measured(signal).all(axis=0), signal, 0.0)
-            signal -= np.tensordot(functions, np.tensordot(functions.T, signal, 1), 1)
-            rapid.append(gaussian_filter(signal, (0.0, _BLUR, _BLUR)))
-        design = np.stack([rapid[0], *np.gradient(rapid[0], axis=(1, 2))]).reshape(3, -1)
-        normal, right = design @ design.T, design @ rapid[1].ravel()
-        # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
-        white = design.shape[1] * inputs.noise[inputs.bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
-        normal -= white * np.diag([1.0, *[0.5 / _BLUR**2] * 2])
-        if normal[0, 0] > _STRONG * white:
-            ratio, cross = right[0] / normal[0, 0], normal[0, 1:]
-            tensor = normal[1:, 1:] - np.outer(cross, cross) / normal[0, 0]
-            found.append([*ratio**2 * tensor, ratio * (right[1:] - ratio * cross)])
-    return np.array(found).reshape(-1, 3, 2)
+    # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
+    noise = side**2 * inputs.noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
+    found: list[list[Array]] = [[] for _ in functions]
+    for top in tops:
+        film = films(*((slice(top, top + side), slice(left, left + side)) for left in lefts))
+        planes = (together @ film).reshape(2, -1, len(lefts), side, side)
+        planes = gaussian_filter(planes, (0.0, 0.0, 0.0, _BLUR, _BLUR)).swapaxes(1, 2)
+        parts = np.split(planes, len(functions), axis=2)
+        for equations, (first, second), rate in zip(found, parts, rates, strict=True):
+            late = np.einsum("ij,wjyx->wiyx", rate, first, optimize=True)
+            design = np.stack([first, *np.gradient(first, axis=(2, 3)), late], axis=1)
+            design, target = design.reshape(len(lefts), 4, -1), second.reshape(len(lefts), -1, 1)
+            each = len(rate) * np.array([1.0, *[0.5 / _BLUR**2] * 2, np.mean(rate**2) * len(rate)])
+            normal, right = design @ design.mT - np.diag(noise * each), design @ target
+            strong = normal[:, 0, 0] > _STRONG * noise * len(rate)
+            normal, right = normal[strong], right[strong]
+            size, cross = normal[:, :1, :1], normal[:, :1, 1:]
+            ratio = right[:, :1] / size
+            tensor = ratio**2 * (normal[:, 1:, 1:] - cross.mT * cross / size)
+            rest = ratio * (right[:, 1:].mT - ratio * cross)
+            equations.append(np.concatenate([tensor, rest], axis=1))
+    return [np.concatenate(equations) for equations in found]
 
 
-def _unflagged(result: xr.Dataset) -> float:
-    """Share of the pixels with samples that have no flag."""
-    status = result["status"].values
-    measured = (status & _UNMEASURED) == 0
-    return float((status == 0).sum() / max(int(measured.sum()), 1))
+def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:
+    """Rows and columns with samples in some frames, as of an object in a part of the image."""
+    every = slice(None, None, max(1, corrected.sizes["time"] // _ALONG))
+    known = schema.measured(corrected["counts"].isel(time=every).values).all(axis=0).any(axis=0)
+    known |= not known.any()
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 
 
-def _pixels_apart(result: xr.Dataset, shift: xr.Dataset | None = None) -> tuple[int, int]:
-    """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1.
+def _filled(films: Array) -> Array:
+    """Films (band, time, pixel) in which a sample that a band lacks is that before it.
 
-    With a shift of the reflections also those that have no pair, though not by the image's end.
+    Zero of a pixel that lacks more than a tenth of them.
     """
-    status = result["status"].values
-    moving = (status & (_UNMEASURED | np.uint32(Status.NO_BACKGROUND_MOTION))) == 0
-    apart = (status & np.uint32(Status.BANDS_APART)) != 0
-    if shift is not None:
-        reach = np.nanmax(np.abs(shift["shift"].where(shift["known"]).values), axis=(1, 2))
-        down, right = np.minimum(np.ceil(reach).astype(int), np.array(status.shape) // 2)
-        inside = np.zeros(status.shape, dtype=bool)
-        inside[down : status.shape[0] - down, right : status.shape[1] - right] = True
-        apart |= inside & ((status & np.uint32(Status.NO_REFLECTION_PAIR)) != 0)
-    return int((apart & moving).sum()), max(int(moving.sum()), 1)
+    known = schema.measured(films).all(axis=0)
+    if known.all():
+        return films
+    frame = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, np.newaxis], -1))
+    frame = np.where(frame < 0, known.argmax(axis=0), frame)
+    filled = np.take_along_axis(films, frame[np.newaxis], axis=1)
+    return np.where(known.mean(axis=0) > _COMMON, filled, np.float32(0.0))

@@ -1,5 +1,7 @@
 """Objects that heat rapidly: followed with true error bars, or flagged, in several scenes."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -58,6 +60,42 @@ def test_a_kinked_rise_is_followed() -> None:
     """A front of kinked rises of 0.3 to 3 s: most pixels without a flag, true intervals."""
     rng = np.random.default_rng(1)
     assert_followed("kink", heated("kink", rng), rng)
+
+
+def switched(rng: np.random.Generator, pair: tuple[float, float], rate: float) -> xr.Dataset:
+    """Scene of walkers before a heater that is switched on for 2 of 6 s, at a frame rate [Hz]."""
+    time = np.arange(int(20.0 * rate)) / rate
+    scene = Picture((28, 40)).draw(time, emissivity_of(*pair), rng)
+    level = np.zeros(time.size)
+    for frame in range(1, time.size):
+        aim = 30.0 * (time[frame] % 6.0 < 2.0)
+        level[frame] = aim + (level[frame - 1] - aim) * np.exp(-1.0 / (0.5 * rate))
+    rows, columns = np.indices((28, 40))
+    warm, profile = scene["object_temperature"], 1.0 + 0.2 * np.cos(columns / 9 + rows / 13)
+    curves = np.multiply.outer(level, profile)
+    return scene.assign(object_temperature=(warm.dims, 295.15 + curves, warm.attrs))
+
+
+QUICK = {("front", (0.60, 0.45), 10.0), ("heater", (0.86, 0.72), 10.0)}
+HEATED = product(("front", "heater"), ((0.86, 0.72), (0.60, 0.45), (0.95, 0.85)), (10.0, 30.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "pair", "rate"),
+    [pytest.param(*case, marks=[] if case in QUICK else [pytest.mark.slow]) for case in HEATED],
+)
+def test_an_object_that_heats_within_seconds_is_no_parallax(
+    kind: str, pair: tuple[float, float], rate: float
+) -> None:
+    """Cameras at one place: no shift is found, and nobody is warned of bands apart."""
+    rng = np.random.default_rng(1)
+    scene = switched(rng, pair, rate)
+    if kind == "front":
+        front = Picture((28, 40), rise=(0.5, 2.0))
+        scene = front.draw(scene["time"].values, emissivity_of(*pair), rng)
+    result = separation.separate(simulation.observe(scene, RIG.response(), rng), RIG.response())
+    assert result.attrs["reflection_shift"] == "none"
+    assert "warnings" not in result.attrs
 
 
 @pytest.mark.long

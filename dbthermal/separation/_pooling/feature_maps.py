@@ -33,25 +33,34 @@ _EMPTY: Final = 1e-3
 
 def mean_signals(
     corrected: xr.Dataset, response: xr.Dataset, bands: list[int], noise: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Mean linearised signals (band, y, x) [K] of the bands, reference first, and variances [K^2].
 
     NaN without a sample. Where neighbours differ by more than the noise (band) [K] explains, as by
-    a residual fixed pattern, that is added to the variance.
+    a residual fixed pattern, that is added to the variance. And the mean of the reference (y, x)
+    [K] in the last third of the frames, less that in the first.
     """
     counts = corrected["counts"]
     shape = (len(bands), counts.sizes["y"], counts.sizes["x"])
-    means, frames = np.empty(shape), np.empty(shape)
+    means, frames, change = np.empty(shape), np.empty(shape), np.empty(shape[1:])
+    third = max(counts.sizes["time"] // 3, 1)
+    thirds = slice(third), slice(third, -third), slice(-third, None)
     for index, band in enumerate(bands):
         curve = responses.curve(response, str(counts["band"].values[band]))
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
             part = counts.isel(band=band, y=rows).values
             known = schema.measured(part)
-            frames[index, rows] = known.sum(axis=0)
-            total = np.where(known, part, 0.0).sum(axis=0, dtype=np.float64)
+            part = part if known.all() else np.where(known, part, 0.0)
+            sums, numbers = (
+                np.stack([film[some].sum(axis=0, dtype=np.float64) for some in thirds])
+                for film in (part, known)
+            )
+            frames[index, rows] = numbers.sum(axis=0)
             with np.errstate(invalid="ignore"):  # without a sample
-                means[index, rows] = curve.linearise(total / frames[index, rows])
+                means[index, rows] = curve.linearise(sums.sum(axis=0) / frames[index, rows])
+                if index == 0:
+                    change[rows] = np.diff(curve.linearise(sums[::2] / numbers[::2]), axis=0)[0]
     # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
     inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
     variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
@@ -62,44 +71,30 @@ def mean_signals(
         scatter = MAD * float(np.median(known)) if known.size else 0.0
         of_noise = float(np.median(variances[0] + variances[index]))
         variances[index] += max(scatter**2 - of_noise, 0.0)
-    return means, variances
+    return means, variances, change
 
 
-def signal_change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
-    """Mean signal (y, x) [K] of a band in the last third of the frames, less that in the first."""
-    counts = corrected["counts"].isel(band=band)
-    curve = responses.curve(response, str(corrected["band"].values[band]))
-    third, changes = max(counts.sizes["time"] // 3, 1), []
-    for top in range(0, counts.sizes["y"], _ROWS):
-        part = counts.isel(y=slice(top, top + _ROWS)).load()
-        part = part.where(schema.measured(part))
-        first, last = (
-            part.isel(time=frames).mean("time", dtype=np.float64).values
-            for frames in (slice(third), slice(-third, None))
-        )
-        changes.append((last - first) / curve.reference_slope)
-    return np.concatenate(changes)
-
-
-def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, Array]:
+def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tuple[Array, Array]:
     r"""
     Reflection in the differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
 
     The median is the background at rest, which makes no edges. 0 without a background estimate:
-    that is where nothing moved.
+    that is where nothing moved; and of other pixels than those (y, x).
     """
     share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * (
         1.0 - result["emissivity"].values[bands[0]]
     )
-    shape, frames = share.shape[1:], result.sizes["time"]
-    excess, deviation = np.empty(shape), np.empty(shape)
-    for top in range(0, shape[0], _ROWS):
-        rows = slice(top, top + _ROWS)
-        background = result["background_temperature"].isel(y=rows).values
-        excess[rows] = background.mean(axis=0) - np.median(background, axis=0)
-        deviation[rows] = result["background_temperature_std"].isel(y=rows).values.mean(axis=0)
+    films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
+    frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
+    for row in np.flatnonzero(of.any(axis=1)):
+        film, std = (part[:, row, of[row]] for part in films)
+        # Sorted along contiguous samples: far faster than a median along the first axis.
+        ordered = np.sort(film.T.copy(), axis=1)
+        median = ordered[:, [(frames - 1) // 2, frames // 2]].mean(axis=1)
+        excess[row, of[row]] = film.mean(axis=0) - median
+        deviation[row, of[row]] = std.mean(axis=0)
         release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames

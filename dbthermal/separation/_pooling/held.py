@@ -23,6 +23,7 @@ _MORE_AROUND: Final = 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _AROUND: Final = 1.5
 _SOME: Final = 1e-3
+_FRAMES: Final = 64  # about as many tell how much an object differs
 
 
 def hold(
@@ -61,8 +62,9 @@ def hold(
         both &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
     films = [one["object_temperature"].values for one in (pooled, alone)]
     square, variance = np.zeros((2, *both.shape))
+    every = slice(None, None, max(1, len(single) // _FRAMES))
     for row, here in enumerate(sound & told):
-        value, other, std = (film[:, row, here].astype(np.float64) for film in (*films, single))
+        value, other, std = (film[every, row, here].astype(np.float64) for film in (*films, single))
         square[row, here] = np.nanmean(((value - other) / std) ** 2, axis=0)
         variance[row, here] = np.nanmean(std**2, axis=0)
         release()
@@ -70,12 +72,15 @@ def hold(
     more = both & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
     constant = np.where(told & ~sound, _around(square * variance, both | (stay & sound)), 0.0)
-    for row, (factor, offset) in enumerate(zip(square * both, constant, strict=True)):
-        film = pooled["object_temperature_std"].values[:, row]
-        film[...] = np.sqrt(film**2 + factor * np.nan_to_num(single[:, row]) ** 2 + offset)
-        for name, part in alone.data_vars.items():
-            if part.dims[-2:] == ("y", "x"):
-                pooled[name].values[..., row, stay[row]] = part.values[..., row, stay[row]]
+    factor, film = square * both, pooled["object_temperature_std"].values
+    maps = [(pooled[name].values, part.values) for name, part in alone.items() if "x" in part.dims]
+    wider = (factor > 0) | (constant > 0)
+    for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
+        here, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
+        added = factor[row, here] * np.nan_to_num(single[:, row, here]) ** 2 + constant[row, here]
+        film[:, row, here] = np.sqrt(film[:, row, here] ** 2 + added)
+        for target, part in maps:
+            target[..., row, alike] = part[..., row, alike]
         release()
 
 

@@ -146,9 +146,7 @@ def materials(
         frames = slice(first[count.argmax()], (first + count)[count.argmax()])  # it only rises
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _bands(result, response)
-    means, variances = feature_maps.mean_signals(corrected, response, bands, noise)
-    change = feature_maps.signal_change(corrected, response, bands[0])
-    reflected, reflected_variance = feature_maps.reflected_difference(result, bands)
+    means, variances, change = feature_maps.mean_signals(corrected, response, bands, noise)
     ratios, features = _features(result, bands)
     valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & int(_UNUSABLE) == 0)
     cells = _cells(ratios, means, variances, valid, error_rate)
@@ -158,6 +156,8 @@ def materials(
     # Pairs whose ratios could not show a difference are compared by what they emit.
     roots = regions.roots()[pairs]
     vague = (roots[:, 0] != roots[:, 1]) & (regions.compare(*roots.T)[1] > resolution)
+    seen = np.isin(cells, pairs[vague])
+    reflected, reflected_variance = feature_maps.reflected_difference(result, bands, seen)
     emitted = means[1:] - means[0] - reflected
     variance = variances[1:] + variances[0] + reflected_variance
     linked, steps = _links(cells, pairs[vague], emitted, variance, change)

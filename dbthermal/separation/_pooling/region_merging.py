@@ -105,7 +105,9 @@ class Regions:
 
     def roots(self) -> Labels:
         """Roots (cell + 1,) of all cells, that of no cell first."""
-        return np.array([self.root(cell) for cell in range(self._parent.size)])
+        while np.any(self._parent != self._parent[self._parent]):
+            self._parent = self._parent[self._parent]
+        return self._parent.copy()
 
     def known(self) -> Mask:
         """Roots (cell + 1,) of regions with an estimate of the first feature."""
@@ -175,8 +177,19 @@ class Regions:
         return self._first[:, regions] / safe, pixels / safe, known
 
     def _compare_one(self, first: int, second: int) -> tuple[float, float]:
-        statistic, resolution = self.compare(np.array([first]), np.array([second]))
-        return float(statistic[0]), float(resolution[0])
+        """As `compare` of one pair: without arrays, for there are many."""
+        statistic, features, resolution = 0.0, 0, np.inf
+        for k, (total, sums) in enumerate(zip(self._total, self._first, strict=True)):
+            if total[first] > 0 and total[second] > 0:
+                one, other = sums[first] / total[first], sums[second] / total[second]
+                pixels = self._count[k, [first, second]] if self._common[k, 0, 0] else (1.0, 1.0)
+                mean = 0.5 * abs(one + other)
+                variance = pixels[0] / total[first] + pixels[1] / total[second]
+                variance += (self._tolerance[k, 0] * mean) ** 2
+                statistic, features = statistic + (other - one) ** 2 / variance, features + 1
+                if k == 0 and mean > 0:
+                    resolution = np.sqrt(self._limits[1] * variance) / mean
+        return statistic / self._limits[features], resolution
 
     def _merge(self, first: int, second: int) -> None:
         self._parent[second] = first
