@@ -39,7 +39,7 @@ _BENDS: Final = np.cos(np.multiply.outer([2.0, 3.0], np.arccos(_NODES)))
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
-_WORSE: Final = 0.05
+_WORSE: Final = 0.04
 _STEPS: Final = 2
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 # Where nothing bounds the fluctuation of the background: its variance [K^2].
@@ -207,9 +207,10 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     plain = _average(weight, grid, np.ones_like(grid), values, covariance)
     mean, spread = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
     # The blackest emissivity that is as improbable; the grid rises.
-    above = np.cumsum(weight.sum(axis=0)[::-1], axis=0) < _WORSE
-    blackest = np.take_along_axis(grid[::-1], np.minimum(above.sum(axis=0), len(grid) - 1)[None], 0)
-    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest[0] - 1.0)) - mean[0]
+    share = weight.sum(axis=0)
+    above = 1.0 - np.cumsum(share, axis=0) + 0.5 * share
+    blackest = _crossing(grid, above, _WORSE)
+    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest - 1.0)) - mean[0]
     mean[0] += moved
     spread[0, 0] += moved**2
     # e_1 = 1 / a, e_m = rho_m / a; de_1 = -e_1 / a da, de_m = (drho_m - e_m da) / a.
@@ -220,6 +221,16 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     change[-1, -1] = 1.0
     spread = np.einsum("imp,mnp,jnp->ijp", change, spread, change, optimize=True)
     return Moments(point, mean[-1], spread, plain[0][:-1], plain[1][:-1, :-1])
+
+
+def _crossing(grid: Array, falling: Array, level: float) -> Array:
+    """Place (pixel) on a grid (grid, pixel) at which a function that falls along it meets a level."""
+    after = np.clip((falling > level).sum(axis=0), 1, len(grid) - 1)
+    (low, high), (more, less) = (
+        np.take_along_axis(part, np.stack([after - 1, after]), 0) for part in (grid, falling)
+    )
+    part = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
+    return np.asarray(low + part * (high - low))
 
 
 def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Array:
