@@ -42,7 +42,8 @@ _BENDS: Final = np.cos(np.multiply.outer([2.0, 3.0], np.arccos(_NODES)))
 _SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
 _WORSE: Final = 0.04
-_STEPS: Final = 2
+# Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
+_STEPS, _SETTLED = 8, 0.02
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 # Where nothing bounds the fluctuation of the background: its variance [K^2].
@@ -219,8 +220,7 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     grid = prior.grid()  # (grid, pixel)
     (points, pixels), size, parts = grid.shape, len(tile.noise) + 1, prior.weight.size
     levels = np.stack([np.broadcast_to(part, pixels) for part in (level.signal, level.std)])
-    known = (grid, prior.mean, prior.covariance, levels)
-    known = (*known, data.nodes, data.information, data.linear)
+    curve_parts = (data.nodes, data.information, data.linear)
     shapes = {"whole": (2, size - 2), "place": (size,), "likelihood": (size - 2, 6)}
     shapes |= {"normal": (parts, 2, size - 2), "values": (parts, size)}
     shapes |= dict.fromkeys(("slope", "loose"), (parts, size - 2))
@@ -231,7 +231,12 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     _moments(
         known_emissivity.response_tables(tile),
         np.log(prior.weight),
-        _Given(*(np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in known)),
+        _Given(
+            *(
+                np.ascontiguousarray(np.moveaxis(part, -1, 0))
+                for part in (grid, prior.mean, prior.covariance, levels, *curve_parts)
+            )
+        ),
         _Work(**work),
         share,
         mean,
@@ -342,7 +347,7 @@ def _linearise(tables: tuple[kernels.Table, ...], given: _Given, p: int, work: _
 
     Those of a Gauss-Newton method, with the components of the prior taken as one.
     """
-    points, others = work.whole.shape[0], work.whole.shape[2]
+    points, others, settled = work.whole.shape[0], work.whole.shape[2], False
     for g in range(points):
         work.place[g, 0], work.place[g, 1 + others] = given.grid[p, g], given.level[p, 0]
         for m in range(others):
@@ -352,10 +357,16 @@ def _linearise(tables: tuple[kernels.Table, ...], given: _Given, p: int, work: _
             for g in range(points):
                 work.place[g, 1 + m] = min(max(work.place[g, 1 + m], _BOUNDS[0]), _BOUNDS[1])
             _quadratic(tables[0], tables[1 + m], given, p, m, work)
-        for g in range(points if step < _STEPS else 0):
+        if step == _STEPS or settled:
+            break
+        settled = True
+        for g in range(points):
+            before = work.place[g, 1 + others]
             spare = work.slope[g, 0], work.loose[g, 0]
             knowledge = work.likelihood[g], work.whole[g], given.level[p]
             _eliminate(*knowledge, work.place[g], *spare)
+            change = abs(work.place[g, 1 + others] - before)
+            settled &= not change > _SETTLED * given.level[p, 1]
 
 
 @compiled
@@ -381,9 +392,9 @@ def _quadratic(
         for i in range(4):
             of_e[i] = emitted[5 * g + i] - level
             of_c[i] = by_level + e * rate[5 * g + i] * (1.0 - share)
-        square = value = by_e = by_c = ee = ec = cc = 0.0
+        square, value, by_e, by_c, ee, ec, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(4):
-            model = here = here_e = here_c = 0.0  # H times the model and its slopes
+            here, here_e, here_c = 0.0, 0.0, 0.0  # H times the model and its slopes
             for j in range(4):
                 here += information[i, j] * (level + e * of_e[j])
                 here_e += information[i, j] * of_e[j]
@@ -431,10 +442,10 @@ def _normalise(work: _Work) -> None:
 
     Each times the probability that the other emissivities lie between 0 and 1.
     """
-    weight, highest, total = work.weight, -np.inf, 0.0
+    weight, total = work.weight, 0.0
     for g, k in np.ndindex(weight.shape):
         weight[g, k] = weight[g, k] if np.isfinite(weight[g, k]) else -np.inf
-        highest = max(highest, weight[g, k])
+    highest = weight.max()
     for g, k in np.ndindex(weight.shape):
         share = np.exp(weight[g, k] - highest)
         for m in range(work.slope.shape[2] if share > _NEGLIGIBLE else 0):
