@@ -157,13 +157,14 @@ def filled(
     if beside.materials is not None and not result.attrs.get("pooled"):
         told = solve(corrected, response, **shared)
     scene = scenes.gather(inputs, result, told, beside.prior)
+    sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
-        scenes.require_same_capture(scene, result)
+        scenes.require_same_capture(scene, result, sample)
     if beside.surroundings is None:
-        level = scenes.find_level(scene)
+        level = scenes.find_level(scene, sample)
     else:
         level = scenes.stated(scene, beside.surroundings, beside.surroundings_std)
-        fluctuation = scenes.find_level(replace(scene, level=level)).fluctuation
+        fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
     bridged = _lacking(result, inputs.blocks)
@@ -243,28 +244,14 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
         lacking |= np.isnan(completed[name].values[:, rows]).any(axis=0)
     if not lacking.any():
         return
-    block = scene.inputs.capture.isel(y=rows).load()
-    grains = quality.grains(block)
-    tiles_read, numbers = list[tuple[Tile, Mask]](), list[Whole]()
-    for window in tiles.windows(rows, block.sizes["x"]):
-        local = (slice(window[0].start - rows.start, window[0].stop - rows.start), window[1])
-        if lacking[local].any():
-            part, selected = block.isel(y=local[0], x=local[1]), lacking[local].ravel()
-            tiles_read.append(scene.tile(part, grains, selected))
-            numbers.append(tiles.numbers(window, block.sizes["x"])[selected])
-        last = window[0].stop == rows.stop and window[1].stop == block.sizes["x"]
-        if numbers and (last or sum(part.size for part in numbers) >= tiles.PIXELS):
-            signals, valid = (
-                np.concatenate(parts, axis=-1)
-                for parts in zip(
-                    *((tile.signals, valid) for tile, valid in tiles_read), strict=True
-                )
-            )
-            tile = replace(tiles_read[0][0], signals=signals, shape=(1, signals.shape[-1]))
-            _complete_pixels(scene, completed, tile, valid, np.concatenate(numbers))
-            tiles_read.clear()
-            numbers.clear()
-            release()
+    lines = np.flatnonzero(lacking.any(axis=1))
+    part = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
+    tile, valid = scene.tile(part, lacking[lines].ravel())
+    places = np.flatnonzero(lacking) + rows.start * lacking.shape[1]
+    for start in range(0, places.size, tiles.PIXELS):
+        some = np.arange(start, min(start + tiles.PIXELS, places.size))
+        _complete_pixels(scene, completed, tile.select_pixels(some), valid[:, some], places[some])
+    release()
 
 
 def _complete_pixels(

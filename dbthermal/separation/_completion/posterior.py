@@ -36,8 +36,8 @@ _LEAST: Final = 2
 # Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
 _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
-# A quadratic and a cubic that are no part of a line, at the nodes: Chebyshev's polynomials.
-_BENDS: Final = np.cos(np.multiply.outer([2.0, 3.0], np.arccos(_NODES)))
+# A constant, a quadratic and a cubic, at the nodes: Chebyshev's polynomials.
+_SHAPES: Final = np.cos(np.multiply.outer([0.0, 2.0, 3.0], np.arccos(_NODES)))
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
@@ -71,12 +71,6 @@ class Bins:
 
     signals: Array  # (band, bin, pixel) [K]
     frames: Array  # (bin, pixel)
-    starts: Whole  # first frame of each bin
-
-    def mean(self, values: Array, valid: Mask) -> Array:
-        """Means (bin, pixel) of values (time, pixel)."""
-        total = np.add.reduceat(np.where(valid, values, 0.0), self.starts, axis=0)
-        return np.asarray(total / np.maximum(self.frames, 1.0))
 
 
 @dataclass(frozen=True)
@@ -116,7 +110,7 @@ def bins(tile: Tile, valid: Mask) -> Bins:
     starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
     frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
     total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
-    return Bins(total / np.maximum(frames, 1.0), frames, starts)
+    return Bins(total / np.maximum(frames, 1.0), frames)
 
 
 def curve(
@@ -150,15 +144,14 @@ def curve(
         noise = tile.noise[m] ** 2 + tile.noise[0] ** 2  # of one frame
         variance = _long_run(residual, weight, bins_used, noise)
         inverse, right = gram / variance, moment / variance
-        if offset[m - 1] > 0:  # an offset of variance p^2: H - H 1 1^T H / (1 / p^2 + 1^T H 1)
-            row = inverse.sum(axis=1)
-            share = 1.0 / (offset[m - 1] ** -2 + row.sum(axis=0))
-            right = right - row * (share * right.sum(axis=0))
-            inverse = inverse - share * row[:, np.newaxis] * row
-        for one in _BENDS:  # the same, of a quadratic and a cubic of variance p^2
-            row = np.einsum("ijp,j->ip", inverse, one)
-            share = bends[m - 1] ** 2 / (1.0 + bends[m - 1] ** 2 * (one @ row))
-            right = right - row * (share * (one @ right))
+        # Of a constant, quadratic and cubic part of variance p^2 is told nothing:
+        # H - H b b^T H / (1 / p^2 + b^T H b).
+        for shape, deviation in zip(
+            _SHAPES, (offset[m - 1], bends[m - 1], bends[m - 1]), strict=True
+        ):
+            row = np.einsum("ijp,j->ip", inverse, shape)
+            share = deviation**2 / (1.0 + deviation**2 * (shape @ row))
+            right = right - row * (share * (shape @ right))
             inverse = inverse - share * row[:, np.newaxis] * row
         information.append(inverse)
         linear.append(right)

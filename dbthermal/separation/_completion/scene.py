@@ -44,6 +44,7 @@ _MEDIAN: Final = np.pi / 2.0
 # Precision of a level that a pixel does not show [1/K^2].
 _NOTHING: Final = 1e-9
 
+Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
 
 
@@ -67,15 +68,12 @@ class Scene:
         value, covariance = self.emissivity[:, places], self.covariance[..., places]
         return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
 
-    def tile(
-        self, part: xr.Dataset, grains: Any = None, selected: Mask | None = None
-    ) -> tuple[Tile, Mask]:
+    def tile(self, part: xr.Dataset, selected: Mask | slice = slice(None)) -> tuple[Tile, Mask]:
         """Tile of the selected pixels of a part of the capture, and valid samples (time, pixel)."""
         inputs = self.inputs
-        counts, valid, status = quality.read(part, 1, grains, most_missing=1.0)
+        counts, valid, status = quality.read(part, most_missing=1.0)
         valid = valid & ((status & _UNUSABLE) == 0)
-        if selected is not None:
-            counts, valid = counts[..., selected], valid[:, selected]
+        counts, valid = counts[..., selected], valid[:, selected]
         curves = tuple(inputs.curves[band] for band in inputs.bands)
         pairs = zip(inputs.bands, curves, strict=True)
         signals = [curve.linearise(counts[band]) - curve.reference for band, curve in pairs]
@@ -89,7 +87,7 @@ class Scene:
             pattern=None if inputs.pattern is None else tuple(inputs.pattern[inputs.bands]),
         ), valid
 
-    def sample(self) -> tuple[Tile, Mask, Whole]:
+    def sample(self) -> Sample:
         """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
         capture = self.inputs.capture
         numbers = np.arange(self.source.size).reshape(capture.sizes["y"], capture.sizes["x"])
@@ -143,9 +141,9 @@ def _covariance(result: xr.Dataset, bands: list[int]) -> Array:
     return variance * np.eye(len(bands))[..., np.newaxis]
 
 
-def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
-    """Refuse a result whose values do not give the capture's signals back."""
-    tile, valid, places = scene.sample()
+def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> None:
+    """Refuse a result whose values do not give the capture's signals back, in some pixels."""
+    tile, valid, places = sample
     films = [result[name].values.reshape(len(valid), -1)[:, places] for name in FILMS]
     with np.errstate(all="ignore"):
         mixed = tile.mixed(scene.emissivity[:, places], np.array(films, dtype=np.float64))
@@ -237,14 +235,14 @@ def contradicted(scene: Scene, static: Moments, places: Whole) -> Mask:
     return np.asarray(square > chdtri(bands, _CHANCE))
 
 
-def find_level(scene: Scene) -> Level:
-    """Level of the background over the pixels, from those that show it, beside what is known.
+def find_level(scene: Scene, sample: Sample) -> Level:
+    """Level of the background over some pixels, from those that show it, beside what is known.
 
     Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
     scatter that they do not explain, which is how much pixels differ. Pixels whose emissivities
     come from one prior, or from other pixels, share its error: together they count as one pixel.
     """
-    tile, valid, places = scene.sample()
+    tile, valid, places = sample
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
     parts, counted = [], []
     for source in np.unique(sources[sources >= 0]):
