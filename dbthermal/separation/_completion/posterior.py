@@ -241,7 +241,8 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     # The blackest emissivity that is as improbable; the grid rises.
     above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
     blackest = _crossing(grid, above, _WORSE)
-    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest - 1.0)) - mean[0]
+    bound = 1.0 + 2.0 * (1.0 / blackest - 1.0) if parts > 1 else np.inf
+    moved = np.minimum(mean[0], bound) - mean[0]
     mean[0] += moved
     spread[0, 0] += moved**2
     # e_1 = 1 / a, e_m = rho_m / a; de_1 = -e_1 / a da, de_m = (drho_m - e_m da) / a.
