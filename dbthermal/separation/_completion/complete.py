@@ -247,7 +247,7 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
     lines = np.flatnonzero(lacking.any(axis=1))
     part = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
     tile, valid = scene.tile(part, lacking[lines].ravel())
-    places = np.flatnonzero(lacking) + rows.start * lacking.shape[1]
+    places = np.flatnonzero(lacking) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
         some = np.arange(start, min(start + tiles.PIXELS, places.size))
         _complete_pixels(scene, completed, tile.select_pixels(some), valid[:, some], places[some])

@@ -436,7 +436,7 @@ def _normalise(work: _Work) -> None:
 
     Each times the probability that the other emissivities lie between 0 and 1.
     """
-    weight, total = work.weight, 0.0
+    weight = work.weight
     for g, k in np.ndindex(weight.shape):
         weight[g, k] = weight[g, k] if np.isfinite(weight[g, k]) else -np.inf
     highest = weight.max()
@@ -447,8 +447,7 @@ def _normalise(work: _Work) -> None:
             value, scale = work.values[g, k, 1 + m], 1.0 / np.sqrt(2.0 * variance)
             share *= 0.5 * (math.erf((1.0 - value) * scale) + math.erf(value * scale))
         weight[g, k] = share if share > _NEGLIGIBLE else 0.0
-        total += weight[g, k]
-    weight /= total
+    weight /= weight.sum()
 
 
 @compiled
