@@ -115,6 +115,28 @@ def test_black_gives_the_reading() -> None:
     assert bool((apart < 4.0 * np.hypot(whole["object_temperature_std"], RIG.noise[0])).all())
 
 
+@pytest.mark.parametrize("emissivities", [(0.95, 0.85), (0.98, 0.95), (0.92, 0.90), (0.86, 0.72)])
+@pytest.mark.parametrize(("hottest", "room"), [(330.0, 290.15), (330.0, ROOM), (300.0, 310.15)])
+def test_near_black_no_worse_than_the_reading(
+    emissivities: tuple[float, float], hottest: float, room: float
+) -> None:
+    """Before still surroundings, colder or warmer than the body: a smaller error, and held."""
+    rng = np.random.default_rng(5)
+    picture = Picture(shape=(8, 10), walkers=0, hottest=hottest)
+    scene = picture.draw(TIME, emissivity_of(*emissivities), rng)
+    still = xr.full_like(scene["background_temperature"], room)
+    capture = observe(scene.assign(background_temperature=still), RESPONSE, rng)
+    whole = separation.separate(capture, RESPONSE)
+    reading = separation.solve(capture, RESPONSE, "apparent")
+    errors = [
+        float(np.sqrt(((one["object_temperature"] - scene["object_temperature"]) ** 2).mean()))
+        for one in (whole, reading)
+    ]
+    print(f"{errors[0]:.3f} K, of the reading {errors[1]:.3f} K")
+    assert errors[0] < errors[1]
+    assert held(whole, scene) > 0.92
+
+
 def test_gaps_of_single_pixels(half: Case) -> None:
     """Samples that a pixel alone lacks are bridged, known by frame, and within their intervals."""
     scene, capture, _ = half

@@ -23,8 +23,6 @@ from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
-# Largest last step of a sample that is solved [K].
-_CONVERGED: Final = 1e-3
 # Bands that differ by less are gray, by so many standard deviations or by rounding.
 _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
@@ -59,18 +57,16 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
         covariance = np.zeros((len(e), *e.shape))
     level = np.zeros(e.shape[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        found = known_emissivity.solve(tile, e, level, np.full_like(level, _ANY))
-        solved = np.all(np.abs(found.step) < _CONVERGED, axis=0)
+        shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
+        found = known_emissivity.solve(tile, e, level, np.full_like(level, _ANY), shared)
+        solved = np.isfinite(found.signal)
         signal, left = found.signal, found.white
         if settings.smooth and len(signal) > 1:
             signal, left = known_emissivity.smooth(signal, left, solved, tile.time)
-        left = left + found.shared + known_emissivity.through(found.sensitivity[:-1], covariance)
-        behind = found.background_variance
-        behind = behind + known_emissivity.through(found.background_sensitivity[:-1], covariance)
-        curve, values = tile.curves[0], list[Array]()
-        for mean, variance in ((signal, left), (found.background, behind)):
-            temperature = np.where(solved, tile.temperature(0, mean), np.nan)
-            values += [temperature, np.sqrt(variance) / curve.slope(temperature)]
+        left = left + found.shared
+        values = list[Array]()
+        for mean, variance in ((signal, left), (found.background, found.background_variance)):
+            values += known_emissivity.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
     solved &= np.all(np.isfinite(values), axis=0)
     values = [np.where(solved, value, np.nan) for value in values]
@@ -79,7 +75,7 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     std = np.sqrt(np.einsum("bbp->bp", covariance))
     warm, warm_std, cold, cold_std = values
     estimate = Estimate(warm, warm_std, cold, cold_std, e, std, status)
-    return estimate.undefine(gray, np.zeros_like(gray), gray).check_range(curve)
+    return estimate.undefine(gray, np.zeros_like(gray), gray).check_range(tile.curves[0])
 
 
 def _gray(emissivity: Array, covariance: Array) -> Mask:

@@ -21,7 +21,7 @@ from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
 from dbthermal.separation._inputs import Method, check
 from dbthermal.separation._solve import require_workers, solve
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
 _BITS: Final = {
     scenes.MATERIAL: Status.COMPLETED_FROM_MATERIAL | Status.COMPLETED_FROM_SURROUNDINGS,
@@ -157,13 +157,14 @@ def filled(
     if beside.materials is not None and not result.attrs.get("pooled"):
         told = solve(corrected, response, **shared)
     scene = scenes.gather(inputs, result, told, beside.prior)
+    sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
-        scenes.require_same_capture(scene, result)
+        scenes.require_same_capture(scene, result, sample)
     if beside.surroundings is None:
-        level = scenes.find_level(scene)
+        level = scenes.find_level(scene, sample)
     else:
         level = scenes.stated(scene, beside.surroundings, beside.surroundings_std)
-        fluctuation = scenes.find_level(replace(scene, level=level)).fluctuation
+        fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
     bridged = _lacking(result, inputs.blocks)
@@ -243,60 +244,93 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
         lacking |= np.isnan(completed[name].values[:, rows]).any(axis=0)
     if not lacking.any():
         return
-    block = scene.inputs.capture.isel(y=rows).load()
-    grains = quality.grains(block)
-    for window in tiles.windows(rows, block.sizes["x"]):
-        local = (slice(window[0].start - rows.start, window[0].stop - rows.start), window[1])
-        if not lacking[local].any():
+    lines = np.flatnonzero(lacking.any(axis=1))
+    part = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
+    tile, valid = scene.tile(part, lacking[lines].ravel())
+    places = np.flatnonzero(lacking) + rows.start * completed.sizes["x"]
+    for start in range(0, places.size, tiles.PIXELS):
+        some = np.arange(start, min(start + tiles.PIXELS, places.size))
+        _complete_pixels(scene, completed, tile.select_pixels(some), valid[:, some], places[some])
+    release()
+
+
+def _complete_pixels(
+    scene: Scene, completed: xr.Dataset, tile: Tile, valid: Mask, places: Whole
+) -> None:
+    """Complete pixels by their numbers in the image, in place."""
+    y, x = np.divmod(places, completed.sizes["x"])
+    # A frame that was lost is no sample to complete: many captures lack some.
+    parts = [completed[name].values[:, y, x] for name in (*FILMS, *MAPS, f"{FILMS[0]}_std")]
+    wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in parts[:2]], axis=0)
+    wanted |= np.any([np.isnan(part).any(axis=0) for part in parts[2:4]], axis=0)
+    wanted &= valid.any(axis=0)
+    measured = np.array([parts[0], parts[-1]], dtype=np.float64)
+    sources = np.where(wanted, scene.source[places], -1)
+    for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
+        here = sources == source
+        if not here.any():
             continue
-        places = tiles.numbers(window, block.sizes["x"])
-        tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
-        # A frame that was lost is no sample to complete: many captures lack some.
-        names = (*FILMS, *MAPS, f"{FILMS[0]}_std")
-        parts = [completed[name].values[:, *window] for name in names]
-        parts = [part.reshape(len(part), -1) for part in parts]
-        wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in parts[:2]], axis=0)
-        wanted |= np.any([np.isnan(part).any(axis=0) for part in parts[2:4]], axis=0)
-        wanted &= valid.any(axis=0)
-        measured = np.array([parts[0], parts[-1]], dtype=np.float64)
-        sources = np.where(wanted, scene.source[places], -1)
-        for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
+        part = tile.select_pixels(here)
+        static, variance = scenes.solve_statics(scene, part, valid[:, here], source, places[here])
+        if source == scenes.MATERIAL:
+            kept = ~scenes.contradicted(scene, static, places[here])
+            sources[here] = np.where(kept, source, scenes.PRIOR)
             here = sources == source
-            if not here.any():
-                continue
-            part = (tile.select_pixels(here), valid[:, here], source, places[here])
-            values, _ = scenes.solve(scene, *part, measured[..., here])
-            if source == scenes.MATERIAL:
-                kept = ~scenes.contradicted(scene, values, places[here])
-                sources[here] = np.where(kept, source, scenes.PRIOR)
-                values = {name: value[..., kept] for name, value in values.items()}
-                here = sources == source
-            _fill(scene, completed, places[here], values, source)
-        release()
+            static, part = static.select_pixels(kept), part.select_pixels(kept)
+            variance = variance[kept]
+        values = scenes.solve(scene, part, valid[:, here], static, variance, measured[..., here])
+        _fill(scene, completed, places[here], values, source)
 
 
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
     """Fill in missing values, and set the bits that say so."""
     y, x = np.divmod(places, completed.sizes["x"])
-    filled, beyond = np.zeros((2, places.size), dtype=bool)
+    filled, beyond = np.zeros(places.size, dtype=bool), np.zeros(places.size, dtype=bool)
     curve = scene.inputs.curves[scene.inputs.bands[0]]
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
         both = (name, f"{name}_std")
-        old = [completed[one].values[:, y, x].astype(np.float64) for one in both]
-        new = [values[one][order] if name in MAPS else values[one] for one in both]
-        take = np.isnan(old[0]) & np.isfinite(new[0]) & np.isfinite(new[1])
-        filled |= take.any(axis=0)
-        if name == FILMS[0]:
-            beyond |= np.any(take & tiles.out_of_range(new[0], new[1], curve), axis=0)
-        for one, pair in zip(both, zip(new, old, strict=True), strict=True):
-            completed[one].values[:, y, x] = np.where(take, *pair)
+        new = [values[part][order] if name in MAPS else values[part] for part in both]
+        limits = (curve.lowest, curve.highest) if name == FILMS[0] else (-np.inf, np.inf)
+        _take(
+            *(completed[part].values for part in both),
+            *(np.asfortranarray(part) for part in new),
+            np.stack([y, x], axis=-1),
+            limits,
+            filled,
+            beyond,
+        )
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
     if source in _BITS:
         completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
     completed["status"].values[y, x] |= beyond * np.uint32(Status.OUTSIDE_RESPONSE)
+
+
+@compiled
+def _take(
+    value: Array,
+    std: Array,
+    new: Array,
+    new_std: Array,
+    places: Whole,
+    limits: tuple[float, float],
+    filled: Mask,
+    beyond: Mask,
+) -> None:
+    """Take new values and deviations (time, pixel) where a film or map has none, in place.
+
+    And tell the pixels that take some, and some outside the limits by several deviations.
+    """
+    for t in range(len(value)):
+        for p in range(len(places)):
+            place = (t, places[p, 0], places[p, 1])
+            a, b = new[t, p], new_std[t, p]
+            if np.isnan(value[place]) and np.isfinite(a) and np.isfinite(b):
+                value[place], std[place], filled[p] = a, b, True
+                margin = tiles.RANGE_SIGMAS * b
+                beyond[p] |= a < limits[0] - margin or a > limits[1] + margin
 
 
 def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:

@@ -18,15 +18,17 @@ fluctuation f(t), and any object at all:
 3. Frame by frame s and f are the posterior mean, the latter of a variance that the bins show.
 """
 
-from dataclasses import dataclass
-from typing import Final
+import math
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
+from dbthermal._compiled import compiled
 from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation._completion.prior import Mixture
-from dbthermal.separation._tiles import Array, Mask, Tile, Whole
+from dbthermal.separation._subspace import kernels
+from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
 
 # Bins of time, at most, and frames in each, at least.
 _BINS: Final = 32
@@ -34,13 +36,15 @@ _LEAST: Final = 2
 # Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
 _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
-# A quadratic and a cubic that are no part of a line, at the nodes: Chebyshev's polynomials.
-_BENDS: Final = np.cos(np.multiply.outer([2.0, 3.0], np.arccos(_NODES)))
+# A constant, a quadratic and a cubic, at the nodes: Chebyshev's polynomials.
+_SHAPES: Final = np.cos(np.multiply.outer([0.0, 2.0, 3.0], np.arccos(_NODES)))
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
-_WORSE: Final = 0.05
-_STEPS: Final = 2
+_WORSE: Final = 0.04
+# Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
+_STEPS, _SETTLED = 8, 0.02
+_NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 # Where nothing bounds the fluctuation of the background: its variance [K^2].
 _VAGUE: Final = 1e6
@@ -67,16 +71,10 @@ class Bins:
 
     signals: Array  # (band, bin, pixel) [K]
     frames: Array  # (bin, pixel)
-    starts: Whole  # first frame of each bin
-
-    def mean(self, values: Array, valid: Mask) -> Array:
-        """Means (bin, pixel) of values (time, pixel)."""
-        total = np.add.reduceat(np.where(valid, values, 0.0), self.starts, axis=0)
-        return np.asarray(total / np.maximum(self.frames, 1.0))
 
 
 @dataclass(frozen=True)
-class Moments:
+class Moments(Pixels):
     """Posterior of the emissivities and of the background's level."""
 
     point: Array  # emissivities at the mean of a and rho_m (band, pixel) [1]
@@ -112,7 +110,7 @@ def bins(tile: Tile, valid: Mask) -> Bins:
     starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
     frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
     total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
-    return Bins(total / np.maximum(frames, 1.0), frames, starts)
+    return Bins(total / np.maximum(frames, 1.0), frames)
 
 
 def curve(
@@ -146,15 +144,14 @@ def curve(
         noise = tile.noise[m] ** 2 + tile.noise[0] ** 2  # of one frame
         variance = _long_run(residual, weight, bins_used, noise)
         inverse, right = gram / variance, moment / variance
-        if offset[m - 1] > 0:  # an offset of variance p^2: H - H 1 1^T H / (1 / p^2 + 1^T H 1)
-            row = inverse.sum(axis=1)
-            share = 1.0 / (offset[m - 1] ** -2 + row.sum(axis=0))
-            right = right - row * (share * right.sum(axis=0))
-            inverse = inverse - share * row[:, np.newaxis] * row
-        for one in _BENDS:  # the same, of a quadratic and a cubic of variance p^2
-            row = np.einsum("ijp,j->ip", inverse, one)
-            share = bends[m - 1] ** 2 / (1.0 + bends[m - 1] ** 2 * (one @ row))
-            right = right - row * (share * (one @ right))
+        # Of a constant, quadratic and cubic part of variance p^2 is told nothing:
+        # H - H b b^T H / (1 / p^2 + b^T H b).
+        for shape, deviation in zip(
+            _SHAPES, (offset[m - 1], bends[m - 1], bends[m - 1]), strict=True
+        ):
+            row = np.einsum("ijp,j->ip", inverse, shape)
+            share = deviation**2 / (1.0 + deviation**2 * (shape @ row))
+            right = right - row * (share * (shape @ right))
             inverse = inverse - share * row[:, np.newaxis] * row
         information.append(inverse)
         linear.append(right)
@@ -183,33 +180,69 @@ def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Arra
     return np.asarray(np.where(more, variance * correlated, noise))
 
 
+class _Given(NamedTuple):
+    """What is known of each pixel."""
+
+    grid: Array  # of the first emissivity (pixel, grid) [1]
+    mean: Array  # of the prior's components (pixel, component, band) [1]
+    covariance: Array  # (pixel, component, band, band) [1]
+    level: Array  # of the background, and its deviation (pixel, 2) [K]
+    nodes: Array  # see `Curve`, of pixels first
+    information: Array
+    linear: Array
+
+
+class _Work(NamedTuple):
+    """Quantities on the grid of one pixel: (grid, component, ...), or (grid, band - 1, ...)."""
+
+    density: Array  # prior of the first emissivity, a logarithm; of the cells
+    weight: Array  # of the posterior, a logarithm first
+    normal: Array  # mean and precision of the other emissivities (grid, component, 2, band - 1)
+    whole: Array  # the same of the components as one (grid, 2, band - 1)
+    place: Array  # where the model is linearised, (e, c) (grid, band + 1)
+    likelihood: Array  # quadratic functions, see `_quadratic` (grid, band - 1, 6)
+    values: Array  # mean of (e, c) (grid, component, band + 1)
+    slope: Array  # of the other emissivities with c (grid, component, band - 1) [1/K]
+    loose: Array  # their variances at a value of c (grid, component, band - 1)
+    stiff: Array  # precision of c (grid, component) [1/K^2]
+    signals: Array  # spare (5, 5 * grid)
+
+
 def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     """Posterior of the emissivities and of the background's level, steps 1 and 2."""
-    grid, spacing = prior.grid()  # (grid, pixel)
-    density, mean, variance = prior.conditional(grid)  # (component, [band - 1,] grid, pixel)
-    share = np.exp(density - density.max(axis=0))
-    share = (share / share.sum(axis=0))[:, np.newaxis]
-    centre = (share * mean).sum(axis=0, keepdims=True)
-    wide = (share * (variance + (mean - centre) ** 2)).sum(axis=0, keepdims=True)
-    e, c = np.clip(centre[0], *_BOUNDS), np.broadcast_to(level.signal, grid.shape)
-    for _ in range(_STEPS):  # Gauss-Newton, with the components of the prior taken as one
-        curvature = _quadratic(tile, data, grid, e, c)
-        _, values, _ = _eliminate(curvature, centre, wide, level)
-        e, c = np.clip(values[0, :-1], *_BOUNDS), values[0, -1]
-    curvature = _quadratic(tile, data, grid, e, c)
-    evidence, values, covariance = _eliminate(curvature, mean, variance, level)
-    std = np.sqrt(np.einsum("kiigp->kigp", covariance)[:, :-1])
-    inside = ndtr((1.0 - values[:, :-1]) / std) - ndtr(-values[:, :-1] / std)
-    log = density + evidence + np.log(spacing) + np.log(inside).sum(axis=1)
-    log = np.where(np.isfinite(log), log, -np.inf)
-    weight = np.exp(log - log.max(axis=(0, 1)))
-    weight = weight / weight.sum(axis=(0, 1))
-    plain = _average(weight, grid, np.ones_like(grid), values, covariance)
-    mean, spread = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
+    grid = prior.grid()  # (grid, pixel)
+    (points, pixels), size, parts = grid.shape, len(tile.noise) + 1, prior.weight.size
+    levels = np.stack([np.broadcast_to(part, pixels) for part in (level.signal, level.std)])
+    curve_parts = (data.nodes, data.information, data.linear)
+    shapes = {"whole": (2, size - 2), "place": (size,), "likelihood": (size - 2, 6)}
+    shapes |= {"normal": (parts, 2, size - 2), "values": (parts, size)}
+    shapes |= dict.fromkeys(("slope", "loose"), (parts, size - 2))
+    work = {name: np.empty((points, *shapes.get(name, (parts,)))) for name in _Work._fields}
+    work["signals"] = np.empty((5, 5 * points))
+    share = np.empty((pixels, points))
+    mean, spread = np.empty((pixels, 2, size)), np.empty((pixels, 2, size, size))
+    _moments(
+        known_emissivity.response_tables(tile),
+        np.log(prior.weight),
+        _Given(
+            *(
+                np.ascontiguousarray(np.moveaxis(part, -1, 0))
+                for part in (grid, prior.mean, prior.covariance, levels, *curve_parts)
+            )
+        ),
+        _Work(**work),
+        share,
+        mean,
+        spread,
+    )
+    (plain, mean), (covariance, spread) = (
+        np.ascontiguousarray(np.moveaxis(part, 0, -1)) for part in (mean, spread)
+    )
     # The blackest emissivity that is as improbable; the grid rises.
-    above = np.cumsum(weight.sum(axis=0)[::-1], axis=0) < _WORSE
-    blackest = np.take_along_axis(grid[::-1], np.minimum(above.sum(axis=0), len(grid) - 1)[None], 0)
-    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest[0] - 1.0)) - mean[0]
+    above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
+    blackest = _crossing(grid, above, _WORSE)
+    bound = 1.0 + 2.0 * (1.0 / blackest - 1.0) if parts > 1 else np.inf
+    moved = np.minimum(mean[0], bound) - mean[0]
     mean[0] += moved
     spread[0, 0] += moved**2
     # e_1 = 1 / a, e_m = rho_m / a; de_1 = -e_1 / a da, de_m = (drho_m - e_m da) / a.
@@ -219,81 +252,232 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     change[:-1, 0] = -point / a
     change[-1, -1] = 1.0
     spread = np.einsum("imp,mnp,jnp->ijp", change, spread, change, optimize=True)
-    return Moments(point, mean[-1], spread, plain[0][:-1], plain[1][:-1, :-1])
+    return Moments(point, mean[-1], spread, plain[:-1], covariance[:-1, :-1])
 
 
-def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Array:
-    """Log-likelihoods as quadratic functions about zero, near emissivities e and a level c.
+def _crossing(grid: Array, falling: Array, level: float) -> Array:
+    """Place (pixel) on a grid (grid, pixel) at which a function that falls along it has a value."""
+    after = np.clip((falling > level).sum(axis=0), 1, len(grid) - 1)
+    (low, high), (more, less) = (
+        np.take_along_axis(part, np.stack([after - 1, after]), 0) for part in (grid, falling)
+    )
+    part = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
+    return np.asarray(low + part * (high - low))
 
-    (6, band - 1, grid, pixel): value; slopes with e_m, with c; curvatures with e_m, both, c.
+
+@compiled
+def _moments(
+    tables: tuple[kernels.Table, ...],
+    weight: Array,
+    given: _Given,
+    work: _Work,
+    share: Array,
+    means: Array,
+    spreads: Array,
+) -> None:
+    """Probability on the grid (pixel, grid), and moments of (e, c) and (1 / e_1, e_m / e_1, c).
+
+    (pixel, 2, band + 1), (pixel, 2, band + 1, band + 1), in place; the weights are logarithms.
     """
-    nodes, step = data.nodes[:, np.newaxis], 0.05  # [K]
-    parts = []
-    for m in range(1, len(tile.noise)):
-        one, information = e[m - 1], data.information[m - 1]
-        level, above = (
-            known_emissivity.other_band(tile, m, c),
-            known_emissivity.other_band(tile, m, c + step),
-        )
-        by_e = known_emissivity.other_band(tile, m, c + (nodes - c) / grid) - level
-        raised = known_emissivity.other_band(tile, m, c + step + (nodes - c - step) / grid) - above
-        by_c = (above - level + one * (raised - by_e)) / step
-        model = np.stack([level + one * by_e, by_e, by_c])  # (3, node, grid, pixel)
-        weighted = np.einsum("ijp,ajgp->aigp", information, model)
-        products = np.einsum("aigp,bigp->abgp", model, weighted)
-        given = np.einsum("ip,aigp->agp", data.linear[m - 1], model)
-        value = given[0] - 0.5 * products[0, 0]
-        slope = given[1:] - products[0, 1:]
-        (ee, ec), (_, cc) = products[1:, 1:]
+    for p in range(len(share)):
+        mean, covariance = given.mean[p], given.covariance[p]
+        if (
+            p == 0
+            or np.any(mean != given.mean[p - 1])
+            or np.any(covariance != given.covariance[p - 1])
+        ):
+            _condition(mean, covariance, weight, given.grid[p], work)
+        _linearise(tables, given, p, work)
+        for g in range(share.shape[1]):
+            for k in range(weight.size):
+                work.values[g, k, 0] = given.grid[p, g]
+                evidence, work.stiff[g, k] = _eliminate(
+                    work.likelihood[g],
+                    work.normal[g, k],
+                    given.level[p],
+                    work.values[g, k],
+                    work.slope[g, k],
+                    work.loose[g, k],
+                )
+                work.weight[g, k] = work.density[g, k] + evidence
+        _normalise(work)
+        for g in range(share.shape[1]):
+            share[p, g] = work.weight[g].sum()
+        for way in range(2):
+            _average(work, way, means[p, way], spreads[p, way])
+
+
+@compiled
+def _condition(mean: Array, covariance: Array, weight: Array, grid: Array, work: _Work) -> None:
+    """Log-density of the first emissivity, and mean and precision of the others at it, in place.
+
+    The others are taken as independent given the first.
+    """
+    points, bands = grid.size, mean.shape[1]
+    for g in range(points):
+        low, high = grid[max(g - 1, 0)], grid[min(g + 1, points - 1)]
+        cell = np.log((high - low) / (min(g + 1, points - 1) - max(g - 1, 0)))
+        log, normal, whole = work.density[g], work.normal[g], work.whole[g]
+        for k in range(weight.size):
+            variance, off = covariance[k, 0, 0], grid[g] - mean[k, 0]
+            log[k] = weight[k] - 0.5 * (np.log(variance) + off**2 / variance)
+            for m in range(bands - 1):
+                slope = covariance[k, 1 + m, 0] / variance
+                normal[k, 0, m] = mean[k, 1 + m] + slope * off
+                rest = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
+                normal[k, 1, m] = 1.0 / max(rest, 1e-8)
+        share = np.exp(log - log.max())
+        share /= share.sum()
+        for m in range(bands - 1):
+            whole[0, m] = (share * normal[:, 0, m]).sum()
+            wide = 1.0 / normal[:, 1, m] + (normal[:, 0, m] - whole[0, m]) ** 2
+            whole[1, m] = 1.0 / (share * wide).sum()
+        log += cell
+
+
+@compiled
+def _linearise(tables: tuple[kernels.Table, ...], given: _Given, p: int, work: _Work) -> None:
+    """Log-likelihoods of a pixel about its best values at each point of the grid, in place.
+
+    Those of a Gauss-Newton method, with the components of the prior taken as one.
+    """
+    points, others, settled = work.whole.shape[0], work.whole.shape[2], False
+    for g in range(points):
+        work.place[g, 0], work.place[g, 1 + others] = given.grid[p, g], given.level[p, 0]
+        for m in range(others):
+            work.place[g, 1 + m] = work.whole[g, 0, m]
+    for step in range(_STEPS + 1):
+        for m in range(others):
+            for g in range(points):
+                work.place[g, 1 + m] = min(max(work.place[g, 1 + m], _BOUNDS[0]), _BOUNDS[1])
+            _quadratic(tables[0], tables[1 + m], given, p, m, work)
+        if step == _STEPS or settled:
+            break
+        settled = True
+        for g in range(points):
+            before = work.place[g, 1 + others]
+            spare = work.slope[g, 0], work.loose[g, 0]
+            knowledge = work.likelihood[g], work.whole[g], given.level[p]
+            _eliminate(*knowledge, work.place[g], *spare)
+            change = abs(work.place[g, 1 + others] - before)
+            settled &= not change > _SETTLED * given.level[p, 1]
+
+
+@compiled
+def _quadratic(
+    first: kernels.Table, other: kernels.Table, given: _Given, p: int, band: int, work: _Work
+) -> None:
+    """Log-likelihoods of another band as quadratic functions about zero, in place.
+
+    Near (e_1, e_m, c): value; slopes with e_m, with c; curvatures with e_m, both, c.
+    """
+    nodes, linear, information = given.nodes[p], given.linear[p, band], given.information[p, band]
+    signal, emitted, rate = work.signals[0], work.signals[1], work.signals[2]
+    of_e, of_c = np.empty(4), np.empty(4)
+    for g in range(len(work.place)):
+        c = signal[5 * g + 4] = work.place[g, -1]
+        for i in range(4):
+            signal[5 * g + i] = c + (nodes[i] - c) / work.place[g, 0]
+    spare = work.signals[3], work.signals[4]
+    known_emissivity.other_band(first, other, signal, emitted, rate, *spare)
+    for g in range(len(work.place)):
+        share, e, c = 1.0 / work.place[g, 0], work.place[g, 1 + band], work.place[g, -1]
+        level, by_level = emitted[5 * g + 4], (1.0 - e) * rate[5 * g + 4]
+        for i in range(4):
+            of_e[i] = emitted[5 * g + i] - level
+            of_c[i] = by_level + e * rate[5 * g + i] * (1.0 - share)
+        square, value, by_e, by_c, ee, ec, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(4):
+            here, here_e, here_c = 0.0, 0.0, 0.0  # H times the model and its slopes
+            for j in range(4):
+                here += information[i, j] * (level + e * of_e[j])
+                here_e += information[i, j] * of_e[j]
+                here_c += information[i, j] * of_c[j]
+            model, left = level + e * of_e[i], linear[i] - here
+            value, square = value + linear[i] * model, square + model * here
+            by_e, by_c = by_e + of_e[i] * left, by_c + of_c[i] * left
+            ee, ec, cc = ee + of_e[i] * here_e, ec + of_e[i] * here_c, cc + of_c[i] * here_c
         # L = L0 + g d - d A d / 2 with d = (e, c) less the point.
-        value = value - slope[0] * one - slope[1] * c
-        value = value - 0.5 * (ee * one**2 + 2.0 * ec * one * c + cc * c**2)
-        slope = slope[0] + ee * one + ec * c, slope[1] + ec * one + cc * c
-        parts.append([value, *slope, ee, ec, cc])
-    return np.moveaxis(np.array(parts), 1, 0)
+        result = work.likelihood[g, band]
+        result[0] = value - 0.5 * square - by_e * e - by_c * c
+        result[0] -= 0.5 * (ee * e**2 + 2.0 * ec * e * c + cc * c**2)
+        result[1], result[2] = by_e + ee * e + ec * c, by_c + ec * e + cc * c
+        result[3], result[4], result[5] = ee, ec, cc
 
 
+@compiled
 def _eliminate(
-    likelihood: Array, mean: Array, variance: Array, level: Level
-) -> tuple[Array, Array, Array]:
-    """Evidence (component, grid, pixel), mean and covariance of (e_m, c).
+    likelihood: Array, normal: Array, level: Array, values: Array, slope: Array, loose: Array
+) -> tuple[float, float]:
+    """Evidence, and the precision of c; mean of (e_m, c), slopes of e_m with c and variances at it.
 
     Given c the e_m are independent, so they are eliminated first, and c last.
     """
-    value, by_e, by_c, ee, ec, cc = likelihood
-    precision = 1.0 / np.square(level.std)
-    stiff = ee + 1.0 / variance
-    right = by_e + mean / variance
-    curvature = precision + (cc - ec**2 / stiff).sum(axis=1)
-    toward = precision * level.signal + (by_c - ec * right / stiff).sum(axis=1)
+    precision, evidence, scale = 1.0 / level[1] ** 2, 0.0, 1.0
+    curvature, toward = precision, precision * level[0]
+    for m in range(loose.size):
+        mean, weight, ec = normal[0, m], normal[1, m], likelihood[m, 4]
+        variance, right = 1.0 / (likelihood[m, 3] + weight), likelihood[m, 1] + mean * weight
+        loose[m], slope[m], values[1 + m] = variance, -ec * variance, right * variance
+        scale *= variance * weight
+        evidence += likelihood[m, 0] - 0.5 * (mean**2 * weight - right**2 * variance)
+        curvature += likelihood[m, 5] - ec**2 * variance
+        toward += likelihood[m, 2] - ec * right * variance
     c = toward / curvature
-    evidence = value - 0.5 * (np.log(stiff * variance) + mean**2 / variance - right**2 / stiff)
-    evidence = evidence.sum(axis=1) + 0.5 * (np.log(precision / curvature) + toward * c)
-    slope = -ec / stiff
-    e = right / stiff + slope * c[:, np.newaxis]
-    slope = np.concatenate([slope, np.ones_like(c)[:, np.newaxis]], axis=1)
-    covariance = slope[:, :, None] * slope[:, None] / curvature[:, None, None]
-    for m in range(e.shape[1]):
-        covariance[:, m, m] += 1.0 / stiff[:, m]
-    return evidence, np.concatenate([e, c[:, np.newaxis]], axis=1), covariance
+    values[-1] = c
+    for m in range(loose.size):
+        values[1 + m] += slope[m] * c
+    return evidence + 0.5 * (np.log(scale * precision / curvature) + toward * c), curvature
 
 
-def _average(
-    weight: Array, first: Array, scale: Array, values: Array, covariance: Array
-) -> tuple[Array, Array]:
-    """Mean and covariance, over components and grid, of a first, of e_m by a scale, and of c."""
-    scales = np.ones((values.shape[1], *scale.shape))
-    scales[:-1] = scale
-    head = np.broadcast_to(first, (values.shape[0], 1, *first.shape))
-    parts = np.concatenate([head, values * scales], axis=1)
-    parts = np.where(weight[:, np.newaxis] > 0, parts, 0.0)
-    mean = np.einsum("kgp,kigp->ip", weight, parts)
-    off = parts - mean[:, np.newaxis]
-    total = np.einsum("kgp,kigp,kjgp->ijp", weight, off, off, optimize=True)
-    inner = np.where(weight[:, np.newaxis, np.newaxis] > 0, covariance, 0.0)
-    within = np.einsum("kgp,kijgp,igp,jgp->ijp", weight, inner, scales, scales, optimize=True)
-    total[1:, 1:] += within
-    return mean, total
+@compiled
+def _normalise(work: _Work) -> None:
+    """Weights (grid, component) that add up to 1 of logarithms, in place.
+
+    Each times the probability that the other emissivities lie between 0 and 1.
+    """
+    weight = work.weight
+    for g, k in np.ndindex(weight.shape):
+        weight[g, k] = weight[g, k] if np.isfinite(weight[g, k]) else -np.inf
+    highest = weight.max()
+    for g, k in np.ndindex(weight.shape):
+        share = np.exp(weight[g, k] - highest)
+        for m in range(work.slope.shape[2] if share > _NEGLIGIBLE else 0):
+            variance = work.slope[g, k, m] ** 2 / work.stiff[g, k] + work.loose[g, k, m]
+            value, scale = work.values[g, k, 1 + m], 1.0 / np.sqrt(2.0 * variance)
+            share *= 0.5 * (math.erf((1.0 - value) * scale) + math.erf(value * scale))
+        weight[g, k] = share if share > _NEGLIGIBLE else 0.0
+    weight /= weight.sum()
+
+
+@compiled
+def _average(work: _Work, relative: int, mean: Array, spread: Array) -> None:
+    """Mean and covariance of (e, c), or of (1 / e_1, e_m / e_1, c), over grid and components."""
+    size = mean.size
+    part, direction = np.empty(size), np.ones(size)
+    mean[:], spread[:], direction[0] = 0.0, 0.0, 0.0
+    for second in range(2):
+        for g, k in np.ndindex(work.weight.shape):
+            weight = work.weight[g, k]
+            if weight == 0.0:
+                continue
+            scale = 1.0 / work.values[g, k, 0] if relative else 1.0
+            for i in range(size):
+                part[i] = work.values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
+            part[0] = (scale if relative else work.values[g, k, 0]) - mean[0] * second
+            if second == 0:
+                for i in range(size):
+                    mean[i] += weight * part[i]
+                continue
+            # Given e_1, c has the variance 1 / stiff, of which e_m follows a share.
+            inner = 1.0 / work.stiff[g, k]
+            for m in range(size - 2):
+                direction[1 + m] = work.slope[g, k, m] * scale
+                spread[1 + m, 1 + m] += weight * work.loose[g, k, m] * scale**2
+            for i in range(size):
+                for j in range(size):
+                    moved = part[i] * part[j] + inner * direction[i] * direction[j]
+                    spread[i, j] += weight * moved
 
 
 def behind(
@@ -327,18 +511,19 @@ def behind(
     slope = np.zeros((len(static.covariance), *seen.shape))
     slope[0], slope[-1] = level * mean(off) + change * (off - mean(off)), 1.0 - level
     spread = level * common + change * noise
-    return value, spread + known_emissivity.through(slope, static.covariance)
+    through = np.einsum("itp,ijp,jtp->tp", slope, static.covariance, slope, optimize=True)
+    return value, spread + np.maximum(through, 0.0)
 
 
-def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:
+def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Array:
     """Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
 
     Weighed against what is expected, as uncertain as it is large.
     """
     vague = np.full_like(static.level, _VAGUE)
-    free = known_emissivity.solve(tile, static.point, static.level, vague)
-    observed = means.mean(free.background, valid)
-    noise = means.mean(free.background_variance, valid) / np.maximum(means.frames, 1.0)
+    bins_alone = replace(tile, signals=means.signals)
+    free = known_emissivity.solve(bins_alone, static.point, static.level, vague)
+    observed, noise = free.background, free.background_variance / np.maximum(means.frames, 1.0)
     used = means.frames > 0
     count = np.maximum(used.sum(axis=0), 2)
     centre = np.where(used, observed, 0.0).sum(axis=0) / count

@@ -30,34 +30,15 @@ class Mixture:
     mean: Array  # (component, band, pixel) [1]
     covariance: Array  # (component, band, band, pixel) [1]
 
-    def grid(self) -> tuple[Array, Array]:
-        """Grid (grid, pixel) of the first emissivity, and the spacing of its points."""
+    def grid(self) -> Array:
+        """Grid (grid, pixel) of the first emissivity."""
         pixels = self.mean.shape[-1]
         if len(self.weight) > 1:
-            grid = np.repeat(_GRID[:, np.newaxis], pixels, axis=1)
-        else:
-            std = np.sqrt(self.covariance[0, 0, 0])
-            low = np.maximum(self.mean[0, 0] - _SIGMAS * std, _LIMITS[0])
-            high = np.minimum(self.mean[0, 0] + _SIGMAS * std, _LIMITS[1])
-            grid = low + np.linspace(0.0, 1.0, _POINTS)[:, np.newaxis] * (high - low)
-        return grid, np.gradient(grid, axis=0)
-
-    def conditional(self, grid: Array) -> tuple[Array, Array, Array]:
-        """Log-density of the first emissivity, mean and variance of the others given it.
-
-        (component, grid, pixel), (component, band - 1, grid, pixel), and of ones for the grid. The
-        others are taken as independent given the first.
-        """
-        first = self.covariance[:, 0, 0, np.newaxis]
-        off = grid - self.mean[:, 0, np.newaxis]
-        log = np.log(self.weight)[:, np.newaxis, np.newaxis] - 0.5 * (
-            np.log(first) + off**2 / first
-        )
-        slope = self.covariance[:, 1:, 0] / self.covariance[:, :1, 0]
-        mean = self.mean[:, 1:, np.newaxis] + slope[:, :, np.newaxis] * off[:, np.newaxis]
-        diagonal = np.einsum("kbbp->kbp", self.covariance)[:, 1:]
-        variance = diagonal - slope * self.covariance[:, 1:, 0]
-        return log, mean, np.maximum(variance, 1e-8)[:, :, np.newaxis]
+            return np.repeat(_GRID[:, np.newaxis], pixels, axis=1)
+        std = np.sqrt(self.covariance[0, 0, 0])
+        low = np.maximum(self.mean[0, 0] - _SIGMAS * std, _LIMITS[0])
+        high = np.minimum(self.mean[0, 0] + _SIGMAS * std, _LIMITS[1])
+        return np.asarray(low + np.linspace(0.0, 1.0, _POINTS)[:, np.newaxis] * (high - low))
 
     def at(self, places: Whole | int) -> "Mixture":
         """Return the mixture of some pixels, or of labels (pixel,)."""

@@ -15,7 +15,7 @@ from dbthermal.separation import _known_emissivity as known_emissivity
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
-from dbthermal.separation._completion.posterior import Level
+from dbthermal.separation._completion.posterior import Level, Moments
 from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
@@ -44,6 +44,7 @@ _MEDIAN: Final = np.pi / 2.0
 # Precision of a level that a pixel does not show [1/K^2].
 _NOTHING: Final = 1e-9
 
+Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
 
 
@@ -67,11 +68,12 @@ class Scene:
         value, covariance = self.emissivity[:, places], self.covariance[..., places]
         return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
 
-    def tile(self, part: xr.Dataset, grains: Any = None) -> tuple[Tile, Mask]:
-        """Tile of all pixels of a part of the capture, and its valid samples (time, pixel)."""
+    def tile(self, part: xr.Dataset, selected: Mask | slice = slice(None)) -> tuple[Tile, Mask]:
+        """Tile of the selected pixels of a part of the capture, and valid samples (time, pixel)."""
         inputs = self.inputs
-        counts, valid, status = quality.read(part, 1, grains, most_missing=1.0)
+        counts, valid, status = quality.read(part, most_missing=1.0)
         valid = valid & ((status & _UNUSABLE) == 0)
+        counts, valid = counts[..., selected], valid[:, selected]
         curves = tuple(inputs.curves[band] for band in inputs.bands)
         pairs = zip(inputs.bands, curves, strict=True)
         signals = [curve.linearise(counts[band]) - curve.reference for band, curve in pairs]
@@ -85,7 +87,7 @@ class Scene:
             pattern=None if inputs.pattern is None else tuple(inputs.pattern[inputs.bands]),
         ), valid
 
-    def sample(self) -> tuple[Tile, Mask, Whole]:
+    def sample(self) -> Sample:
         """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
         capture = self.inputs.capture
         numbers = np.arange(self.source.size).reshape(capture.sizes["y"], capture.sizes["x"])
@@ -139,9 +141,9 @@ def _covariance(result: xr.Dataset, bands: list[int]) -> Array:
     return variance * np.eye(len(bands))[..., np.newaxis]
 
 
-def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
-    """Refuse a result whose values do not give the capture's signals back."""
-    tile, valid, places = scene.sample()
+def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> None:
+    """Refuse a result whose values do not give the capture's signals back, in some pixels."""
+    tile, valid, places = sample
     films = [result[name].values.reshape(len(valid), -1)[:, places] for name in FILMS]
     with np.errstate(all="ignore"):
         mixed = tile.mixed(scene.emissivity[:, places], np.array(films, dtype=np.float64))
@@ -169,20 +171,12 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
     return Level(signal, std * curve.slope(values), _FLUCTUATION)
 
 
-def solve(
-    scene: Scene,
-    tile: Tile,
-    valid: Mask,
-    source: int,
-    places: Whole,
-    measured: Array | None = None,
-) -> tuple[Values, Array]:
-    """Complete the pixels of a tile whose emissivities come from one source.
+def solve_statics(
+    scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
+) -> tuple[Moments, Array]:
+    """Posterior of what is constant in pixels of a tile whose emissivities come from one source.
 
-    The background is told with the object temperatures that are `measured`, and their deviations
-    (2, time, pixel) [K], NaN elsewhere. Beside the values, the posterior mean and variance of the
-    background's level, the prior's variance, and the variance of the background over time
-    (4, pixel).
+    And the variance of the background over time (pixel) [K^2].
     """
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
@@ -196,58 +190,68 @@ def solve(
         bend = bend * level.fluctuation
         data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
-        variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
-        variance = np.maximum(variance, _LEAST[1] ** 2)
-        found = known_emissivity.solve(
-            tile, static.point, static.level, variance, apart=scene.apart
-        )
+        variance = posterior.fluctuation(tile, static, means, level.fluctuation)
+    return static, np.maximum(variance, _LEAST[1] ** 2)
+
+
+def solve(
+    scene: Scene, tile: Tile, valid: Mask, static: Moments, variance: Array, measured: Array
+) -> Values:
+    """Complete the pixels of a tile, given what is constant in them.
+
+    The background is told with the object temperatures that are `measured`, and their deviations
+    (2, time, pixel) [K], NaN elsewhere.
+    """
+    with np.errstate(all="ignore"):
+        static_parts = (static.point, static.level, variance, static.covariance)
+        found = known_emissivity.solve(tile, *static_parts, apart=scene.apart)
         signal, left = known_emissivity.smooth(found.signal, found.white, valid, tile.time)
-        left = left + found.shared + known_emissivity.through(found.sensitivity, static.covariance)
-        around = known_emissivity.through(found.background_sensitivity, static.covariance)
-        behind = found.background, found.background_variance + around
-        if measured is not None:
-            own, spread = posterior.behind(tile, static, measured, valid, variance)
-            known = np.isfinite(own) & np.isfinite(spread)
-            behind = np.where(known, own, behind[0]), np.where(known, spread, behind[1])
+        background, spread = found.background, found.background_variance
+        if (some := np.isfinite(measured[0]).any(axis=0)).any():
+            part = (tile.select_pixels(some), static.select_pixels(some), measured[..., some])
+            behind = posterior.behind(*part, valid[:, some], variance[some])
+            known = np.isfinite(behind).all(axis=0)
+            for film, own in zip((background, spread), behind, strict=True):
+                film[:, some] = np.where(known, own, film[:, some])
         values: Values = {}
-        films = (signal, left), behind
-        for name, (mean, spread) in zip(FILMS, films, strict=True):
-            temperature = tile.temperature(0, np.where(valid, mean, np.nan))
-            values[name] = temperature
-            values[f"{name}_std"] = np.sqrt(spread) / tile.curves[0].slope(temperature)
+        films = (signal, left + found.shared), (background, spread)
+        for name, (mean, deviation) in zip(FILMS, films, strict=True):
+            pair = known_emissivity.temperatures(tile, np.where(valid, mean, np.nan), deviation)
+            values[name], values[f"{name}_std"] = pair
         pairs = ((static.emissivity, static.emissivity_covariance), static.reflection_ratio())
         values["emissivity_covariance"] = static.emissivity_covariance
         for name, (mean, covariance) in zip(MAPS, pairs, strict=True):
             values[name] = mean
             values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
-    room = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
-    return values, np.array(np.broadcast_arrays(*room))
+    return values
 
 
-def contradicted(scene: Scene, values: Values, places: Whole) -> Mask:
+def contradicted(scene: Scene, static: Moments, places: Whole) -> Mask:
     """Completed pixels that tell other emissivities than their material has, by chi-square."""
-    off = (values["emissivity"] - scene.emissivity[:, places]).T[..., np.newaxis]
+    off = (static.emissivity - scene.emissivity[:, places]).T[..., np.newaxis]
     bands = off.shape[1]
     covariance = np.moveaxis(scene.covariance[..., places], -1, 0) + _NOTHING * np.eye(bands)
     square = (off * np.linalg.solve(covariance, off)).sum(axis=(1, 2))
     return np.asarray(square > chdtri(bands, _CHANCE))
 
 
-def find_level(scene: Scene) -> Level:
-    """Level of the background over the pixels, from those that show it, beside what is known.
+def find_level(scene: Scene, sample: Sample) -> Level:
+    """Level of the background over some pixels, from those that show it, beside what is known.
 
     Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
     scatter that they do not explain, which is how much pixels differ. Pixels whose emissivities
     come from one prior, or from other pixels, share its error: together they count as one pixel.
     """
-    tile, valid, places = scene.sample()
+    tile, valid, places = sample
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
     parts, counted = [], []
     for source in np.unique(sources[sources >= 0]):
         here = sources == source
         counted.append(np.full(here.sum(), 1.0 if source == OWN else 1.0 / here.sum()))
         part = tile.select_pixels(here), valid[:, here], int(source), places[here]
-        parts.append(solve(scene, *part)[1])
+        static, fluctuation = solve_statics(scene, *part)
+        before = np.square(scene.level.at(places[here]).std)
+        parts.append([static.level, static.covariance[-1, -1], before, fluctuation])
     if not parts:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(parts, axis=1)

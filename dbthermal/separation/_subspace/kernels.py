@@ -186,11 +186,11 @@ def temperature(table: Table, signal: Array, result: Array) -> None:
     if outside > 0.0:
         for t in range(signal.size):
             if not abs(signal[t] - table.middle_signal) <= table.half_signal:
-                result[t] = _inverse(table, signal[t])
+                result[t] = inverse(table, signal[t])
 
 
 @compiled
-def _inverse(table: Table, signal: float) -> float:
+def inverse(table: Table, signal: float) -> float:
     """Temperature [K] of a blackbody with any signal less the reference [K]."""
     excess = signal - table.offset
     if table.linear:
