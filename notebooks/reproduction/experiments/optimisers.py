@@ -93,20 +93,23 @@ def newton_gradient(search: Search, column: int) -> tuple[Array, ...]:
     ]
     scale = objective.Scale(sigma, tuple(deviation), 1.0)
     _, forces, blocks = objective.system(films, rest, signals, scale, weights, 1.0)
-    # The noise, which is eliminated in the forces, is put back.
+    # The forces are those of the eliminated noise: q N^-1 pull is put back.
     noise = objective.noise_step(blocks, 0.0 * films, rest, scale, weights)[1:]
     (_, e1, e2), variance = rest, np.square(sigma)[:, None]
     k1, k2 = e2 / e1, (1 - e2) / (1 - e1)
+    # g_n1, g_n2 = q n + mean - (h p)_m +- w r; beyond the noise's term they are those of I1~, I2~.
     of_noise = forces[:, :2].T - (weights.noise + weights.noise_mean) / variance * noise
     of_noise[0] -= k1 * forces[:, 1]
     error = forces[:, 2] - weights.reconstruction / variance[1] * (k2 * noise[0] - noise[1])
     first, second = blocks[:, :2].T - of_noise
     bend, square = objective.bending(films[0])
     stiff = weights.smoothness / weights.curvature**2
+    # I2~(t) = I2~(0) + k1 [I1~(t) - I1~(0)], and the bending (1 + k1^2) |D I1~|^2
     smooth = first + k1 * second + stiff * (1 + k1**2) * bend
     smooth[0] -= k1 * second.sum()
     by_k1 = second @ (films[0] - films[0, 0]) + stiff * k1 * square
     by_k2 = -blocks[:, 4] @ error
+    # dk1 = (de2 - k1 de1) / e1, dk2 = (k2 de1 - de2) / (1 - e1)
     by_emissivity = [by_k2 * k2 / (1 - e1) - by_k1 * k1 / e1, by_k1 / e1 - by_k2 / (1 - e1)]
     parts = smooth, blocks[:, :2].T, second.sum(), np.array(by_emissivity)
     values = objective.losses(films, rest, signals, scale, weights)
@@ -125,9 +128,9 @@ def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
     gradient = (part.numpy() for part in torch.autograd.grad(total.sum(), (films, rest)))
     rows = []
     for column, (film, border) in enumerate(zip(*gradient, strict=True)):
-        theirs = total[:, column].detach().numpy(), film[0], film[1:], border[0], border[1:]
-        pairs = zip(newton_gradient(search, column), theirs, strict=True)
-        rows.append([np.linalg.norm(ours - other) / np.linalg.norm(other) for ours, other in pairs])
+        values = total[:, column].detach().numpy(), film[0], film[1:], border[0], border[1:]
+        pairs = zip(newton_gradient(search, column), values, strict=True)
+        rows.append([np.linalg.norm(step - value) / np.linalg.norm(value) for step, value in pairs])
     names = ["losses", "by smooth signal", "by noise", "by offset", "by emissivities"]
     return xr.DataArray(np.transpose(rows), {"quantity": names}, ("quantity", "pixel"))
 
@@ -141,11 +144,8 @@ def newton(start: Search, truth: xr.DataArray) -> tuple[Search, xr.Dataset]:
         stopped.append(search._minimise(stages)[1])
     before = SETTINGS.stage_steps * (SETTINGS.stages - 1)
     steps = before + 1 + np.mean(~np.array(stopped[:-1]), axis=1).sum()
-    seconds, at = (
-        time.process_time() - began,
-        (torch.tensor(search.films), torch.tensor(search.rest)),
-    )
-    return search, judged(start, truth, [(steps, seconds, *at)])
+    point = steps, time.process_time() - began, *map(torch.tensor, (search.films, search.rest))
+    return search, judged(start, truth, [point])
 
 
 def adam(start: Search, truth: xr.DataArray, rate: float, looks: Sequence[int]) -> xr.Dataset:
