@@ -271,12 +271,14 @@ def gpu() -> str:
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
 """Marks around the default call's figures in README.md and docs/benchmarks.md."""
 
-DEFAULT_CALL: Final = """`separation.separate`, the default call, and `solve`, each pixel alone: a
-simulated plate of glass that is heated while people walk by, {rows}x{columns} pixels, {frames}
-frames, two bands. Processor time of one thread, after a first call that compiles; of `solve`
-without the search for the shift between cameras apart. Errors are medians over the pixels without
-a flag. Measured, and the peak of the memory: one capture of 640x512, by the clock, of two threads.
-On {machine}; its load when it began: {busy:.1f}.
+DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
+pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` treats each
+pixel alone, and is told the shift between cameras apart. Times are of one thread's processor,
+after a first call that compiles; errors are medians over the pixels without a flag. What is
+measured of 640x512 pixels is one capture, by the clock, with two threads.
+
+{machine}.
+Load when it began: {busy:.1f}; the clock's figures are too slow where others work on it.
 
 {table}
 """

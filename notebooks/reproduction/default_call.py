@@ -159,8 +159,8 @@ def rows(calls: Calls) -> Iterator[tuple[str, ...]]:
     yield (
         "call",
         "cameras",
-        "us a pixel, one thread",
-        "frames/s of 640x512, two cores, from that",
+        "us a pixel",
+        "frames/s of 640x512, two cores, from it",
         "measured",
         "peak memory",
         "error",
