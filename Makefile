@@ -139,7 +139,7 @@ lab: ## open JupyterLab on a copy of the five-minute tour, in results/lab
 	@test -e results/lab/tour.ipynb || { mkdir -p results/lab && cp notebooks/00_quickstart.ipynb results/lab/tour.ipynb; }
 	$(python) -m jupyterlab results/lab/tour.ipynb
 
-bench: .venv/installed ## measure every method's time, and a run from disk to disk, into results/bench
+bench: .venv/installed ## measure the default call, every method, and a run from disk to disk, into results/bench
 	$(python) -m reproduction.benchmark
 
 attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/trust.md

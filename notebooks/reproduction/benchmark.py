@@ -1,8 +1,9 @@
-"""Time and memory of every method on this machine: a table and a figure in results/bench.
+"""Time and memory on this machine: a table and a figure in results/bench.
 
-Times of one thread are its processor's, the better of two; those of processes and of the disk are
-the clock's. What a series would not end within `LONGEST` is left out of it. All captures are
-simulated plate glass before which people walk, at `RATE`.
+First those of the default call, see `default_call`, then those of every method. Times of one thread
+are its processor's, the better of two; those of processes and of the disk are the clock's. What a
+series would not end within `LONGEST` is left out of it. All captures are simulated plate glass
+before which people walk, at `RATE`.
 """
 
 import argparse
@@ -12,10 +13,10 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,10 +32,11 @@ from matplotlib.figure import Figure
 from dbthermal import separation, simulation, store
 from dbthermal.figures import drawing
 from dbthermal.separation._subspace import method as subspace
-from reproduction import experiments, paths
+from reproduction import default_call, experiments, paths, verify
+from reproduction.default_call import processor_time
 
 RATE: Final = 10.0  # [Hz]
-LONGEST: Final = 8.0  # [s]
+LONGEST: Final = default_call.SHORT  # [s]
 FRAME: Final = 640 * 512  # pixels of a camera
 USUAL: Final = {"pixels": 512, "frames": 350, "bands": 2}
 SERIES: Final = {
@@ -109,13 +111,7 @@ def solve(movie: xr.Dataset, method: str, settings: Any = None) -> xr.Dataset:
 
 def seconds_of(method: str, sizes: dict[str, int]) -> float:
     """Processor time [s] of a separation; the better of two, for the first one may compile."""
-    movie = capture(**sizes)
-    taken: list[float] = []
-    while not taken or (len(taken) < 2 and taken[0] < LONGEST):
-        start = time.process_time()
-        solve(movie, method)
-        taken.append(time.process_time() - start)
-    return min(taken)
+    return processor_time(partial(solve, capture(**sizes), method))[0]
 
 
 def forms() -> dict[str, tuple[float, float]]:
@@ -203,8 +199,7 @@ def _run(source: Path, target: Path, processes: int) -> float:
 def _peak(source: Path, target: Path, memory: float) -> float:
     """Peak of the memory [byte] of this process, which separates by two threads."""
     separation.run(source, target, simulation.Rig().response(), memory=memory)
-    found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
-    return 1024.0 * float(found[1]) if found else float("nan")
+    return default_call.peak_memory()
 
 
 def size_on_disk(folder: Path) -> int:
@@ -273,11 +268,32 @@ def gpu() -> str:
     return torch.cuda.get_device_name() if torch.cuda.is_available() else "a GPU was not at hand"
 
 
+MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
+"""Marks around the default call's figures in README.md and docs/benchmarks.md."""
+
+DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
+pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` treats each
+pixel alone, and is told the shift between cameras apart. Times are of one thread's processor,
+after a first call that compiles; errors are medians over the pixels without a flag. What is
+measured of 640x512 pixels is one capture, by the clock, with two threads.
+
+{machine}.
+Load when it began: {busy:.1f}; the clock's figures are too slow where others work on it.
+
+{table}
+"""
+
 HEAD: Final = """# Benchmarks
 
 Made by `make bench` on {machine}.
 Load of the machine when it began: {busy:.1f}; where others work on it, what is of the clock is too
 slow. All captures are simulated.
+
+## The default call
+
+{default_call}
+
+## Every method
 
 {ratios}
 
@@ -308,13 +324,24 @@ def rows(*cells: Sequence[str]) -> str:
     return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
 
 
-def table(times: Times, disk: Disk, rates: dict[str, tuple[float, float]], busy: float) -> str:
-    """All that was measured, in Markdown, ratios first."""
+def default_figures(calls: default_call.Calls, busy: float) -> str:
+    """Figures of the default call, in Markdown."""
+    height, width = default_call.SHAPE
+    size = {"rows": height, "columns": width, "frames": default_call.FRAMES}
+    table = rows(*default_call.rows(calls))
+    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=table)
+
+
+def table(
+    default: str, times: Times, disk: Disk, rates: dict[str, tuple[float, float]], busy: float
+) -> str:
+    """All that was measured, in Markdown: the default call's figures, then ratios first."""
     most = max(disk.seconds)
     frames = times["subspace", "frames"]
     return HEAD.format(
         machine=machine(),
         busy=busy,
+        default_call=f"{MARKS[0]}\n\n{default}\n{MARKS[1]}",
         few=FEW,
         processes=most,
         ratios=rows(("ratio", ""), *ratios(times, disk)),
@@ -403,21 +430,34 @@ def figure(times: Times) -> Figure:
     return drawn
 
 
-def main(arguments: Sequence[str] | None = None, measure: Callable[[], Times] = all_series) -> int:
-    """Measure, and write results/bench/benchmarks.md and .png; the former in docs too, if asked."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, and write results/bench/benchmarks.md and .png; README and docs too, if asked."""
     parser = argparse.ArgumentParser(prog="reproduction.benchmark", description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write docs/benchmarks.md, too")
+    parser.add_argument("--default-call", action="store_true", help="measure nothing else")
+    parser.add_argument("--write", action="store_true", help="write README.md and docs, too")
     chosen = parser.parse_args(arguments)
     busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
     folder.mkdir(parents=True, exist_ok=True)
-    times = measure()
+    calls: default_call.Calls = {}
     with TemporaryDirectory(dir=folder) as place:
-        disk = from_disk(Path(place))
-    text = table(times, disk, forms(), busy)
+        for name, call in default_call.measured(Path(place)):
+            calls[name] = call
+            print(*name, call, flush=True)
+    text = default = default_figures(calls, busy)
+    readme, page = paths.root() / "README.md", paths.root() / "docs" / "benchmarks.md"
+    if not chosen.default_call:
+        times = all_series()
+        with TemporaryDirectory(dir=folder) as place:
+            disk = from_disk(Path(place))
+        text = table(default, times, disk, forms(), busy)
+        store.save_figure(figure(times), folder / "benchmarks.png", record)
+        if chosen.write:
+            page.write_text(text, encoding="utf-8")
     store.save_text(text, folder / "benchmarks.md", record)
-    store.save_figure(figure(times), folder / "benchmarks.png", record)
     if chosen.write:
-        (paths.root() / "docs" / "benchmarks.md").write_text(text, encoding="utf-8")
+        for path in (readme, page):
+            old = path.read_text(encoding="utf-8")
+            path.write_text(verify.enclosed(old, MARKS, default, path.name), encoding="utf-8")
     print(text)
     return 0
 

@@ -76,13 +76,18 @@ def agree(value: object, expected: object) -> bool:
     return value == expected and type(value) is type(expected)
 
 
+def enclosed(page: str, marks: tuple[str, str], text: str, name: str) -> str:
+    """Page with a text between two marks; `name` is the page's in an error."""
+    head, start, rest = page.partition(marks[0])
+    _, stop, tail = rest.partition(marks[1])
+    if not (start and stop):
+        raise ValueError(f"Missing marks {marks} in {name}. Must enclose its table.")
+    return f"{head}{start}\n\n{text}\n{stop}{tail}"
+
+
 def with_table(page: str, numbers: Mapping[str, Numbers]) -> str:
     """Text of docs/paper.md with the comparison with the paper between its `MARKS`."""
-    head, start, rest = page.partition(MARKS[0])
-    _, stop, tail = rest.partition(MARKS[1])
-    if not (start and stop):
-        raise ValueError(f"Missing marks {MARKS} in docs/paper.md. Must enclose its table.")
-    return f"{head}{start}\n\n{paper.markdown(numbers)}\n{stop}{tail}"
+    return enclosed(page, MARKS, paper.markdown(numbers), "docs/paper.md")
 
 
 def record(numbers: Mapping[str, Numbers], reference: Mapping[str, object]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from dbthermal import separation
-from reproduction import benchmark
+from reproduction import benchmark, default_call, paths, verify
 from reproduction.benchmark import FRAME, Disk
 
 
@@ -33,7 +33,8 @@ def test_the_table_says_what_was_measured() -> None:
         result_bytes=16 * 600 * FRAME,
     )
     rates = {"tensors on GPU": (60.0 * FRAME * benchmark.MOVED, 600.0 * FRAME * benchmark.MOVED)}
-    text = benchmark.table(times(), disk, rates, 0.5)
+    text = benchmark.table("the default call", times(), disk, rates, 0.5)
+    assert verify.enclosed(text, benchmark.MARKS, "the default call", "the page") == text
     for line in (
         "| `dbvt` over `subspace`, a pixel, 2048 over 2048 pixels | 4 |",
         "2 processes, over reading and writing alone | 2.0 |",
@@ -47,6 +48,33 @@ def test_the_table_says_what_was_measured() -> None:
         "| a day at 60 Hz | 24 h | 2 h | 13.6 TB | 27.2 TB |",
     ):
         assert line in text, text
+
+
+def test_the_default_call_is_on_its_pages() -> None:
+    """Its figures are said first in docs/benchmarks.md and in README.md, between their marks."""
+    call = default_call.Call(pixel=7e-5, rmse=0.0312, cover=0.951, frame_rate=31.0, peak=4.2e9)
+    calls = {("separate", "one place"): call}
+    text = benchmark.default_figures(calls, 0.5)
+    line = "| `separate` | one place | 70 | 31 | 31 | 4.2 GB | 0.031 K | 95.1 % |"
+    assert line in text.splitlines()
+    for name in ("README.md", "docs/benchmarks.md"):
+        page = (paths.root() / name).read_text(encoding="utf-8")
+        assert text in verify.enclosed(page, benchmark.MARKS, text, name)
+
+
+@pytest.mark.slow
+def test_the_default_call_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On small captures at one place, of both functions and of a whole frame."""
+    cameras = {name: default_call.CAMERAS[name] for name in ("one place",)}
+    monkeypatch.setattr(default_call, "CAMERAS", cameras)
+    monkeypatch.setattr(default_call, "whole_frame", lambda *_: (10.0, 1e9))
+    calls = dict(default_call.measured(tmp_path, (28, 40)))
+    assert list(calls) == [("separate", "one place"), ("solve", "one place")]
+    assert calls["separate", "one place"].frame_rate == 35.0
+    for call in calls.values():
+        assert 0 < call.pixel < 0.1  # s
+        assert 0 < call.rmse < 0.2  # K
+        assert call.cover > 0.9
 
 
 @pytest.mark.slow

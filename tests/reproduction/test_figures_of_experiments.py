@@ -49,6 +49,14 @@ def draw_noise(**attrs: object) -> Figure:
     return figures.error_over_noise(errors, title="sweep")
 
 
+def draw_descents(**attrs: object) -> Figure:
+    """Draw the end of one optimiser, and the course of another."""
+    names = ("iteration", "time", "objective", "object_temperature_rmse")
+    courses = xr.Dataset({name: array("optimiser look", 2, 3) for name in names}, attrs=attrs)
+    courses = courses.assign_coords(optimiser=["a", "b"])
+    return figures.descents(courses.where((courses["optimiser"] == "b") | (courses["look"] == 0)))
+
+
 def draw_emissivity(**attrs: object) -> Figure:
     """Draw the errors of two methods over emissivity and noise."""
     coords = {"noise": [0.01, 0.1, 1.0], "emissivity": [0.3, 0.9], "variant": ["a", "b"]}
@@ -173,6 +181,7 @@ DRAWN: dict[str, Callable[..., Figure]] = {
     "compared_reflections": draw_compared,
     "condition_matrix": draw_condition,
     "error_over_noise": draw_noise,
+    "descents": draw_descents,
     "emissivity_errors": draw_emissivity,
     "reductions": lambda **attrs: figures.reductions(two("term", **attrs), [90.0, 5.0]),
     "emissivity_procedures": draw_procedures,

@@ -3,6 +3,7 @@
 from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
 from reproduction.figures.comparison import (
     compared_reflections,
+    descents,
     emissivity_errors,
     emissivity_procedures,
     error_over_noise,
@@ -23,6 +24,7 @@ __all__ = [
     "accuracy",
     "compared_reflections",
     "condition_matrix",
+    "descents",
     "disturbances",
     "emissivity_errors",
     "emissivity_procedures",

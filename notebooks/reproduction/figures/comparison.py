@@ -115,6 +115,29 @@ def sensitivity(errors: xr.DataArray, base: float) -> Figure:
     return figure
 
 
+def descents(courses: xr.Dataset) -> Figure:
+    """Objective over iterations and error over time (optimiser, look), each optimiser a line.
+
+    `iteration`, `time` [ms], `objective` [1] and `object_temperature_rmse` [K], all on logarithmic
+    axes; an optimiser with one look, the others missing, is a mark.
+    """
+    figure, axes = canvas(1, 2, (9.0, 3.6))
+    for axis, (across, up) in zip(
+        axes[0],
+        (("iteration", "objective"), ("time", "object_temperature_rmse")),
+        strict=True,
+    ):
+        for index, name in enumerate(courses["optimiser"].values):
+            course = courses.sel(optimiser=name)
+            axis.loglog(course[across], course[up], label=str(name), **drawing.marked_line(index))
+    axes[0, 0].set(xlabel="iterations [1]", ylabel="median objective [1]")
+    axes[0, 1].set(xlabel="time of one thread, a pixel [ms]", ylabel="median error [K]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
+    figure.suptitle("Descents from random emissivities" + drawing.provenance_note(courses))
+    return figure
+
+
 def emissivity_procedures(
     compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
 ) -> Figure:
