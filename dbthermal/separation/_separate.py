@@ -15,7 +15,6 @@ from dbthermal import _smooth as smooth
 from dbthermal import alignment, schema
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
-from dbthermal.alignment._matching import leading
 from dbthermal.alignment._reflections import SMALLEST, seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
@@ -37,8 +36,8 @@ if TYPE_CHECKING:
 # how many times a window's changes have to exceed the noise, in variance.
 _FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 16), 4, 2.0
 _CHANCE, _LEAST, _LEAST_LATE, _STRONG = 1e-3, 0.3, 0.1, 3.0
-# Pixels that tell the functions of time, and share of its samples that a pixel must have.
-_TOLD_BY, _COMMON = 100, 0.9
+# Functions of time, pixels that tell them, and share of its samples that a pixel must have.
+_PLANES, _TOLD_BY, _COMMON = 32, 100, 0.9
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
     "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
@@ -265,7 +264,7 @@ def _displacements(corrected: xr.Dataset, response: xr.Dataset) -> list[Array]:
     segment = inputs.capture["segment"].values[every] if "segment" in inputs.capture else None
     orders = min(HIGHEST_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
-    functions = [leading(some - some @ part @ part.T) for part in curves]
+    functions = [smooth.leading(some - some @ part @ part.T, _PLANES) for part in curves]
     rates = [part.T @ np.gradient(part, axis=0) for part in functions]
     together = np.concatenate(functions, axis=1).T.astype(np.float32)
     side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
