@@ -162,7 +162,7 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames]
             # Planes of a rate, by the functions that a rate's transpose makes of these.
-            rates = np.gradient(np.eye(times.size), times, axis=0).T @ functions
+            rates = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions
             rate = Movies.blurred(
                 capture.planes(rates)[:1], capture.valid, capture.noise, freedom, 1
             )

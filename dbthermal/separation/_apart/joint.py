@@ -20,14 +20,14 @@ with the weights :math:`(1 - g) g^j`.
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, release
+from dbthermal._arrays import Array, copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours
@@ -195,43 +195,20 @@ def solve(
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
         raw = system.first_emissivity(inputs, result)
-        by_maps = maps is not None and frames.smooth
+        maps = maps if frames.smooth else None
         solved = system.told(film)[0]
-        if by_maps and material is not None:
+        if maps is not None and material is not None:
             raw, given = system.of_material(inputs, raw, material)
             solved |= given & maps.usable.ravel()
         solved &= np.all(np.isfinite(raw), axis=0)
         equations = system.equations(inputs, system.inside(raw), solved)
         places, some = equations.solved, looked_at(len(film))
         first, steps, change, variance = system.first_band(inputs, equations.loose, some)
-        curve = inputs.curves[inputs.bands[0]]
-        target: Callable[[Whole], tuple[Floats, Floats]]
-        if by_maps:
-            assert maps is not None
-            combined, size = _combined(inputs, maps, raw, material, places)
-
-            def target(at: Whole) -> tuple[Floats, Floats]:
-                """Combination without background and a start (solved, frame) [K], by the maps."""
-                q = np.ascontiguousarray((maps.object_part[at] @ combined).T, np.float32)
-                return q, q
+        if maps is not None:
+            target, size = _by_maps(inputs, maps, raw, material, places)
         else:
             shares = system.coefficients(inputs, raw, solved)[:, places]
-            weights = system.weights(inputs, raw)[1:, places]
-            stds = result["object_temperature_std"].values.reshape(film.shape)[some]
-            # In units of the deviation or, of a method without one, of the noise.
-            stds = np.where(np.isfinite(stds[:, places]), stds[:, places], inputs.noise.min())
-            size = np.sqrt(np.mean(stds**2, axis=0))
-            film = system.bridge(film.copy(), solved)
-
-            def target(at: Whole) -> tuple[Floats, Floats]:
-                """Combination without background and a start (solved, frame) [K], by the film."""
-                signal = np.asarray(curve.signal(film[at][:, places]) - curve.reference)
-                signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-                q = shares[0][:, np.newaxis] * signal
-                q += equations.packed.other_bands(shares[1:], signal)
-                if before is not None:  # part of q that the inputs of the result were without
-                    q += np.einsum("bp,btp->pt", weights, before.at(at, places))
-                return q, signal
+            target, size = _by_film(inputs, result, raw, equations, shares, before)
 
         def both(at: Whole, equations: system.Equations) -> tuple[Floats, Floats, Floats]:
             """Object at both places and the last step (solved, frame) [K] of some frames."""
@@ -243,7 +220,9 @@ def solve(
         share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
         if places.size == 0 or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
-        emissivity, (of_slope, of_ratio) = system.inside(raw), np.zeros((2, solved.size))
+        emissivity = system.inside(raw)
+        of_slope: Floats = np.zeros(solved.size)
+        of_ratio: Floats = np.zeros(solved.size)
         if material is not None and np.isfinite(material.emissivity).any():
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
@@ -254,10 +233,9 @@ def solve(
             )
             here, beside, _ = both(some, equations)
         signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
-        unsettled = np.zeros(solved.size, dtype=bool)
-        parts = frames.parts()
-        found = threads.map(lambda part: both(frames.nodes[part], equations), parts)
-        for part, (*pair, step) in zip(parts, found, strict=True):
+        unsettled, parts = np.zeros(solved.size, dtype=bool), frames.parts()
+        objects = threads.map(lambda part: both(frames.nodes[part], equations), parts)
+        for part, (*pair, step) in zip(parts, objects, strict=True):
             signals[:, part, places] = np.swapaxes(pair, 1, 2)
             unsettled[places] |= step > 10.0 * system.CONVERGED
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
@@ -269,14 +247,19 @@ def solve(
     return Joint(inputs, frames, signals, emissivity, factor, unsettled | np.isnan(factor))
 
 
-def _combined(
-    inputs: Inputs, maps: Planes, raw: Floats, material: Material | None, places: Whole
-) -> tuple[Floats, Floats]:
-    """Coefficients (column, solved) of the combination without background, and its deviation [K].
+Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
+"""Combination without background, and a start (solved, frame) [K], at some frames."""
 
-    The deviation is that of the noise and, of ratios of single pixels, of these.
+
+def _by_maps(
+    inputs: Inputs, maps: Planes, raw: Floats, material: Material | None, places: Whole
+) -> tuple[Target, Floats]:
+    """Combination of the maps, and its deviation (solved) [K].
+
+    That of the noise and, of ratios of single pixels, of these.
     """
-    noise, ratio = inputs.noise[inputs.bands], system.ratio_of(raw)[:, places]
+    noise = inputs.noise[inputs.bands]
+    ratio = system.ratio_of(raw)[:, places].astype(np.float64)
     weights = null_combination(ratio, noise)[0]
     combined, variance = maps.combined(weights, places)
     if material is not None and np.isnan(material.emissivity).all():
@@ -285,7 +268,44 @@ def _combined(
         off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
         variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
-    return combined, np.sqrt(variance)
+
+    def target(at: Whole) -> tuple[Floats, Floats]:
+        q = np.ascontiguousarray((maps.object_part[at] @ combined).T, np.float32)
+        return q, q
+
+    return target, np.sqrt(variance)
+
+
+def _by_film(
+    inputs: Inputs,
+    result: xr.Dataset,
+    raw: Floats,
+    equations: system.Equations,
+    shares: Floats,
+    before: Joint | None,
+) -> tuple[Target, Floats]:
+    """Combination that an object of a result has by its shares, and its deviation (solved) [K]."""
+    frames, places = result.sizes["time"], equations.solved
+    film, stds = (
+        result[name].values.reshape(frames, -1)
+        for name in ("object_temperature", "object_temperature_std")
+    )
+    stds = stds[looked_at(frames)][:, places]
+    # In units of the deviation or, of a method without one, of the noise.
+    stds = np.where(np.isfinite(stds), stds, inputs.noise.min())
+    film = system.bridge(copied(film), np.isin(np.arange(film.shape[1]), places))
+    weights, curve = system.weights(inputs, raw)[1:, places], inputs.curves[inputs.bands[0]]
+
+    def target(at: Whole) -> tuple[Floats, Floats]:
+        signal = np.asarray(curve.signal(film[at][:, places]) - curve.reference)
+        signal = np.ascontiguousarray(signal.T, dtype=np.float32)
+        q = shares[0][:, np.newaxis] * signal
+        q += equations.packed.other_bands(shares[1:], signal)
+        if before is not None:  # part of q that the inputs of the result were without
+            q += np.einsum("bp,btp->pt", weights, before.at(at, places))
+        return q, signal
+
+    return target, np.sqrt(np.mean(stds**2, axis=0))
 
 
 def from_result(inputs: Inputs, result: xr.Dataset, frames: Frames) -> Joint:

@@ -18,6 +18,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.special import chdtri
 
+from dbthermal._arrays import Array
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart.equations import Floats, Mask
@@ -114,7 +115,7 @@ def materials(
     return pool.materials(inputs, threads, bar, known=material)
 
 
-def _of_squares(material: Material, survey: Survey, image: Image, noise: Floats) -> Floats:
+def _of_squares(material: Material, survey: Survey, image: Image, noise: Array) -> Array:
     """Variance (pixel) [1/K^2] of the ratios of materials, at least by what squares of them show.
 
     Of a scatter C a pixel tells by c_1m - kappa_m c_11 how its ratio differs; errors of the shift,
@@ -131,11 +132,11 @@ def _of_squares(material: Material, survey: Survey, image: Image, noise: Floats)
     total = np.stack([np.bincount(group, part) ** 2 for part in off])
     variance = np.stack([np.bincount(key % count, part, count) for part in total]) / energy**2
     inverse = energy_of_variance(material.ratio, image.expand(variance), noise).max(axis=0)
-    return np.fmax(material.inverse_energy, inverse)
+    return np.asarray(np.fmax(material.inverse_energy, inverse))
 
 
 def _survey(
-    scatters: Scatters, alone: xr.Dataset, noise: Floats, places: npt.NDArray[np.intp]
+    scatters: Scatters, alone: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
 ) -> Survey:
     """Survey of some pixels by their planes; of those of a sound model."""
     status = alone["status"].values.ravel()[places]

@@ -133,7 +133,9 @@ class Planes:
         return Scatters(scatter, freedom, noise)
 
 
-def project(inputs: Inputs, result: xr.Dataset, emissivity: Array, threads: Executor) -> Planes:
+def project(
+    inputs: Inputs, result: xr.Dataset, emissivity: system.Floats, threads: Executor
+) -> Planes:
     """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
     rapid, columns = _functions(inputs), _smooth_functions(inputs.capture)
@@ -155,7 +157,7 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Array, threads: Exec
                 few = columns.functions[frames]
                 inverse = np.linalg.solve(few.T @ few, few.T)
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
-                x, shares = film[frames][:, places], emissivity[:, places]
+                x, shares = film[frames][:, places], emissivity[:, places].astype(np.float64)
                 signals = np.ascontiguousarray(tile.signals)
                 _straighten(signals, x, shares, *response, bends)
                 for band, signal in enumerate(signals):
@@ -183,7 +185,7 @@ def _polynomial_at(series: Array, place: float) -> float:
     value = series[series.size - 1]
     for degree in range(series.size - 2, -1, -1):
         value = value * place + series[degree]
-    return value
+    return float(value)
 
 
 @compiled
@@ -240,7 +242,7 @@ def _polynomial(curve: Curve) -> tuple[Array, float, float]:
     kelvin = np.linspace(low, high, 64)
     signal = curve.signal(kelvin) - curve.reference
     series = Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef
-    return series, 0.5 * (low + high), 0.5 * (high - low)
+    return np.asarray(series, np.float64), 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _interpolated(inputs: Inputs) -> Array:

@@ -71,7 +71,7 @@ def pooled(
     both: joint.Joint | None = joint.from_result(inputs, before, frames)
     shares = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
-        inputs = replace(inputs, difference=both.difference)
+        inputs = replace(inputs, difference=None if both is None else both.difference)
         maps = planes.project(inputs, before, shares, threads)
         survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
