@@ -197,15 +197,10 @@ def _solve(
     least: float = emissions.BEND,
 ) -> Solution:
     """Steps 1 to 4, compiled for two bands, or on a device."""
-    solve = fused.solve if _compiled(tile, settings) else steps.solve
+    solve = fused.solve if settings.device is None else steps.solve
     if settings.device is not None:
         solve = partial(steps.solve_on, settings.device)
     return solve(tile, functions, settings.background_drift, least)
-
-
-def _compiled(tile: Tile, settings: SubspaceSettings) -> bool:
-    """Steps 1 to 4 of a tile are those that are compiled."""
-    return len(tile.noise) == 2 and settings.device is None
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -372,7 +367,7 @@ def _divided(
 
     groups = pieces.alike(first)
     parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
-    if _compiled(tile, settings):
+    if settings.device is None:
         return fused.solve_parts(tile, functions, parts, settings.background_drift, least)
     alone = [_solve(tile.select_pixels(places), own, settings, least) for places, own in parts]
     return alone[0].join(alone[1:]).select_pixels(np.argsort(np.concatenate(groups)))
