@@ -1,4 +1,4 @@
-"""Variances of the outputs of one pixel (eq. 8, 10), and whether its residual is noise; compiled."""
+"""Variances of the outputs of one pixel (eq. 8, 10), and if its residual is noise; compiled."""
 
 from math import log, sqrt
 from typing import Any, Final, NamedTuple

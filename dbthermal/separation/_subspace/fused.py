@@ -132,7 +132,7 @@ def _pixel(
 def _write(
     model: Model, ratios: Ratio, work: Work, record: Any, vectors: Any, matrices: Any
 ) -> None:
-    """Ratios and emissivities; scatter less noise, at the order of the pixel and at `rapid_orders`."""
+    """Ratios, emissivities, and scatter less noise, at the pixel's order and at `rapid_orders`."""
     noise, orders = model.noise, len(work.scatter)
     rows = model.functions.shape[1] - model.steps
     for m in range(noise.size):

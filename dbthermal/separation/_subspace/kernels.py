@@ -270,17 +270,17 @@ def principal(matrix: Array, turned: Array, turns: Array, axis: Array) -> float:
         axis[0], axis[1] = (largest - d, b) if a >= d else (b, largest - a)
         return largest
     for i in range(count):
-        for j in range(count):
-            turned[i, j], turns[i, j] = matrix[i, j], 1.0 if i == j else 0.0
-    for _ in range(_SWEEPS):
-        off = 0.0
+        copy(matrix[i], turned[i])
+        fill(turns[i], 0.0)
+        turns[i, i] = 1.0
+    sweep, off = 0, 1.0
+    while off > 0.0 and sweep < _SWEEPS:
+        sweep, off = sweep + 1, 0.0
         for p in range(count):
             for q in range(p + 1, count):
                 off = max(off, turned[p, q] ** 2 - _ROUNDED * abs(turned[p, p] * turned[q, q]))
                 if turned[p, q] != 0.0:
                     _turn(turned, turns, p, q)
-        if off <= 0.0:
-            break
     best = 0
     for i in range(1, count):
         best = i if turned[i, i] > turned[best, best] else best

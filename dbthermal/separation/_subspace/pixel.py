@@ -4,7 +4,6 @@ from math import erfc, exp, sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
@@ -258,7 +257,7 @@ def _order(work: Work, known: float, frames: int) -> int:
 @inlined
 def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
     r"""
-    Are equal emissivities not excluded by the signals as they are?
+    Say whether equal emissivities are not excluded by the signals as they are.
 
     All that changes in a gray body changes the bands in proportion to the slopes of their
     responses, :math:`\dot z_m = (1 - e) \, u_m'(y) \, \dot y`: before a background warmer than
@@ -395,7 +394,7 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
 
 @inlined
 def background(model: Model, work: Work) -> None:
-    """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
+    """Step 4 (eq. 9), in place."""
     tables, emissivity, share, frames = model.tables, work.emissivity, work.share, work.first.size
     mean, result, step, curvature = work.mean, work.background, work.spare, work.curvature
     first, total, outside = kernels.response(tables, 0), 0.0, 0.0
@@ -431,21 +430,38 @@ def background(model: Model, work: Work) -> None:
         y = x + step[t] / curvature[t]
         outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
         mean[t], curvature[t] = middle + half * y, curvature[t] * scale**2
-    for m in range(1, share.size):
-        bend, factor = work.bend[m, :frames], 1.0 - emissivity[m]
-        apart = kernels.mixed(1.0, kernels.response(tables, m).signal, -1.0, first.signal)
-        for t in range(frames):
-            bend[t] = factor * kernels.polynomial(apart, (mean[t] - middle) * scale)
     if outside > 0.0:
         _outside(model, work)
     kernels.copy(mean, result)
-    physical = True
-    for m in range(share.size):
-        finite = kernels.mean(work.bend[m, :frames]) * 0.0 if m > 0 else 0.0
-        physical &= 0 < emissivity[m] < 1 and finite == 0
-    if not physical:
-        for m in range(1, share.size):
-            kernels.fill(work.bend[m, :frames], 0.0)
+    _bend(model, work)
+
+
+@inlined
+def _bend(model: Model, work: Work) -> None:
+    r"""
+    Part of the reflections that the responses bend apart (eq. 11), in place.
+
+    :math:`(1 - e_m) \, (u_m(y) - u_1(y))`: taken from band m, it leaves the same signal
+    :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and
+    large changes of the background. Zero where a background or an emissivity is not physical.
+    """
+    first, physical, frames = kernels.response(model.tables, 0), True, work.first.size
+    for m in range(work.emissivity.size):
+        bend, factor = work.bend[m, :frames], 1.0 - work.emissivity[m]
+        other = kernels.response(model.tables, m)
+        apart = kernels.mixed(1.0, other.signal, -1.0, first.signal)
+        outside, scale = 0.0, 1.0 / first.half
+        for t in range(frames):
+            x = (work.background[t] - first.middle) * scale
+            outside += 0.0 if abs(x) <= 1.0 else 1.0
+            bend[t] = factor * kernels.polynomial(apart, x)
+        for t in range(frames if outside > 0.0 else 0):
+            if not abs(work.background[t] - first.middle) <= first.half:
+                y = work.background[t]
+                bend[t] = factor * (kernels.exact(other, y)[0] - kernels.exact(first, y)[0])
+        physical &= 0.0 < work.emissivity[m] < 1.0 and kernels.mean(bend) * 0.0 == 0.0
+    for m in range(work.emissivity.size if not physical else 0):
+        kernels.fill(work.bend[m, :frames], 0.0)
 
 
 @inlined
@@ -462,7 +478,3 @@ def _outside(model: Model, work: Work) -> None:
                 step += work.share[m] * a * (work.reflected[m, t] - u)
                 curvature += work.share[m] * a * a
             mean[t], work.curvature[t] = result[t] + step / curvature, curvature
-            signal = kernels.exact(first, mean[t])[0]
-            for m in range(1, work.share.size):
-                apart = kernels.exact(kernels.response(tables, m), mean[t])[0] - signal
-                work.bend[m, t] = (1.0 - work.emissivity[m]) * apart
