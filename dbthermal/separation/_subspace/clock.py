@@ -26,13 +26,15 @@ def check(signals: Array, time: Array, noise: Array, segment: Whole | None) -> N
     axis is compared, pixel by pixel, by :math:`N \ln(E_{time} / E_{number})`. Where it is as large
     in both, the object does not change smoothly, or its changes are too small to tell.
     """
-    frames = time.size
+    frames, white = time.size, reflection_ratio.plane(signals, noise)[0]
+    any_axis = np.full((2, white.shape[2]), np.nan)
     order = min(reflection_ratio.HIGHEST_ORDER, frames // 4)
     chi2 = []
     for clock in (time, np.arange(frames, dtype=np.float64)):
         functions = smooth.subspace(clock, order, segment=segment)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            chi2.append(reflection_ratio.estimate(signals, functions, noise).reduced_chi2)
+            energy, used = reflection_ratio.null_energy(white, functions, any_axis)
+            chi2.append(energy / (frames - used))
     good = (chi2[0] > 0) & (chi2[1] > 0)
     if not np.any(good):
         return

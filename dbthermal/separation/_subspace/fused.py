@@ -49,7 +49,7 @@ def _film(
 
 
 _NUMBERS: Final = ("inverse_energy", "null_variance", "contrast", "reduced_chi2")
-_NUMBERS += ("epsilon_variance", "noise_variance", "drift_variance", "correlation", "delay", "cost")
+_NUMBERS += ("epsilon_variance", "noise_variance", "drift_variance", "correlation", "delay")
 _FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
     np.float64: {**dict.fromkeys(_NUMBERS, ()), **dict.fromkeys(["missing", "lost"], (2,))},
     np.bool_: dict.fromkeys(["pooled", "gray", "constant", "restless", "unexplained"], ()),
@@ -99,9 +99,7 @@ def _pixel(
         pixel.background(model, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
         if again == 0:
-            gray, used = pixel.may_be_gray(model, ratios, work), ratios.order + model.steps
-            free = frames - used
-            record.cost = (bands - 1.0) * (ratios.reduced_chi2 * free + pieces.COST * used)
+            gray = pixel.may_be_gray(model, ratios, work)
         bent = False
         for m in range(1, bands):
             energy = _energy(work.bend[m, :frames], work.removed[m, :frames])

@@ -318,10 +318,18 @@ def _followed(
     if suspect.size == 0:
         return result, first
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    cost = solution.cost[suspect]
-    known = None if part.material is None else part.material.ratio
-    divide = division.divide if len(noise) == 2 else pieces.divide  # compiled for two bands
-    divisions = divide(part.signals, tile.time, noise, tile.segment, known)
+    white, axes = reflection_ratio.plane(part.signals, noise)
+    axis = np.full((2, suspect.size), np.nan)
+    if part.material is not None:
+        axis = np.einsum("abp,bp->ap", axes, part.material.ratio / noise[:, np.newaxis])
+        axis /= np.sqrt((axis**2).sum(axis=0))
+    divisions = division.divide(white, tile.time, tile.segment, axis)
+    pooled = np.where(solution.pooled[suspect], axis, np.nan)
+    energy, count = reflection_ratio.null_energy(white, functions, pooled)
+    # Outside the plane a function fits noise in each further band.
+    further = (pieces.COST - 1.0) * (len(noise) - 2)
+    divisions = [replace(one, cost=one.cost + further * one.functions) for one in divisions]
+    cost = energy + (pieces.COST + further) * count  # of one smooth curve
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
     for one in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.

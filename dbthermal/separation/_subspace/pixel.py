@@ -433,11 +433,11 @@ def background(model: Model, work: Work) -> None:
     if outside > 0.0:
         _outside(model, work)
     kernels.copy(mean, result)
-    _bend(model, work)
+    _bend(model, work, outside)
 
 
 @inlined
-def _bend(model: Model, work: Work) -> None:
+def _bend(model: Model, work: Work, outside: float) -> None:
     r"""
     Part of the reflections that the responses bend apart (eq. 11), in place.
 
@@ -445,22 +445,20 @@ def _bend(model: Model, work: Work) -> None:
     :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and
     large changes of the background. Zero where a background or an emissivity is not physical.
     """
-    first, physical, frames = kernels.response(model.tables, 0), True, work.first.size
-    for m in range(work.emissivity.size):
+    first, result, frames = kernels.response(model.tables, 0), work.background, work.first.size
+    physical, scale = 0.0 < work.emissivity[0] < 1.0, 1.0 / first.half
+    for m in range(1, work.emissivity.size):
         bend, factor = work.bend[m, :frames], 1.0 - work.emissivity[m]
         other = kernels.response(model.tables, m)
         apart = kernels.mixed(1.0, other.signal, -1.0, first.signal)
-        outside, scale = 0.0, 1.0 / first.half
         for t in range(frames):
-            x = (work.background[t] - first.middle) * scale
-            outside += 0.0 if abs(x) <= 1.0 else 1.0
-            bend[t] = factor * kernels.polynomial(apart, x)
+            bend[t] = factor * kernels.polynomial(apart, (result[t] - first.middle) * scale)
         for t in range(frames if outside > 0.0 else 0):
-            if not abs(work.background[t] - first.middle) <= first.half:
-                y = work.background[t]
-                bend[t] = factor * (kernels.exact(other, y)[0] - kernels.exact(first, y)[0])
+            if not abs(result[t] - first.middle) <= first.half:
+                part = kernels.exact(other, result[t])[0] - kernels.exact(first, result[t])[0]
+                bend[t] = factor * part
         physical &= 0.0 < work.emissivity[m] < 1.0 and kernels.mean(bend) * 0.0 == 0.0
-    for m in range(work.emissivity.size if not physical else 0):
+    for m in range(1, work.emissivity.size if not physical else 1):
         kernels.fill(work.bend[m, :frames], 0.0)
 
 

@@ -221,6 +221,44 @@ def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
     return gray
 
 
+def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
+    """
+    Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
+
+    Object and background change more than two bands along two lines: of the whitened signals all
+    but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
+    """
+    white = signals / noise[:, np.newaxis, np.newaxis]
+    if len(noise) == 2:
+        return white, np.repeat(np.eye(2)[..., np.newaxis], signals.shape[2], axis=2)
+    changes = white - white.mean(axis=1, keepdims=True)
+    scatter = np.einsum("btp,ctp->pbc", changes, changes)
+    axes = np.linalg.eigh(scatter)[1][..., -2:].transpose(2, 1, 0)
+    return np.einsum("abp,btp->atp", axes, white), axes
+
+
+def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
+    """
+    Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
+
+    Of the functions that the lowest information criterion selects, and one more; across a known
+    `axis` (2, pixel) where it is not NaN.
+    """
+    held = np.einsum("tf,btp->bfp", functions.functions, white, optimize=True)
+    pairs = ((0, 0), (0, 1), (1, 1))
+    a, b, d = (
+        np.einsum("tp,tp->p", white[i], white[j])
+        - np.cumsum(held[i] * held[j], axis=0)[functions.steps :]
+        for i, j in pairs
+    )
+    principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
+    known = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
+    energy = np.where(np.isnan(known), principal, known)
+    order = choose_order(energy, white.shape[1])
+    used = order + 1 + functions.steps
+    return energy[order, np.arange(order.size)], used
+
+
 def choose_order(null_energy: Array, frames: int) -> Whole:
     """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
     if len(null_energy) == 1:

@@ -55,7 +55,6 @@ class Solution(Pixels):
     constant: Mask
     restless: Mask
     gray: Mask  # the signals as they are may be those of a gray body (pixel)
-    cost: Array  # of these as one smooth curve, eq. 12 (pixel)
     correlation: Array  # of the null residual, see `residuals` (pixel)
     delay: Array  # of the bands (pixel)
     unexplained: Mask  # the residual is not noise (pixel)
@@ -156,7 +155,6 @@ def _steps(
         ratio_variance=ratios.variance + emission.level_std**2,
         freedom=frames - functions.steps - ratios.order,
         gray=as_they_are[0],
-        cost=as_they_are[1],
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
         unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
