@@ -13,8 +13,7 @@ from dbthermal._compiled import kept
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._known_emissivity import AGREE
-from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels
+from dbthermal.separation._subspace import bars, kernels
 from dbthermal.separation._subspace.kernels import Table, allocating
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
 
@@ -251,7 +250,7 @@ def _object(
     # Eq. 6 by implicit differentiation, as in `emission`.
     sensitivity = (v + first * (u - v) - found[0, 0]) / steepness
     epsilon = w[1] ** 2 * maps[1]
-    through = sensitivity**2 * epsilon / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
+    through = sensitivity**2 * epsilon / (1.0 - bars.NORMAL95**2 * epsilon) ** 2
     smooth = variance / steepness**2
     patterned = camera.pattern[0] * w[0] / steepness, camera.pattern[1] * w[1] / steepness
     std = sqrt(through + smooth + patterned[0] ** 2 + patterned[1] ** 2)

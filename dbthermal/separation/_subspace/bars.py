@@ -40,7 +40,7 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
 
 @inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
+    """Variance of the slope by a background that walks, and its bound; `tensors._walk`."""
     degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
     for t in range(kept.size):
@@ -66,7 +66,7 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 @inlined
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
-    """Variance of the slope by a linear drift, as `emission._linear_variance`."""
+    """Variance of the slope by a linear drift, as `tensors._linear`."""
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
     slope, level, _ = regression.moments(emitted, drift, weights)
@@ -77,7 +77,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
         size += part * residual[t]
     size /= length
     # Once more, with the weights of the residual less that drift.
-    inverse, kept = 1.0 / (residuals.TUNING * line.scale), work.variance
+    inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
     for t in range(frames):
         off = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
         inside = max(1.0 - off * off, 0.0)
@@ -302,7 +302,7 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
 
 @inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
-    """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
+    """Autocorrelation, delay of the bands, and whether the residual is noise; see `tensors`."""
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
@@ -340,7 +340,7 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 
 @inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
-    """As `residuals.unexplained`."""
+    """As `tensors._unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
     sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
     products, squares = work.kernel, work.mean

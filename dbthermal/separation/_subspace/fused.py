@@ -1,6 +1,7 @@
 """Steps 1 to 4 of `method`, one pixel after another, compiled; `tensors` has them for a device."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -13,11 +14,53 @@ from dbthermal._arrays import Array
 from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
-from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Ratio, Work
-from dbthermal.separation._subspace.steps import FILMS, Solution
-from dbthermal.separation._tiles import Tile, Whole
+from dbthermal.separation._tiles import Mask, Pixels, Tile, Whole
+
+FILMS: Final = (
+    *("object_temperature", "object_temperature_std"),
+    *("background_temperature", "background_temperature_std"),
+)
+"""Names of the films of a solution."""
+
+
+@dataclass(frozen=True)
+class Solution(Pixels):
+    """Object, background, ratios and emissivities of each pixel, and statistics of the fit."""
+
+    object_temperature: Array  # (time, pixel) [K]; NaN where its deviation is of no use
+    object_temperature_std: Array
+    background_temperature: Array  # (time, pixel) [K]
+    background_temperature_std: Array
+    missing: Array  # samples without a number (2, pixel), of object and background
+    lost: Array  # samples without a number or a deviation of use (2, pixel)
+    beyond: Mask  # temperatures outside the calibrated range (2, pixel)
+    ratio: Array  # kappa: rapid change of each band over that of the first (band, pixel) [1]
+    ratio_variance: Array  # (band, pixel) [1], with that through the background's level
+    inverse_energy: Array  # see `pixel.Ratio` (pixel)
+    null_weights: Array  # w of eq. 5: no background, all of the object (band, pixel) [1]
+    null_variance: Array
+    order: Whole
+    freedom: Whole  # frames less the functions used (pixel)
+    contrast: Array
+    reduced_chi2: Array
+    pooled: Mask
+    scatter: Array  # noise-whitened, of rapid changes, less noise (band, band, pixel) [1]
+    rapid_scatter: Array  # the same at the `rapid_orders` (2, band, band, pixel) [1]
+    emissivity: Array  # (band, pixel) [1]
+    emissivity_covariance: Array  # (band, band, pixel) [1]
+    epsilon_variance: Array  # of the error of the null combination's ratios (pixel) [1]
+    noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
+    drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
+    constant: Mask  # the object changes too little for its emissivity (pixel)
+    restless: Mask  # the background hardly rests (pixel)
+    gray: Mask  # the signals as they are may be those of a gray body (pixel)
+    correlation: Array  # of the null residual (pixel)
+    delay: Array  # of the bands (pixel)
+    unexplained: Mask  # the residual is not noise (pixel)
+    sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
+
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
@@ -104,9 +147,9 @@ def _pixel(
         for m in range(1, bands):
             energy = _energy(work.bend[m, :frames], work.removed[m, :frames])
             bent |= energy > (least * model.noise[m]) ** 2
-        if again == emissions.BENDS or not bent:
+        if again == pixel.BENDS or not bent:
             break
-        least, again = emissions.BEND, again + 1
+        least, again = pixel.BEND, again + 1
         for m in range(1, bands):
             bend, straight = work.bend[m, :frames], work.straight[m, :frames]
             signal, removed = work.signals[m, :frames], work.removed[m, :frames]
@@ -198,7 +241,7 @@ def _separate(
         _return(outside, together, solved.films)
 
 
-def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
+def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     """All that the pixels of a tile share."""
     curve, others = tile.curves[0], len(tile.noise) - 1
     degrees = functions.rising.shape[1]
@@ -288,7 +331,7 @@ def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
 
 
 def solve(
-    tile: Tile, functions: smooth.Subspace, drift: float, least: float = emissions.BEND
+    tile: Tile, functions: smooth.Subspace, drift: float, least: float = pixel.BEND
 ) -> Solution:
     """
     Steps 1 to 4, where it matters again on signals with proportional reflections.
@@ -304,13 +347,13 @@ def solve_parts(
     functions: smooth.Subspace,
     parts: Iterable[tuple[Whole, smooth.Subspace]],
     drift: float,
-    least: float = emissions.BEND,
+    least: float = pixel.BEND,
 ) -> Solution:
     """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
 
     One part after another is taken: of a long capture the functions of all would be much memory.
     """
-    shared, material = _share(tile, functions, drift), tile.material
+    shared, material = share(tile, functions, drift), tile.material
     bands, frames, pixels = tile.signals.shape
     materials = np.full((pixels, 5 + bands), np.nan)
     if material is not None:

@@ -50,6 +50,7 @@ separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for
 formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
+import importlib
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Final
@@ -69,10 +70,9 @@ from dbthermal.separation._subspace import (
     pieces,
     reflection_ratio,
     residuals,
-    steps,
 )
-from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.steps import FILMS, Solution
+from dbthermal.separation._subspace.fused import FILMS, Solution
+from dbthermal.separation._subspace.pixel import BEND
 from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
@@ -120,9 +120,9 @@ class SubspaceSettings:
         down, over the capture [K], each drift as likely. No method can see that part; it only
         widens the error bars of emissivity and background.
     device : str, optional
-        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled for
-        two bands; or on tensors of torch (extra ``torch``), in torch's words, such as "cuda". All
-        else, such as flags and pieces of time, is the same code on the processor.
+        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled; or on
+        tensors of torch (extra ``torch``), in torch's words, such as "cuda". All else, such as
+        flags and pieces of time, is the same code on the processor.
     """
 
     background_drift: float = 3.0
@@ -194,12 +194,13 @@ def _solve(
     tile: Tile,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    least: float = emissions.BEND,
+    least: float = BEND,
 ) -> Solution:
-    """Steps 1 to 4, compiled for two bands, or on a device."""
-    solve = fused.solve if settings.device is None else steps.solve
+    """Steps 1 to 4, compiled, or on a device."""
+    solve = fused.solve
     if settings.device is not None:
-        solve = partial(steps.solve_on, settings.device)
+        tensors = importlib.import_module("dbthermal.separation._subspace.tensors")
+        solve = partial(tensors.solve, settings.device)
     return solve(tile, functions, settings.background_drift, least)
 
 
@@ -364,7 +365,7 @@ def _divided(
     first: Mask,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    least: float = emissions.BEND,
+    least: float = BEND,
     number: int = smooth.PIECE_ORDER,
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""

@@ -6,11 +6,21 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from dbthermal._arrays import Array
-from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, reflection_ratio, regression
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._tiles import Whole
 
+ROUNDS: Final = 3
+# Change of the slope with the emissivity that it starts from, below which it is extrapolated to
+# where both are the same (Aitken): the bands' responses differ far from the reference temperature.
+FASTEST: Final = 0.8
+# Energy of the object's change over that of its noise, below which its emissivity is undefined.
+OBJECT_TO_NOISE: Final = 10.0
+# Energy of the bend between the two responses, in units of the second band's noise, from which it
+# is worth taking out: it moves no linear function of the signal by more standard deviations.
+BEND: Final = 0.2
+# Times that it is taken out at most: it changes with the background that it is computed of.
+BENDS: Final = 2
 _TINY: Final = float(np.finfo(np.float64).tiny)
 
 
@@ -375,16 +385,16 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     before, slope_before = np.nan, np.nan
-    for turn in range(emissions.ROUNDS):
+    for turn in range(ROUNDS):
         _approach(model, emissivity, work, work.emitted)
         slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
-        constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
+        constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not known
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope
         emissivity = material[1] if known else middle if constant else slope
-        if abs(rate) < emissions.FASTEST and not known and not constant:
+        if abs(rate) < FASTEST and not known and not constant:
             emissivity += (slope - before) * rate / (1.0 - rate)
     _approach(model, emissivity, work, work.at_object[0, : z.size])
     for m in range(work.ratio.size):

@@ -13,7 +13,15 @@ from scipy.special import chdtrc
 from dbthermal import _smooth as smooth
 from dbthermal import mixing, planck
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._subspace import bars, fused, kernels, pixel, reflection_ratio, residuals
+from dbthermal.separation._subspace import (
+    bars,
+    fused,
+    kernels,
+    pixel,
+    reflection_ratio,
+    regression,
+    residuals,
+)
 from dbthermal.separation._subspace.fused import FILMS, Solution
 from dbthermal.separation._subspace.pixel import Model
 from dbthermal.separation._tiles import Tile
@@ -52,12 +60,23 @@ class Line(NamedTuple):
     weights: Tensor  # in [0, 1] (time, pixel)
 
 
-class Emission(NamedTuple):
-    """Object and emissivities, with what carries their uncertainty (steps 2 and 3)."""
+class Fit(NamedTuple):
+    """Object and first emissivity, by steps 2 and 3 in turns."""
 
     temperature: Tensor  # (time, pixel) [K]
-    variance: Tensor  # (time, pixel) [K^2]
-    signals: list[Tensor]  # of the object in each band [K]
+    steepness: Tensor  # h'(x) before the last step (time, pixel) [1]
+    signals: list[Tensor]  # of the object in each band (time, pixel) [K]
+    emitted: Tensor  # u_1(x) of the last regression (time, pixel) [K]
+    line: Line
+    first: Tensor  # emissivity of the first band (pixel) [1]
+    constant: Tensor  # the object changes too little for its emissivity (pixel)
+    known: Tensor  # the emissivity is the material's (pixel)
+
+
+class Emission(NamedTuple):
+    """Variances of object and emissivities, and what carries their uncertainty."""
+
+    variance: Tensor  # of the object (time, pixel) [K^2]
     sensitivity: Tensor  # derivative with epsilon (time, pixel) [K]
     smooth_variance: Tensor  # from the smoothed noise (time, pixel) [K^2]
     emissivity: Tensor  # (band, pixel)
@@ -66,9 +85,7 @@ class Emission(NamedTuple):
     level: Tensor  # deviation of the ratios by the background's level (band, pixel)
     noise_variance: Tensor  # of e_1 (pixel)
     drift_variance: Tensor
-    constant: Tensor  # (pixel)
-    restless: Tensor
-    line: Line
+    restless: Tensor  # the background hardly rests (pixel)
 
 
 class Inputs(NamedTuple):
@@ -104,7 +121,12 @@ def solve(
         if not bent.any():
             break
         # Again, on signals whose reflections are proportional.
-        least, removed, places, signals = pixel.BEND, bend[..., bent], places[bent], signals[..., bent]
+        least, removed, places, signals = (
+            pixel.BEND,
+            bend[..., bent],
+            places[bent],
+            signals[..., bent],
+        )
         straight = torch.cat([signals[:1], signals[1:] - removed])
         if inputs.material is not None:
             part = {name: values[..., bent] for name, values in inputs.material.items()}
@@ -124,12 +146,15 @@ def _steps(
     """Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend."""
     model, frames = inputs.model, signals.shape[1]
     ratios = _ratios(inputs, straight)
-    emission = _emission(inputs, ratios, straight, start)
-    background, variance = _background(inputs, ratios, emission, signals)
-    films = torch.stack([emission.temperature, background])
+    fit = _alternate(inputs, ratios, straight[0], start)
+    emission = _emission(inputs, ratios, fit, straight[0])
+    background, variance = _background(inputs, ratios, fit, emission, signals)
+    films = torch.stack([fit.temperature, background])
     stds = torch.stack([emission.variance, variance])
     if float(model.pattern.max()) > 0.0:
-        stds = stds + torch.stack(_pattern_variances(inputs, ratios, emission, background))
+        stds = stds + torch.stack(
+            _pattern_variances(inputs, ratios, fit.temperature, emission.emissivity, background)
+        )
     stds = stds.sqrt()
     margin = tiles.RANGE_SIGMAS * stds.nan_to_num(posinf=np.inf)
     beyond = (films < model.lowest - margin) | (films > model.highest + margin)
@@ -163,7 +188,7 @@ def _steps(
         "epsilon_variance": emission.epsilon,
         "noise_variance": emission.noise_variance,
         "drift_variance": emission.drift_variance,
-        "constant": emission.constant,
+        "constant": fit.constant,
         "restless": emission.restless,
         "gray": _may_be_gray(model, ratios),
         "correlation": _autocorrelation(residual),
@@ -171,7 +196,7 @@ def _steps(
         "unexplained": _unexplained(model, residual, rapid, ratios.null_variance, common),
         "sums": torch.stack([_block_sums(part, model.parts) for part in (residual, curve)]),
     }
-    return result, _bend(inputs, emission.emissivity, background), emission.line
+    return result, _bend(inputs, emission.emissivity, background), fit.line
 
 
 def _blackbody(table: kernels.Table, temperature: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,7 +224,9 @@ def _temperature(table: kernels.Table, signal: Tensor) -> Tensor:
 
 def _weighted(parts: list[Tensor], weights: Tensor) -> Tensor:
     """Sum over the bands of (time, pixel), weighted by (band, pixel)."""
-    return sum((part * weight for part, weight in zip(parts, weights, strict=True)), torch.zeros(()))
+    return sum(
+        (part * weight for part, weight in zip(parts, weights, strict=True)), torch.zeros(())
+    )
 
 
 def _quotient(numerator: Tensor, denominator: Tensor, otherwise: float) -> Tensor:
@@ -305,10 +332,9 @@ def _may_be_gray(model: Model, ratios: Ratio) -> Tensor:
     return result
 
 
-def _emission(inputs: Inputs, ratios: Ratio, signals: Tensor, line: Line | None) -> Emission:
-    """Steps 2 and 3 in turns (eq. 5 to 7), and the variances (eq. 8), see `bars`."""
-    model, curves, z, noise = inputs.model, inputs.curves, signals[0], inputs.model.noise
-    material, frames, used = inputs.material, signals.shape[1], ratios.order + model.steps
+def _alternate(inputs: Inputs, ratios: Ratio, z: Tensor, line: Line | None) -> Fit:
+    """Steps 2 and 3 in turns (eq. 5 to 7)."""
+    model, curves, material = inputs.model, inputs.curves, inputs.material
     target = model.object_part.T @ ratios.smoothed
     temperature = _temperature(curves[1], target)
     # Middle of the interval that the ratios leave for e_1, for a constant object.
@@ -334,16 +360,24 @@ def _emission(inputs: Inputs, ratios: Ratio, signals: Tensor, line: Line | None)
     before = slope_before = torch.full_like(first, np.nan)
     for _ in range(pixel.ROUNDS):
         emitted = _blackbody(curves[0], temperature)[0]
-        line = regress(emitted, z, float(noise[0]), line)
-        constant = line.energy < pixel.OBJECT_TO_NOISE * used * ratios.null_variance
-        constant &= ~known
+        line = regress(emitted, z, float(model.noise[0]), line)
+        least = pixel.OBJECT_TO_NOISE * (ratios.order + model.steps) * ratios.null_variance
+        constant = (line.energy < least) & ~known
         rate = (line.slope - slope_before) / (first - before)
         rate = rate.where(rate.abs() < pixel.FASTEST, 0.0)
         before, slope_before = first, line.slope
         first = line.slope + (line.slope - before) * rate / (1.0 - rate)
         first = middle.where(constant | known, first)
         temperature, steepness = approach(first, temperature)
-    at_object = [_blackbody(curve, temperature)[0] for curve in curves]
+    signals = [_blackbody(curve, temperature)[0] for curve in curves]
+    assert line is not None
+    return Fit(temperature, steepness, signals, emitted, line, first, constant, known)
+
+
+def _emission(inputs: Inputs, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
+    """Variances (eq. 8) of what follows from the first band's signal (time, pixel), see `bars`."""
+    model, material, noise, frames = inputs.model, inputs.material, inputs.model.noise, len(z)
+    line, first, emitted, used = fit.line, fit.first, fit.emitted, ratios.order + model.steps
     # Variance of the slope: of the ordinate's noise, and of the abscissa's.
     kernel = line.weights * emitted
     kernel = (kernel - line.weights * (kernel.sum(0) / line.weights.sum(0))) / line.energy
@@ -354,8 +388,8 @@ def _emission(inputs: Inputs, ratios: Ratio, signals: Tensor, line: Line | None)
     change = emitted.amax(dim=0) - emitted.amin(dim=0)
     drift_variance = (limit / change) ** 2 + torch.maximum(upper, linear)
     if material is not None:
-        noise_variance = material["noise_variance"].where(known, noise_variance)
-        drift_variance = material["drift_variance"].where(known, drift_variance)
+        noise_variance = material["noise_variance"].where(fit.known, noise_variance)
+        drift_variance = material["drift_variance"].where(fit.known, drift_variance)
     # Of the ratios, through the background's level.
     level = (z - emitted).mean(dim=0).abs() * (noise_variance + walk).sqrt() / (1.0 - first) ** 2
     widest = (model.highest - model.lowest) / np.sqrt(12.0)
@@ -365,18 +399,16 @@ def _emission(inputs: Inputs, ratios: Ratio, signals: Tensor, line: Line | None)
     # Eq. 6 by implicit differentiation; the error of w.kappa moves weight from the other bands to
     # the first, by their share in it.
     shares = (ratios.weights**2 * (noise[:, None] ** 2 + (ratios.ratio * noise[0]) ** 2))[1:]
-    others = _weighted(at_object[1:], shares / shares.sum(dim=0))
-    partial = mixing.mixed(first, at_object[0], others)
-    sensitivity = (partial - model.object_part.T @ ratios.coefficients[0]) / steepness
+    others = _weighted(fit.signals[1:], shares / shares.sum(dim=0))
+    partial = mixing.mixed(first, fit.signals[0], others)
+    sensitivity = (partial - model.object_part.T @ ratios.coefficients[0]) / fit.steepness
     leverage = model.leverage[ratios.order - 1].T
-    smooth_variance = leverage * ratios.null_variance / steepness**2
+    smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     square = sensitivity**2 * epsilon
     expected = square + smooth_variance * (1.0 + np.log(frames) / used)
     resting = line.residual**2 < bars.WITHIN**2 * (noise[0] ** 2 + first**2 * expected)
     return Emission(
-        temperature=temperature,
         variance=square / (1.0 - bars.NORMAL95**2 * epsilon) ** 2 + smooth_variance,
-        signals=at_object,
         sensitivity=sensitivity,
         smooth_variance=smooth_variance,
         emissivity=1.0 - ratios.ratio * (1.0 - first),
@@ -385,9 +417,7 @@ def _emission(inputs: Inputs, ratios: Ratio, signals: Tensor, line: Line | None)
         level=level,
         noise_variance=noise_variance,
         drift_variance=drift_variance,
-        constant=constant,
         restless=resting.sum(dim=0) < bars.RESTING * frames,
-        line=line,
     )
 
 
@@ -475,15 +505,14 @@ def _linear(
 
 
 def _background(
-    inputs: Inputs, ratios: Ratio, emission: Emission, signals: Tensor
+    inputs: Inputs, ratios: Ratio, fit: Fit, emission: Emission, signals: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Step 4 (eq. 9), (time, pixel) [K], and its variance [K^2] (eq. 10), see `bars`."""
     emissivity, noise, curves = emission.emissivity, inputs.model.noise[:, None], inputs.curves
     first, precision = emissivity[0], ((1.0 - emissivity) / noise) ** 2
     weights = precision / precision.sum(dim=0)
     reflected = [
-        mixing.background(*parts)
-        for parts in zip(emissivity, signals, emission.signals, strict=True)
+        mixing.background(*parts) for parts in zip(emissivity, signals, fit.signals, strict=True)
     ]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
     start = _temperature(curves[0], _weighted(reflected, weights))
@@ -493,7 +522,7 @@ def _background(
     background = start + _weighted(steps, weights) / curvature
     # Eq. 10, term by term.
     share = (weights * emissivity / (1.0 - emissivity)).sum(dim=0)
-    contrast = background - emission.temperature
+    contrast = background - fit.temperature
     through = contrast * first + share * emission.sensitivity
     covariance = 2.0 * noise[0] ** 2 * ratios.weights[0] * ratios.inverse_energy
     of_first = noise[0] ** 2 - 1.0 / ((ratios.ratio / noise) ** 2).sum(dim=0)
@@ -504,12 +533,12 @@ def _background(
 
 
 def _pattern_variances(
-    inputs: Inputs, ratios: Ratio, emission: Emission, background: Tensor
+    inputs: Inputs, ratios: Ratio, temperature: Tensor, emissivity: Tensor, background: Tensor
 ) -> list[Tensor]:
     """Variances (time, pixel) [K^2] of both temperatures from a residual pattern, see `bars`."""
-    model, emissivity, curves = inputs.model, emission.emissivity, inputs.curves
+    model, curves = inputs.model, inputs.curves
     slopes = [
-        share * _blackbody(curve, emission.temperature)[1]
+        share * _blackbody(curve, temperature)[1]
         for share, curve in zip(emissivity, curves, strict=True)
     ]
     precision = ((1.0 - emissivity) / model.noise[:, None]) ** 2
@@ -538,21 +567,21 @@ def regress(abscissa: Tensor, ordinate: Tensor, noise: float, start: Line | None
         residual = _first_residual(abscissa, ordinate, noise)
     else:
         residual = _fit(abscissa, ordinate, start.weights)[2]
-    for _ in range(residuals.STEPS):
-        scale = (residuals.TO_STD * _ranked_magnitude(residual)).clip(min=noise)
+    for _ in range(regression.STEPS):
+        scale = (regression.TO_STD * _ranked_magnitude(residual)).clip(min=noise)
         weights = _tukey(residual, scale)
         slope, _, residual, energy = _fit(abscissa, ordinate, weights)
     # var(slope) = s^2 / sum w (x - mean)^2, over the fraction of independent points.
     kept = residual * weights
     lagged = _quotient((kept[1:] * kept[:-1]).sum(dim=0), (kept**2).sum(dim=0), 0.0)
-    correlation = lagged.clip(0.0, residuals.MOST_CORRELATED)
+    correlation = lagged.clip(0.0, regression.MOST_CORRELATED)
     independent = (1.0 - correlation) / (1.0 + correlation)
     return Line(slope, scale, residual, energy, scale**2 / energy / independent, weights)
 
 
 def _first_residual(abscissa: Tensor, ordinate: Tensor, noise: float) -> Tensor:
     """Residual from the best of three starts: all points, those above, those below the line."""
-    count = min(len(abscissa), residuals.STARTING_POINTS)
+    count = min(len(abscissa), regression.STARTING_POINTS)
     every = torch.arange(count, device=abscissa.device) * len(abscissa) // count
     # About its mean, or single precision would not resolve a small range.
     centred, up = abscissa - abscissa.mean(dim=0), ordinate - ordinate.mean(dim=0)
@@ -561,10 +590,10 @@ def _first_residual(abscissa: Tensor, ordinate: Tensor, noise: float) -> Tensor:
     slope = intercept = smallest = torch.full_like(centred[0], np.inf)
     for start in (torch.ones_like(plain), plain >= 0, plain <= 0):
         weights = start.float()
-        for _ in range(residuals.STARTING_STEPS):
+        for _ in range(regression.STARTING_STEPS):
             one, other, residual, _ = _fit(x, z, weights)
             deviation = _ranked_magnitude(residual)
-            scale = residuals.ANNEALING * residuals.TO_STD * deviation
+            scale = regression.ANNEALING * regression.TO_STD * deviation
             weights = _tukey(residual, scale.clip(min=noise)).float()
         better = deviation < smallest
         slope, intercept = one.where(better, slope), other.where(better, intercept)
@@ -586,13 +615,13 @@ def _fit(
 
 def _ranked_magnitude(residual: Tensor) -> Tensor:
     """Absolute value of rank `SHARE` over time, in single precision, as in `regression`."""
-    rank = int(residuals.SHARE * residual.shape[0])
+    rank = int(regression.SHARE * residual.shape[0])
     return residual.T.float().abs().kthvalue(rank + 1).values.double()
 
 
 def _tukey(residual: Tensor, scale: Tensor) -> Tensor:
     """Tukey's bisquare weights, (1 - (r / c s)^2)^2 inside c s."""
-    return (1.0 - (residual / (residuals.TUNING * scale)) ** 2).clip(min=0.0) ** 2
+    return (1.0 - (residual / (regression.TUNING * scale)) ** 2).clip(min=0.0) ** 2
 
 
 def _autocorrelation(residual: Tensor) -> Tensor:
