@@ -16,7 +16,6 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import (
     bars,
     fused,
-    kernels,
     pixel,
     reflection_ratio,
     regression,
@@ -27,26 +26,28 @@ from dbthermal.separation._subspace.pixel import Model
 from dbthermal.separation._tiles import Tile
 
 Tensor = torch.Tensor
+Known = dict[str, Tensor]
+"""Each pixel's material: the fields of a `Material`, none without one."""
 einsum: Final = torch.einsum
 
 
 class Ratio(NamedTuple):
-    """Reflection ratios, and the combination of bands without background (step 1)."""
+    """Reflection ratios (step 1); not explained, a field of a `Solution`."""
 
-    ratio: Tensor  # (band, pixel) [1]
-    variance: Tensor  # (band, pixel) [1]
-    inverse_energy: Tensor  # sigma^2 of eq. 4 (pixel) [1/K^2]
-    weights: Tensor  # w of eq. 5 (band, pixel) [1]
-    null_variance: Tensor  # noise variance of that combination (pixel) [K^2]
-    order: Tensor  # number of smooth functions used (pixel)
-    contrast: Tensor  # (pixel)
-    reduced_chi2: Tensor  # (pixel)
+    ratio: Tensor
+    ratio_variance: Tensor
+    inverse_energy: Tensor
+    null_weights: Tensor
+    null_variance: Tensor
+    order: Tensor
+    contrast: Tensor
+    reduced_chi2: Tensor
     coefficients: Tensor  # of the signals on the functions in use (band, column, pixel) [K]
     smoothed: Tensor  # of the null combination (column, pixel) [K]
     columns: Tensor  # whether a column is in use (column, pixel)
-    scatter: Tensor  # whitened, less the noise, at the order (band, band, pixel) [1]
-    rapid_scatter: Tensor  # at the `rapid_orders` (2, band, band, pixel) [1]
-    pooled: Tensor  # whether the material's are used (pixel)
+    scatter: Tensor
+    rapid_scatter: Tensor
+    pooled: Tensor
 
 
 class Line(NamedTuple):
@@ -65,35 +66,27 @@ class Fit(NamedTuple):
 
     temperature: Tensor  # (time, pixel) [K]
     steepness: Tensor  # h'(x) before the last step (time, pixel) [1]
-    signals: list[Tensor]  # of the object in each band (time, pixel) [K]
+    signals: Tensor  # of the object (band, time, pixel) [K]
     emitted: Tensor  # u_1(x) of the last regression (time, pixel) [K]
     line: Line
     first: Tensor  # emissivity of the first band (pixel) [1]
-    constant: Tensor  # the object changes too little for its emissivity (pixel)
+    constant: Tensor
     known: Tensor  # the emissivity is the material's (pixel)
 
 
 class Emission(NamedTuple):
-    """Variances of object and emissivities, and what carries their uncertainty."""
+    """Variances of object and emissivities; not explained, a field of a `Solution`."""
 
     variance: Tensor  # of the object (time, pixel) [K^2]
-    sensitivity: Tensor  # derivative with epsilon (time, pixel) [K]
+    sensitivity: Tensor  # derivative of the object with epsilon (time, pixel) [K]
     smooth_variance: Tensor  # from the smoothed noise (time, pixel) [K^2]
-    emissivity: Tensor  # (band, pixel)
-    covariance: Tensor  # (band, band, pixel)
-    epsilon: Tensor  # variance of epsilon (pixel)
     level: Tensor  # deviation of the ratios by the background's level (band, pixel)
-    noise_variance: Tensor  # of e_1 (pixel)
+    emissivity: Tensor
+    emissivity_covariance: Tensor
+    epsilon_variance: Tensor
+    noise_variance: Tensor
     drift_variance: Tensor
-    restless: Tensor  # the background hardly rests (pixel)
-
-
-class Inputs(NamedTuple):
-    """What the pixels share, in tensors, and each pixel's material."""
-
-    model: Model
-    curves: tuple[kernels.Table, ...]
-    material: dict[str, Tensor] | None
+    restless: Tensor
 
 
 def solve(
@@ -104,36 +97,22 @@ def solve(
     def tensor(values: Any) -> Any:
         return torch.tensor(values, device=device) if isinstance(values, np.ndarray) else values
 
-    model = fused.share(tile, functions, drift)
-    material = None if tile.material is None else tile.material.each(tensor)
-    inputs = Inputs(
-        Model(*map(tensor, model)),
-        tuple(kernels.table(curve) for curve in tile.curves),
-        None if material is None else dict(vars(material)),
-    )
+    model = Model(*map(tensor, fused.share(tile, functions, drift)))
+    material = {} if tile.material is None else dict(vars(tile.material.each(tensor)))
     signals = tensor(tile.signals)
-    noise = inputs.model.noise[1:, None]
-    result, bend, line = _steps(inputs, signals, signals)
+    result, bend, line = _steps(model, material, signals, signals)
     removed, places = torch.zeros_like(bend), torch.arange(signals.shape[2], device=device)
     for _ in range(pixel.BENDS):
         energy = (bend - removed).var(dim=1, correction=0) * signals.shape[1]
-        bent = (energy > (least * noise) ** 2).any(dim=0)
+        bent = (energy > (least * model.noise[1:, None]) ** 2).any(dim=0)
         if not bent.any():
             break
         # Again, on signals whose reflections are proportional.
-        least, removed, places, signals = (
-            pixel.BEND,
-            bend[..., bent],
-            places[bent],
-            signals[..., bent],
-        )
+        least, removed, places = pixel.BEND, bend[..., bent], places[bent]
+        signals, line = signals[..., bent], Line(*(values[..., bent] for values in line))
+        material = {name: values[..., bent] for name, values in material.items()}
         straight = torch.cat([signals[:1], signals[1:] - removed])
-        if inputs.material is not None:
-            part = {name: values[..., bent] for name, values in inputs.material.items()}
-            inputs = inputs._replace(material=part)
-        again, bend, line = _steps(
-            inputs, signals, straight, Line(*(values[..., bent] for values in line))
-        )
+        again, bend, line = _steps(model, material, signals, straight, line)
         # The bend of a gray body is not known: it is told from the signals as they are.
         for name in again.keys() - {"gray"}:
             result[name][..., places] = again[name]
@@ -141,92 +120,76 @@ def solve(
 
 
 def _steps(
-    inputs: Inputs, signals: Tensor, straight: Tensor, start: Line | None = None
+    model: Model, material: Known, signals: Tensor, straight: Tensor, start: Line | None = None
 ) -> tuple[dict[str, Tensor], Tensor, Line]:
     """Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend."""
-    model, frames = inputs.model, signals.shape[1]
-    ratios = _ratios(inputs, straight)
-    fit = _alternate(inputs, ratios, straight[0], start)
-    emission = _emission(inputs, ratios, fit, straight[0])
-    background, variance = _background(inputs, ratios, fit, emission, signals)
+    ratios = _ratios(model, material, straight)
+    fit = _alternate(model, material, ratios, straight[0], start)
+    emission = _emission(model, material, ratios, fit, straight[0])
+    background, variance = _background(model, ratios, fit, emission, signals)
     films = torch.stack([fit.temperature, background])
-    stds = torch.stack([emission.variance, variance])
-    if float(model.pattern.max()) > 0.0:
-        stds = stds + torch.stack(
-            _pattern_variances(inputs, ratios, fit.temperature, emission.emissivity, background)
-        )
-    stds = stds.sqrt()
+    patterns = _pattern_variances(model, ratios, fit.temperature, emission.emissivity, background)
+    stds = (torch.stack([emission.variance, variance]) + patterns).sqrt()
     margin = tiles.RANGE_SIGMAS * stds.nan_to_num(posinf=np.inf)
     beyond = (films < model.lowest - margin) | (films > model.highest + margin)
     lost = ~((films.abs() < tiles.USELESS) & (stds < tiles.USELESS))
     values = torch.stack([films, stds], dim=1).where(~lost[:, None], np.nan).flatten(0, 1)
     # Null residual, rapid part of the first band, and the object's curve.
-    residual = einsum("bp,btp->tp", ratios.weights, straight) - model.functions.T @ ratios.smoothed
+    residual = _weighted(straight, ratios.null_weights) - model.functions.T @ ratios.smoothed
     rapid = straight[0] - model.functions.T @ ratios.coefficients[0]
     curve = model.object_part.T @ ratios.smoothed
-    common = ratios.weights[0] * model.noise[0] ** 2
-    free = frames - model.steps - ratios.order
+    common = ratios.null_weights[0] * model.noise[0] ** 2
+    free = signals.shape[1] - model.steps - ratios.order
+    parts = {**ratios._asdict(), **fit._asdict(), **emission._asdict()}
     result = {
+        **{name: part for name, part in parts.items() if name in Solution.__dataclass_fields__},
         **dict(zip(FILMS, values, strict=True)),
         "missing": films.isnan().sum(dim=1),
         "lost": lost.sum(dim=1),
         "beyond": beyond.any(dim=1),
-        "ratio": ratios.ratio,
-        "ratio_variance": ratios.variance + emission.level**2,
-        "inverse_energy": ratios.inverse_energy,
-        "null_weights": ratios.weights,
-        "null_variance": ratios.null_variance,
-        "order": ratios.order,
+        "ratio_variance": ratios.ratio_variance + emission.level**2,
         "freedom": free,
-        "contrast": ratios.contrast,
-        "reduced_chi2": ratios.reduced_chi2,
-        "pooled": ratios.pooled,
-        "scatter": ratios.scatter,
-        "rapid_scatter": ratios.rapid_scatter,
-        "emissivity": emission.emissivity,
-        "emissivity_covariance": emission.covariance,
-        "epsilon_variance": emission.epsilon,
-        "noise_variance": emission.noise_variance,
-        "drift_variance": emission.drift_variance,
-        "constant": fit.constant,
-        "restless": emission.restless,
         "gray": _may_be_gray(model, ratios),
         "correlation": _autocorrelation(residual),
         "delay": _delay(residual, rapid, ratios.null_variance, free * common, model.noise[0]),
         "unexplained": _unexplained(model, residual, rapid, ratios.null_variance, common),
         "sums": torch.stack([_block_sums(part, model.parts) for part in (residual, curve)]),
     }
-    return result, _bend(inputs, emission.emissivity, background), fit.line
+    return result, _bend(model, emission.emissivity, background), fit.line
 
 
-def _blackbody(table: kernels.Table, temperature: Tensor) -> tuple[Tensor, Tensor]:
-    """Signal less the reference [K] and slope [1] of a blackbody at a temperature [K]."""
-    if table.linear:
-        return table.amplitude * temperature + table.offset, torch.full_like(
-            temperature, table.amplitude
-        )
-    scale = table.wavelength * temperature + table.shift
+def _blackbody(
+    model: Model, temperature: Tensor, bands: int | slice = slice(None)
+) -> tuple[Tensor, Tensor]:
+    """Signal less the reference [K] and slope [1] of a blackbody in bands at a temperature [K]."""
+    linear, amplitude, wavelength, shift, offset = _numbers(model, bands)
+    if linear.any():
+        return amplitude * temperature + offset, amplitude + 0.0 * temperature
+    scale = wavelength * temperature + shift
     exponent = planck.SECOND_RADIATION_CONSTANT / scale
     excess = exponent.expm1()
-    share = table.amplitude / excess
-    slope = share * (1.0 + 1.0 / excess) * exponent * table.wavelength / scale
-    return share + table.offset, slope
+    share = amplitude / excess
+    return share + offset, share * (1.0 + 1.0 / excess) * exponent * wavelength / scale
 
 
-def _temperature(table: kernels.Table, signal: Tensor) -> Tensor:
+def _temperature(model: Model, signal: Tensor, band: int) -> Tensor:
     """Temperature [K] of a blackbody with a signal less the reference [K]; NaN where undefined."""
-    excess = signal - table.offset
-    if table.linear:
-        return excess / table.amplitude
-    ratio = table.amplitude / excess.where(excess > 0, np.nan)
-    return (planck.SECOND_RADIATION_CONSTANT / ratio.log1p() - table.shift) / table.wavelength
+    linear, amplitude, wavelength, shift, offset = _numbers(model, band)
+    excess = signal - offset
+    if linear.any():
+        return excess / amplitude
+    ratio = amplitude / excess.where(excess > 0, np.nan)
+    return (planck.SECOND_RADIATION_CONSTANT / ratio.log1p() - shift) / wavelength
 
 
-def _weighted(parts: list[Tensor], weights: Tensor) -> Tensor:
-    """Sum over the bands of (time, pixel), weighted by (band, pixel)."""
-    return sum(
-        (part * weight for part, weight in zip(parts, weights, strict=True)), torch.zeros(())
-    )
+def _numbers(model: Model, bands: int | slice) -> Tensor:
+    """Numbers of the exact responses of some bands, the last of a row of `kernels.rows`."""
+    return model.tables[bands, -5:].movedim(-1, 0)[..., None, None]
+
+
+def _weighted(parts: Tensor, weights: Tensor) -> Tensor:
+    """Sum over the bands of (band, time, pixel), weighted by (band, pixel)."""
+    return einsum("btp,bp->tp", parts, weights)
 
 
 def _quotient(numerator: Tensor, denominator: Tensor, otherwise: float) -> Tensor:
@@ -234,9 +197,8 @@ def _quotient(numerator: Tensor, denominator: Tensor, otherwise: float) -> Tenso
     return (numerator / denominator).where(denominator > 0, otherwise)
 
 
-def _ratios(inputs: Inputs, signals: Tensor) -> Ratio:
+def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
     """Step 1 (eq. 2 to 5), see `pixel.ratios`."""
-    model, material = inputs.model, inputs.material
     (bands, frames, pixels), noise = signals.shape, model.noise[:, None]
     # Eq. 3: scatter (order, pixel, band, band) of the whitened signals outside the functions.
     held = model.functions @ signals
@@ -249,7 +211,7 @@ def _ratios(inputs: Inputs, signals: Tensor) -> Ratio:
     trace = einsum("opbb->op", scatter)
     largest = torch.linalg.eigvalsh(scatter)[..., -1]
     pooled = torch.zeros_like(rows, dtype=torch.bool)
-    if material is not None:
+    if material:
         axis = material["ratio"] / noise
         axis = axis / axis.norm(dim=0)
         along = einsum("bp,opbc,cp->op", axis, scatter, axis)
@@ -267,7 +229,7 @@ def _ratios(inputs: Inputs, signals: Tensor) -> Ratio:
     length = ((ratio / noise) ** 2).sum(dim=0)
     energy = (values[:, -1] - free) / length
     inverse = _quotient(_quotient(energy + free / length, energy, np.inf), energy, np.inf)
-    if material is not None:
+    if material:
         # The mean of the posterior, of the material's ratio for a prior with its spread.
         spread = material["spread"]
         own = _quotient(spread, spread + inverse, 0.0)
@@ -288,9 +250,9 @@ def _ratios(inputs: Inputs, signals: Tensor) -> Ratio:
     unit = torch.eye(bands, dtype=signals.dtype, device=signals.device)[..., None]
     return Ratio(
         ratio=ratio,
-        variance=inverse * error,
+        ratio_variance=inverse * error,
         inverse_energy=inverse,
-        weights=weights,
+        null_weights=weights,
         null_variance=null_variance,
         order=order + 1,
         contrast=_quotient(largest[-1] * (bands - 1), across[-1], np.inf),
@@ -332,34 +294,32 @@ def _may_be_gray(model: Model, ratios: Ratio) -> Tensor:
     return result
 
 
-def _alternate(inputs: Inputs, ratios: Ratio, z: Tensor, line: Line | None) -> Fit:
+def _alternate(model: Model, material: Known, ratios: Ratio, z: Tensor, line: Line | None) -> Fit:
     """Steps 2 and 3 in turns (eq. 5 to 7)."""
-    model, curves, material = inputs.model, inputs.curves, inputs.material
     target = model.object_part.T @ ratios.smoothed
-    temperature = _temperature(curves[1], target)
+    temperature = _temperature(model, target, 1)
     # Middle of the interval that the ratios leave for e_1, for a constant object.
     largest = ratios.ratio.amax(dim=0)
     middle = 0.5 + 0.5 * (1.0 - 1.0 / largest).where(largest > 1.0, 0.0)
     known = torch.zeros_like(ratios.pooled)
-    if material is not None:
+    if material:
         told = ratios.pooled & material["emissivity"].isfinite()
         middle = material["emissivity"].where(told, middle)
         known = told & material["noise_variance"].isfinite()
 
     def approach(emissivity: Tensor, temperature: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object after a step of Newton towards h(x) = q (eq. 6), and h'(x) before."""
-        factors = ratios.weights * (1.0 - ratios.ratio * (1.0 - emissivity))
-        parts = [_blackbody(curve, temperature) for curve in curves]
-        value, slope = (_weighted([part[i] for part in parts], factors) for i in range(2))
+        factors = ratios.null_weights * (1.0 - ratios.ratio * (1.0 - emissivity))
+        value, slope = (_weighted(part, factors) for part in _blackbody(model, temperature))
         return temperature + (target - value) / slope, slope
 
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
-    guess = _fit(_blackbody(curves[0], temperature)[0], z, torch.ones_like(z))[0]
+    guess = _fit(_blackbody(model, temperature, 0)[0], z, torch.ones_like(z))[0]
     first = guess.where((guess > 0) & (guess < 1), middle)
     temperature = approach(first, temperature)[0]
     before = slope_before = torch.full_like(first, np.nan)
     for _ in range(pixel.ROUNDS):
-        emitted = _blackbody(curves[0], temperature)[0]
+        emitted = _blackbody(model, temperature, 0)[0]
         line = regress(emitted, z, float(model.noise[0]), line)
         least = pixel.OBJECT_TO_NOISE * (ratios.order + model.steps) * ratios.null_variance
         constant = (line.energy < least) & ~known
@@ -369,15 +329,15 @@ def _alternate(inputs: Inputs, ratios: Ratio, z: Tensor, line: Line | None) -> F
         first = line.slope + (line.slope - before) * rate / (1.0 - rate)
         first = middle.where(constant | known, first)
         temperature, steepness = approach(first, temperature)
-    signals = [_blackbody(curve, temperature)[0] for curve in curves]
+    signals = _blackbody(model, temperature)[0]
     assert line is not None
     return Fit(temperature, steepness, signals, emitted, line, first, constant, known)
 
 
-def _emission(inputs: Inputs, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
+def _emission(model: Model, material: Known, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
     """Variances (eq. 8) of what follows from the first band's signal (time, pixel), see `bars`."""
-    model, material, noise, frames = inputs.model, inputs.material, inputs.model.noise, len(z)
-    line, first, emitted, used = fit.line, fit.first, fit.emitted, ratios.order + model.steps
+    noise, frames, line, first, emitted = model.noise, len(z), fit.line, fit.first, fit.emitted
+    used = ratios.order + model.steps
     # Variance of the slope: of the ordinate's noise, and of the abscissa's.
     kernel = line.weights * emitted
     kernel = (kernel - line.weights * (kernel.sum(0) / line.weights.sum(0))) / line.energy
@@ -387,7 +347,7 @@ def _emission(inputs: Inputs, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
     linear = _linear(model, ratios, line, emitted, first, limit)
     change = emitted.amax(dim=0) - emitted.amin(dim=0)
     drift_variance = (limit / change) ** 2 + torch.maximum(upper, linear)
-    if material is not None:
+    if material:
         noise_variance = material["noise_variance"].where(fit.known, noise_variance)
         drift_variance = material["drift_variance"].where(fit.known, drift_variance)
     # Of the ratios, through the background's level.
@@ -395,10 +355,10 @@ def _emission(inputs: Inputs, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
     widest = (model.highest - model.lowest) / np.sqrt(12.0)
     level = ratios.ratio * model.rates[:, None] * level.where(level < widest, widest)
     epsilon = ratios.inverse_energy * ratios.null_variance
-    epsilon = epsilon + (ratios.weights * level).sum(dim=0) ** 2
+    epsilon = epsilon + (ratios.null_weights * level).sum(dim=0) ** 2
     # Eq. 6 by implicit differentiation; the error of w.kappa moves weight from the other bands to
     # the first, by their share in it.
-    shares = (ratios.weights**2 * (noise[:, None] ** 2 + (ratios.ratio * noise[0]) ** 2))[1:]
+    shares = (ratios.null_weights**2 * (noise[:, None] ** 2 + (ratios.ratio * noise[0]) ** 2))[1:]
     others = _weighted(fit.signals[1:], shares / shares.sum(dim=0))
     partial = mixing.mixed(first, fit.signals[0], others)
     sensitivity = (partial - model.object_part.T @ ratios.coefficients[0]) / fit.steepness
@@ -412,8 +372,10 @@ def _emission(inputs: Inputs, ratios: Ratio, fit: Fit, z: Tensor) -> Emission:
         sensitivity=sensitivity,
         smooth_variance=smooth_variance,
         emissivity=1.0 - ratios.ratio * (1.0 - first),
-        covariance=_covariance(model, ratios, first, noise_variance + drift_variance, level),
-        epsilon=epsilon,
+        emissivity_covariance=_covariance(
+            model, ratios, first, noise_variance + drift_variance, level
+        ),
+        epsilon_variance=epsilon,
         level=level,
         noise_variance=noise_variance,
         drift_variance=drift_variance,
@@ -425,7 +387,7 @@ def _covariance(
     model: Model, ratios: Ratio, first: Tensor, slope_variance: Tensor, level: Tensor
 ) -> Tensor:
     """Covariance of the emissivities (band, band, pixel) (eq. 8), see `bars`."""
-    ratio, weights, energy = ratios.ratio, ratios.weights, ratios.inverse_energy
+    ratio, weights, energy = ratios.ratio, ratios.null_weights, ratios.inverse_energy
     reflectivity, squares = 1.0 - first, (model.noise**2)[:, None]
     pairs = ratio[:, None] * ratio
     # Of kappa_m with epsilon, over sigma^2, and with one another.
@@ -505,60 +467,51 @@ def _linear(
 
 
 def _background(
-    inputs: Inputs, ratios: Ratio, fit: Fit, emission: Emission, signals: Tensor
+    model: Model, ratios: Ratio, fit: Fit, emission: Emission, signals: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Step 4 (eq. 9), (time, pixel) [K], and its variance [K^2] (eq. 10), see `bars`."""
-    emissivity, noise, curves = emission.emissivity, inputs.model.noise[:, None], inputs.curves
-    first, precision = emissivity[0], ((1.0 - emissivity) / noise) ** 2
+    emissivity, noise, first = emission.emissivity, model.noise[:, None], fit.first
+    precision = ((1.0 - emissivity) / noise) ** 2
     weights = precision / precision.sum(dim=0)
-    reflected = [
-        mixing.background(*parts) for parts in zip(emissivity, signals, fit.signals, strict=True)
-    ]
+    reflected = mixing.background(emissivity[:, None], signals, fit.signals)
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
-    start = _temperature(curves[0], _weighted(reflected, weights))
-    parts = [_blackbody(curve, start) for curve in curves]
-    curvature = _weighted([slope**2 for _, slope in parts], weights)
-    steps = [a * (seen - u) for (u, a), seen in zip(parts, reflected, strict=True)]
-    background = start + _weighted(steps, weights) / curvature
+    start = _temperature(model, _weighted(reflected, weights), 0)
+    signal, slope = _blackbody(model, start)
+    curvature = _weighted(slope**2, weights)
+    background = start + _weighted(slope * (reflected - signal), weights) / curvature
     # Eq. 10, term by term.
     share = (weights * emissivity / (1.0 - emissivity)).sum(dim=0)
     contrast = background - fit.temperature
     through = contrast * first + share * emission.sensitivity
-    covariance = 2.0 * noise[0] ** 2 * ratios.weights[0] * ratios.inverse_energy
+    covariance = 2.0 * noise[0] ** 2 * ratios.null_weights[0] * ratios.inverse_energy
     of_first = noise[0] ** 2 - 1.0 / ((ratios.ratio / noise) ** 2).sum(dim=0)
-    slope = (emission.noise_variance + emission.drift_variance) / (1.0 - first) ** 2
+    steady = (emission.noise_variance + emission.drift_variance) / (1.0 - first) ** 2
     variance = 1.0 / (precision.sum(dim=0) * curvature) + share**2 * emission.smooth_variance
-    variance = variance + through * (through * emission.epsilon - contrast * covariance)
-    return background, variance + contrast**2 * (of_first * ratios.inverse_energy + slope)
+    variance = variance + through * (through * emission.epsilon_variance - contrast * covariance)
+    return background, variance + contrast**2 * (of_first * ratios.inverse_energy + steady)
 
 
 def _pattern_variances(
-    inputs: Inputs, ratios: Ratio, temperature: Tensor, emissivity: Tensor, background: Tensor
-) -> list[Tensor]:
-    """Variances (time, pixel) [K^2] of both temperatures from a residual pattern, see `bars`."""
-    model, curves = inputs.model, inputs.curves
-    slopes = [
-        share * _blackbody(curve, temperature)[1]
-        for share, curve in zip(emissivity, curves, strict=True)
-    ]
+    model: Model, ratios: Ratio, temperature: Tensor, emissivity: Tensor, background: Tensor
+) -> Tensor:
+    """Variances (2, time, pixel) [K^2] of both temperatures by a residual pattern, see `bars`."""
+    if not model.pattern.any():
+        return torch.zeros(())
+    slopes = emissivity[:, None] * _blackbody(model, temperature)[1]
     precision = ((1.0 - emissivity) / model.noise[:, None]) ** 2
     direct = precision / precision.sum(dim=0) / (1.0 - emissivity)
-    steepness, through = _weighted(slopes, ratios.weights), _weighted(slopes, direct)
-    slope = _blackbody(curves[0], background)[1]
-    result = [torch.zeros_like(background), torch.zeros_like(background)]
-    for std, weight, share in zip(model.pattern, ratios.weights, direct, strict=True):
-        part = weight / steepness
-        result[0] += (std * part) ** 2
-        result[1] += (std * (share - through * part) / slope) ** 2
-    return result
+    through = _weighted(slopes, direct)
+    parts = ratios.null_weights[:, None] / _weighted(slopes, ratios.null_weights)
+    others = (direct[:, None] - through * parts) / _blackbody(model, background, 0)[1]
+    return einsum("b,xbtp->xtp", model.pattern**2, torch.stack([parts, others]) ** 2)
 
 
-def _bend(inputs: Inputs, emissivity: Tensor, background: Tensor) -> Tensor:
+def _bend(model: Model, emissivity: Tensor, background: Tensor) -> Tensor:
     """Part of the reflections (band - 1, time, pixel) [K] that is bent (eq. 11), see `pixel`."""
-    first, *others = (_blackbody(curve, background)[0] for curve in inputs.curves)
-    signal = torch.stack([other - first for other in others]) * (1.0 - emissivity[1:, None])
-    physical = ((emissivity > 0) & (emissivity < 1)).all(dim=0) & signal.isfinite().all(0).all(0)
-    return signal.where(physical, 0.0)
+    signal = _blackbody(model, background)[0]
+    bend = (signal[1:] - signal[0]) * (1.0 - emissivity[1:, None])
+    physical = ((emissivity > 0) & (emissivity < 1)).all(dim=0) & bend.isfinite().all(0).all(0)
+    return bend.where(physical, 0.0)
 
 
 def regress(abscissa: Tensor, ordinate: Tensor, noise: float, start: Line | None = None) -> Line:
