@@ -6,7 +6,7 @@ of the capture by repeated halving may be chosen; it is the one with the least d
 .. math:: L(v) = \sum_i \left[ \mathrm{tr} \, S_i - v^T S_i v \right] + c \, n \qquad (12)
 
 of the n pieces i, with the scatter :math:`S_i` (eq. 3) of the signals in their plane, see
-`reflection_ratio.plane`, outside the piece's polynomials: the energy across the background's axis v
+`pieces.plane`, outside the piece's polynomials: the energy across the background's axis v
 in units of the noise, and a cost of each piece. In a plane the part across an axis is one number,
 along its normal n: the energy is :math:`n^T S n`. Given the division, the axis is the principal one
 of the sum of the scatters; given the axis, the best of all divisions is found from the shortest

@@ -91,8 +91,10 @@ def _film(
     return lost, missing, beyond > zero
 
 
-_NUMBERS: Final = ("inverse_energy", "null_variance", "contrast", "reduced_chi2")
-_NUMBERS += ("epsilon_variance", "noise_variance", "drift_variance", "correlation", "delay")
+_NUMBERS: Final = (
+    *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "epsilon_variance"),
+    *("noise_variance", "drift_variance", "correlation", "delay"),
+)
 _FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
     np.float64: {**dict.fromkeys(_NUMBERS, ()), **dict.fromkeys(["missing", "lost"], (2,))},
     np.bool_: dict.fromkeys(["pooled", "gray", "constant", "restless", "unexplained"], ()),

@@ -54,6 +54,7 @@ class Table(NamedTuple):
     """Response of a band, as polynomials of (temperature - middle) / half; exact beside them."""
 
     signal: tuple[float, ...]  # coefficients of u(T) - T_r [K], rising
+    slope: tuple[float, ...]  # of u'(T) [1]
     inverse: tuple[float, ...]  # of T of (signal - middle_signal) / half_signal, nearly [K]
     middle: float  # [K]
     half: float  # [K]
@@ -79,15 +80,16 @@ def response(rows: Array, band: int) -> Table:
     return Table(
         (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]),
         (c[10], c[11], c[12], c[13], c[14], c[15], c[16], c[17], c[18], c[19]),
-        c[20],
-        c[21],
-        c[22],
-        c[23],
-        c[24] > 0.0,
-        c[25],
-        c[26],
-        c[27],
-        c[28],
+        (c[20], c[21], c[22], c[23], c[24], c[25], c[26], c[27], c[28], c[29]),
+        c[30],
+        c[31],
+        c[32],
+        c[33],
+        c[34] > 0.0,
+        c[35],
+        c[36],
+        c[37],
+        c[38],
     )
 
 
@@ -117,6 +119,7 @@ def table(curve: Curve, *others: Curve) -> Table:
     a = curve.reference_slope
     return Table(
         signal=_coefficients(u),
+        slope=_coefficients(slope),
         inverse=_coefficients(inverse),
         middle=0.5 * (low + high),
         half=0.5 * (high - low),

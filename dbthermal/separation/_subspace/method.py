@@ -4,7 +4,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
 
 .. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y) + n_m \qquad (1)
 
-1. The rapid changes of the bands lie along the reflection ratios (`reflection_ratio`)
+1. The rapid changes of the bands lie along the reflection ratios (`pixel`)
 
    .. math:: \kappa_m = (1 - e_m) / (1 - e_1) \qquad (2)
 
@@ -16,7 +16,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
    .. math:: \mathrm{var}(\kappa_m) = \sigma^2 (s_m^2 + \kappa_m^2 s_1^2) \qquad (4)
 
 2. The null combination of bands holds no background. Smoothed in the subspace, it is inverted for
-   the object temperature (`emission`):
+   the object temperature (`pixel`):
 
    .. math:: q = \sum w_m z_m, \quad \sum w_m \kappa_m = 0, \quad \sum w_m = 1 \qquad (5)
 
@@ -319,14 +319,14 @@ def _followed(
     if suspect.size == 0:
         return result, first
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    white, axes = reflection_ratio.plane(part.signals, noise)
+    white, axes = pieces.plane(part.signals, noise)
     axis = np.full((2, suspect.size), np.nan)
     if part.material is not None:
         axis = np.einsum("abp,bp->ap", axes, part.material.ratio / noise[:, np.newaxis])
         axis /= np.sqrt((axis**2).sum(axis=0))
-    divisions = division.divide(white, tile.time, tile.segment, axis)
     pooled = np.where(solution.pooled[suspect], axis, np.nan)
-    energy, count = reflection_ratio.null_energy(white, functions, pooled)
+    energy, count = pieces.null_energy(white, functions, pooled)
+    divisions = division.divide(white, tile.time, tile.segment, axis)
     # Outside the plane a function fits noise in each further band.
     further = (pieces.COST - 1.0) * (len(noise) - 2)
     divisions = [replace(one, cost=one.cost + further * one.functions) for one in divisions]

@@ -21,7 +21,6 @@ OBJECT_TO_NOISE: Final = 10.0
 BEND: Final = 0.2
 # Times that it is taken out at most: it changes with the background that it is computed of.
 BENDS: Final = 2
-_TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 class Model(NamedTuple):
@@ -257,7 +256,7 @@ def _order(work: Work, known: float, frames: int) -> int:
     # N ln E + K ln N is least where E N^(K / N) is.
     best, least, price, step = lowest, np.inf, 1.0, frames ** (1.0 / frames)
     for order in range(lowest, len(scatter) - 1):
-        criterion = price * max(_across(scatter[order], work, known), _TINY)
+        criterion = price * max(_across(scatter[order], work, known), reflection_ratio.TINY)
         price *= step
         if criterion < least:
             best, least = order, criterion
@@ -290,7 +289,7 @@ def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
             step += (off[m] - before[m]) ** 2
             turned -= before[m] * (off[m] - before[m])
         if i > 0:
-            part = min(max(turned / max(step, _TINY), 0.0), 1.0)
+            part = min(max(turned / max(step, reflection_ratio.TINY), 0.0), 1.0)
             for m in range(bands):
                 square += (before[m] + part * (off[m] - before[m])) ** 2
             statistic = square / ratios.inverse_energy

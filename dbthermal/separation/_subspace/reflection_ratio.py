@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri, ndtr
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import quotient
 from dbthermal.separation._tiles import Array, Mask, Whole
 
@@ -30,7 +29,7 @@ CHANCE: Final = float(2.0 * ndtr(-4.0))
 
 # Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
 GRAY_CHANCE: Final = 1e-4
-_TINY: Final = float(np.finfo(np.float64).tiny)
+TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 def rapid_orders(orders: int) -> Whole:
@@ -91,54 +90,6 @@ def energy_of_variance(ratio: Array, variance: Array, noise: Array) -> Array:
 def _ratio_error(ratio: Array, noise: Array) -> Array:
     squares = (noise**2)[:, np.newaxis]
     return squares + ratio**2 * squares[0]
-
-
-def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
-    """
-    Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
-
-    Object and background change more than two bands along two lines: of the whitened signals all
-    but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
-    """
-    white = signals / noise[:, np.newaxis, np.newaxis]
-    if len(noise) == 2:
-        return white, np.repeat(np.eye(2)[..., np.newaxis], signals.shape[2], axis=2)
-    changes = white - white.mean(axis=1, keepdims=True)
-    scatter = np.einsum("btp,ctp->pbc", changes, changes)
-    axes = np.linalg.eigh(scatter)[1][..., -2:].transpose(2, 1, 0)
-    return np.einsum("abp,btp->atp", axes, white), axes
-
-
-def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
-    """
-    Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
-
-    Of the functions that the lowest information criterion selects, and one more; across a known
-    `axis` (2, pixel) where it is not NaN.
-    """
-    held = np.einsum("tf,btp->bfp", functions.functions, white, optimize=True)
-    pairs = ((0, 0), (0, 1), (1, 1))
-    a, b, d = (
-        np.einsum("tp,tp->p", white[i], white[j])
-        - np.cumsum(held[i] * held[j], axis=0)[functions.steps :]
-        for i, j in pairs
-    )
-    principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
-    known = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
-    energy = np.where(np.isnan(known), principal, known)
-    order = choose_order(energy, white.shape[1])
-    used = order + 1 + functions.steps
-    return energy[order, np.arange(order.size)], used
-
-
-def choose_order(null_energy: Array, frames: int) -> Whole:
-    """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
-    if len(null_energy) == 1:
-        return np.zeros(null_energy.shape[1], dtype=np.intp)
-    criterion = frames * np.log(np.maximum(null_energy, _TINY))
-    criterion += np.arange(1, len(null_energy) + 1)[:, np.newaxis] * np.log(frames)
-    lowest = min(LOWEST_ORDER, null_energy.shape[0] - 1) - 1
-    return np.asarray(lowest + np.argmin(criterion[lowest:-1], axis=0) + 1)
 
 
 def agrees(scatter: Array, axis: Array) -> Mask:

@@ -56,7 +56,8 @@ def regress(abscissa: Array, ordinate: Array, noise: float) -> Lines:
     weights, numbers = np.empty((pixels, frames)), np.empty((pixels, 3 + frames))
     few = np.full((5, frames), np.inf, np.float32)
     regression.lines(*rows, float(noise), weights, few, numbers)
-    return Lines(*numbers[:, :3].T, weights.T)
+    slope, variance, energy = numbers[:, :3].T
+    return Lines(slope, variance, energy, weights.T)
 
 
 @lru_cache(maxsize=16)

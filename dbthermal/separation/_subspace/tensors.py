@@ -22,10 +22,11 @@ from dbthermal.separation._subspace import (
     residuals,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._subspace.pixel import Model
 from dbthermal.separation._tiles import Tile
 
 Tensor = torch.Tensor
+Model = Any
+"""A `pixel.Model`, its arrays as tensors."""
 Known = dict[str, Tensor]
 """Each pixel's material: the fields of a `Material`, none without one."""
 einsum: Final = torch.einsum
@@ -97,7 +98,7 @@ def solve(
     def tensor(values: Any) -> Any:
         return torch.tensor(values, device=device) if isinstance(values, np.ndarray) else values
 
-    model = Model(*map(tensor, fused.share(tile, functions, drift)))
+    model = pixel.Model(*map(tensor, fused.share(tile, functions, drift)))
     material = {} if tile.material is None else dict(vars(tile.material.each(tensor)))
     signals = tensor(tile.signals)
     result, bend, line = _steps(model, material, signals, signals)
@@ -269,7 +270,7 @@ def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
 def _order(across: Tensor, frames: int) -> Tensor:
     """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
     orders = torch.arange(1, len(across) + 1, device=across.device)[:, None]
-    criterion = frames * across.clip(min=np.finfo(float).tiny).log() + orders * np.log(frames)
+    criterion = frames * across.clip(min=reflection_ratio.TINY).log() + orders * np.log(frames)
     lowest = min(reflection_ratio.LOWEST_ORDER, len(across) - 1) - 1
     if len(across) == 1:
         return torch.zeros_like(criterion[0], dtype=torch.int64)
@@ -283,7 +284,7 @@ def _may_be_gray(model: Model, ratios: Ratio) -> Tensor:
     # The part of g / s orthogonal to v; its variance is sigma^2.
     off = gray[..., None] - (gray @ unit)[:, None] * unit
     start, step = off[:-1], off.diff(dim=0)
-    length = (step**2).sum(dim=1).clip(min=np.finfo(float).tiny)
+    length = (step**2).sum(dim=1).clip(min=reflection_ratio.TINY)
     share = (-(start * step).sum(dim=1) / length).clip(0.0, 1.0)
     nearest = ((start + share[:, None] * step) ** 2).sum(dim=1) / ratios.inverse_energy
     # The mean is no larger than the largest chance: few pixels need it.
