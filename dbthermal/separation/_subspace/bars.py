@@ -282,14 +282,12 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
         combined(w, coefficients, count, work.columns)
         kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
         kernels.combined(model.functions, model.spans, work.columns, count, residual)
-    weight, other, second = w[0], w[1], work.straight[1, :frames]
     for t in range(frames):
-        rapid[t] = work.first[t] - rapid[t]
-        residual[t] = weight * work.first[t] + other * second[t] - residual[t]
-    for m in range(2, w.size):
-        weight, second = w[m], work.straight[m, :frames]
+        rapid[t], residual[t] = work.first[t] - rapid[t], -residual[t]
+    for m in range(w.size):
+        weight, signal = w[m], work.straight[m, :frames]
         for t in range(frames):
-            residual[t] += weight * second[t]
+            residual[t] += weight * signal[t]
     record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
     for block in range(model.parts.size - 1):
         one, other = 0.0, 0.0

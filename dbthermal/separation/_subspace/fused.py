@@ -18,6 +18,14 @@ from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Ratio, Work
 from dbthermal.separation._tiles import Mask, Pixels, Tile, Whole
 
+# Samples that are turned at once, to stay in the cache, and the fewest pixels.
+_TURNED: Final = 2**14
+_BLOCK: Final = 8
+_VECTOR: Final = 64  # numbers that a loop takes at once, at most
+_PAGE, _APART = 512, 24  # numbers of a page, and of three lines of the cache
+_ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
+_SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
+
 FILMS: Final = (
     *("object_temperature", "object_temperature_std"),
     *("background_temperature", "background_temperature_std"),
@@ -62,15 +70,6 @@ class Solution(Pixels):
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
 
-# Samples that are turned at once, to stay in the cache, and the fewest pixels.
-_TURNED: Final = 2**14
-_BLOCK: Final = 8
-_VECTOR: Final = 64  # numbers that a loop takes at once, at most
-_PAGE, _APART = 512, 24  # numbers of a page, and of three lines of the cache
-_ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
-_SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
-
-
 @inlined
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
@@ -95,13 +94,13 @@ _NUMBERS: Final = (
     *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "epsilon_variance"),
     *("noise_variance", "drift_variance", "correlation", "delay"),
 )
-_FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
-    np.float64: {**dict.fromkeys(_NUMBERS, ()), **dict.fromkeys(["missing", "lost"], (2,))},
-    np.bool_: dict.fromkeys(["pooled", "gray", "constant", "restless", "unexplained"], ()),
-    np.intp: {"order": (), "beyond": (2,)},  # no arrays of truth values in a record
-}
 RECORD: Final = np.dtype(
-    [(name, kind, shape) for kind, shapes in _FIELDS.items() for name, shape in shapes.items()]
+    [
+        *((name, np.float64) for name in _NUMBERS),
+        *((name, np.bool_) for name in ("pooled", "gray", "constant", "restless", "unexplained")),
+        *((name, np.float64, 2) for name in ("missing", "lost")),
+        *[("order", np.intp), ("beyond", np.intp, 2)],  # no arrays of truth values in a record
+    ]
 )
 """Numbers of a pixel, the fields of a `Solution` without films, sums, and those of the bands."""
 _VECTORS: Final = ("ratio", "ratio_variance", "null_weights", "emissivity")
@@ -235,7 +234,6 @@ def _separate(
             here = np.uintp(together[p])
             for m in range(model.noise.size):
                 kernels.copy(inside[p, m], work.signals[m])
-            kernels.copy(inside[p, 0], work.first)
             kernels.copy(materials[here], work.material)
             record, vectors = solved.record[here], solved.vectors[here]
             ratios = _pixel(model, least, work, outside[p], record, vectors, solved.matrices[here])
@@ -249,10 +247,9 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in bars.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
-    rates, gray = slopes(tile.curves)
     chances = reflection_ratio.CHANCE, reflection_ratio.GRAY_CHANCE
     return Model(
-        tables=_tables(tile.curves),
+        **_responses(tile.curves),
         **_columns(functions),
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
@@ -260,8 +257,6 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         noise=np.array(tile.noise),
         pattern=np.array(tile.pattern or np.zeros(others + 1)),
         drift=drift / np.sqrt(3.0),
-        rates=rates,
-        gray=gray,
         chances=(float(chdtri(others, chances[0])), float(chdtri(others, chances[1]))),
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
         edges=edges,
@@ -289,22 +284,18 @@ def _columns(functions: smooth.Subspace) -> dict[str, Any]:
 
 
 @lru_cache
-def _tables(curves: tuple[Curve, ...]) -> Array:
-    return kernels.rows(curves)
-
-
-@lru_cache
-def slopes(curves: tuple[Curve, ...]) -> tuple[Array, Array]:
-    """Ratios of the responses' slopes: relative rate at the reference (band) [1/K], and some.
-
-    These at temperatures over the calibrated range (temperature, band) [1].
-    """
+def _responses(curves: tuple[Curve, ...]) -> dict[str, Array]:
+    """Fields of a `Model` that hold the responses."""
     first = curves[0]
     around = first.reference + np.array([-0.5, 0.5])  # [K]
     temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
     rates = [np.diff(np.log(one.slope(around) / first.slope(around)))[0] for one in curves]
     ratios = [one.slope(temperatures) / first.slope(temperatures) for one in curves]
-    return np.array(rates), np.stack(ratios, axis=1)
+    return {
+        "tables": kernels.rows(curves),
+        "rates": np.array(rates),
+        "gray": np.stack(ratios, axis=1),
+    }
 
 
 def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
@@ -312,12 +303,13 @@ def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     # Places of one frame that lie a multiple of a page apart would drive each other from the cache.
     apart = -(-frames // _PAGE) * _PAGE + _APART
     names = Work._fields
-    together, banded = names[: names.index("signals")], names[names.index("signals") :][:6]
+    together, banded = names[1 : names.index("signals")], names[names.index("signals") :][:6]
     vectors = names[names.index("axis") : names.index("material")]
     block, size = max(_BLOCK, _TURNED // frames), len(together)
     space = np.empty((size + len(banded) * bands, apart))
     rows = space[size:].reshape(len(banded), bands, apart)
     return {
+        "first": rows[0, 0, :frames],  # of the signals
         **dict(zip(together, space[:size, :frames], strict=True)),
         **dict(zip(banded, rows, strict=True)),
         **dict(zip(vectors, np.empty((len(vectors), bands)), strict=True)),
@@ -381,10 +373,11 @@ def solve_parts(
     named |= {
         "freedom": freedom,
         "beyond": named["beyond"] > 0,
+        "sums": sums,
         "scatter": squares[0],
         "rapid_scatter": squares[1:3],
         "emissivity_covariance": squares[3],
         **dict(zip(_VECTORS, vectors.transpose(1, 2, 0), strict=True)),
         **dict(zip(FILMS, films, strict=True)),
     }
-    return Solution(sums=sums, **named)
+    return Solution(**named)

@@ -354,9 +354,8 @@ def _approach(model: Model, emissivity: float, work: Work, emitted: Array) -> No
 @inlined
 def combined(weights: Array, coefficients: Array, count: int, columns: Array) -> None:
     """Sum of the bands' coefficients (band, column), weighted, in place."""
-    for j in range(count):
-        columns[j] = weights[0] * coefficients[0, j] + weights[1] * coefficients[1, j]
-    for m in range(2, weights.size):
+    kernels.fill(columns[:count], 0.0)
+    for m in range(weights.size):
         for j in range(count):
             columns[j] += weights[m] * coefficients[m, j]
 
