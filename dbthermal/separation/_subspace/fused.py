@@ -284,7 +284,7 @@ def _columns(functions: smooth.Subspace) -> dict[str, Any]:
 
 
 @lru_cache
-def _responses(curves: tuple[Curve, ...]) -> dict[str, Array]:
+def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
     """Fields of a `Model` that hold the responses."""
     first = curves[0]
     around = first.reference + np.array([-0.5, 0.5])  # [K]
