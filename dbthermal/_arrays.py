@@ -1,7 +1,4 @@
-"""Types of arrays that most modules share, and what lets one text compute on arrays and tensors.
-
-An array is one of NumPy; where a function asks for its `namespace`, a tensor of torch will do, on
-any device. Only names that both have, with the same meaning, are then used.
+"""Types of arrays that most modules share, and films that are in memory or on disk.
 
 Films that a separation fills are in memory, or in files that vanish with the process, and are
 written and read as arrays all the same. The pages of a file count as the process's memory, too,
@@ -11,7 +8,6 @@ until they are released (`release`).
 import importlib
 import mmap
 import os
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -33,30 +29,10 @@ _FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
 _MAPS: WeakSet[mmap.mmap] = WeakSet()
 
 
-def namespace(values: Any) -> Any:
-    """NumPy, or torch for a tensor: the module whose functions take the values."""
-    return sys.modules["torch"] if type(values).__module__ == "torch" else np
-
-
-def real(values: Any) -> Any:
-    """Values in double precision; a tensor as it is."""
-    return np.asarray(values, dtype=np.float64) if namespace(values) is np else values
-
-
-def like(values: npt.ArrayLike, other: Any) -> Any:
-    """Values as an array, or as a tensor on the device of another."""
-    return namespace(other).asarray(np.array(values), device=other.device)
-
-
-def host(values: Any) -> npt.NDArray[Any]:
-    """Array of values that may be on a device."""
-    return np.asarray(values if namespace(values) is np else values.cpu())
-
-
 def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:
     """Quotient where the denominator is positive, and another value elsewhere."""
-    xp, positive = namespace(denominator), denominator > 0
-    return xp.where(positive, numerator / xp.where(positive, denominator, 1.0), otherwise)
+    positive = denominator > 0
+    return np.where(positive, numerator / np.where(positive, denominator, 1.0), otherwise)
 
 
 def select(values: Any, selected: Any, axis: int = -1) -> Any:
@@ -65,8 +41,6 @@ def select(values: Any, selected: Any, axis: int = -1) -> Any:
     Along the last one, an index of NumPy would leave the axes in another order in memory, and take
     several times as long.
     """
-    if namespace(values) is not np:
-        return values.movedim(axis, -1)[..., selected].movedim(-1, axis)
     selected = np.flatnonzero(selected) if selected.dtype == bool else selected
     return values.take(selected, axis=axis)
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array, Mask, namespace
+from dbthermal._arrays import Array, Mask
 from dbthermal._compiled import compiled
 
 Whole = npt.NDArray[np.intp]
@@ -55,17 +55,12 @@ class Subspace:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
         if self.of_pieces is not None:
             return self.of_pieces
-        result = namespace(self.functions).zeros_like(self.object_part.T[self.steps :])
+        result = np.zeros_like(self.object_part.T[self.steps :])
         for column, (start, stop) in enumerate(self.spans):
             result[max(column - self.steps, 0) :, start:stop] += (
                 self.object_part[start:stop, column] ** 2
             )
         return result.T
-
-    def columns(self, order: npt.NDArray[np.intp]) -> Mask:
-        """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
-        columns = namespace(order).arange(self.functions.shape[1], device=order.device)
-        return columns[:, np.newaxis] < order + self.steps
 
 
 def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-from dbthermal._arrays import Array, namespace, real
+from dbthermal._arrays import Array
 
 __all__ = [
     "COEFFICIENTS",
@@ -84,23 +84,22 @@ class Curve:
     def counts(self, temperature: npt.ArrayLike) -> Array:
         """Counts of a blackbody at a temperature [K] that fills the pixel, extrapolated [count]."""
         exponent = planck.SECOND_RADIATION_CONSTANT / self._scale(temperature)
-        return self.amplitude / namespace(exponent).expm1(exponent) + self.offset
+        return self.amplitude / np.expm1(exponent) + self.offset
 
     def count_slope(self, temperature: npt.ArrayLike) -> Array:
         """Derivative of `counts` with the temperature [count/K]."""
         scale = self._scale(temperature)
         exponent = planck.SECOND_RADIATION_CONSTANT / scale
-        excess = namespace(exponent).expm1(exponent)
+        excess = np.expm1(exponent)
         growth = self.amplitude / excess * (1.0 + 1.0 / excess)
         return growth * exponent * self.wavelength / scale
 
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature [K] of a blackbody of given counts; NaN at and below the offset."""
-        excess = real(counts) - self.offset
-        xp = namespace(excess)
-        known = (excess > 0) & xp.isfinite(excess)
-        ratio = self.amplitude / xp.where(known, excess, np.nan)
-        scale = planck.SECOND_RADIATION_CONSTANT / xp.log1p(ratio)
+        excess = np.asarray(counts, dtype=np.float64) - self.offset
+        known = (excess > 0) & np.isfinite(excess)
+        ratio = self.amplitude / np.where(known, excess, np.nan)
+        scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio)
         return (scale - self.shift) / self.wavelength
 
     @cached_property
@@ -115,7 +114,7 @@ class Curve:
 
     def linearise(self, counts: npt.ArrayLike) -> Array:
         """Linearised signal z of counts [K]."""
-        excess = real(counts) - self.reference_counts
+        excess = np.asarray(counts, dtype=np.float64) - self.reference_counts
         return self.reference + excess / self.reference_slope
 
     def signal(self, temperature: npt.ArrayLike) -> Array:
@@ -128,11 +127,11 @@ class Curve:
 
     def temperature(self, signal: npt.ArrayLike) -> Array:
         """Temperature [K] of the blackbody with a linearised signal [K]; NaN where undefined."""
-        excess = real(signal) - self.reference
+        excess = np.asarray(signal, dtype=np.float64) - self.reference
         return self.inverse(self.reference_counts + self.reference_slope * excess)
 
     def _scale(self, temperature: npt.ArrayLike) -> Array:
-        return self.wavelength * real(temperature) + self.shift
+        return self.wavelength * np.asarray(temperature, dtype=np.float64) + self.shift
 
 
 @dataclass(frozen=True)
@@ -149,16 +148,16 @@ class LinearCurve(Curve):
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
         """Counts at a temperature [K]."""
-        return self.amplitude * real(temperature) + self.offset
+        return self.amplitude * np.asarray(temperature, dtype=np.float64) + self.offset
 
     def count_slope(self, temperature: npt.ArrayLike) -> Array:
         """Slope, the same at each temperature [count/K]."""
-        temperature = real(temperature)
-        return namespace(temperature).full_like(temperature, self.amplitude)
+        temperature = np.asarray(temperature, dtype=np.float64)
+        return np.full_like(temperature, self.amplitude)
 
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature of counts [K]."""
-        return (real(counts) - self.offset) / self.amplitude
+        return (np.asarray(counts, dtype=np.float64) - self.offset) / self.amplitude
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:

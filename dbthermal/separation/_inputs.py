@@ -53,7 +53,7 @@ class Method:
     survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
     check_clock: Callable[..., None] | None = None  # refuses times that are not of exposure
     any_bands: bool = False  # takes more than two bands
-    compiled: bool = False  # compiled for two bands, a pixel at a time
+    compiled: bool = False  # compiled, a pixel at a time
     not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
 
 

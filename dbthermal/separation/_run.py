@@ -277,7 +277,7 @@ def _share(
     counts = capture["counts"]
     row, lazy = counts[..., 0, :].size, counts.chunksizes.get("y", ())
     chunk = max(lazy, default=counts.encoding.get("preferred_chunks", {}).get("y", 1))
-    each = _TILE if method.compiled and capture.sizes["band"] == 2 else _TILE * _TIMES
+    each = _TILE if method.compiled else _TILE * _TIMES
     tile = each * largest(method, settings, capture) * row / capture.sizes["x"]
 
     def read(height: int) -> tuple[int, bool]:

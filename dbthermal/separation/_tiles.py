@@ -16,7 +16,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing
-from dbthermal._arrays import namespace, select
+from dbthermal._arrays import select
 from dbthermal._samples import Grain
 from dbthermal.response import Curve
 from dbthermal.schema import Status
@@ -236,7 +236,7 @@ class Estimate(Pixels):
 
 def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
     """Temperatures [K] outside the calibrated range of a response by several deviations."""
-    margin: Array = RANGE_SIGMAS * namespace(std).nan_to_num(std, posinf=np.inf)
+    margin: Array = RANGE_SIGMAS * np.nan_to_num(std, posinf=np.inf)
     return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
@@ -262,8 +262,7 @@ def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
 
 def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
     """Pixels in a tile of a capture, at most."""
-    large = capture.sizes["band"] == 2 or getattr(settings, "device", None) is not None
-    times = _COMPILED if method.compiled and large else 1
+    times = _COMPILED if method.compiled else 1
     fitting = max(1, min(times * PIXELS, SAMPLES // capture.sizes["time"]))
     return int(getattr(settings, "batch", fitting))
 

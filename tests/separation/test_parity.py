@@ -1,4 +1,4 @@
-"""Compiled steps of two bands and the same steps on tensors: the same bits and values."""
+"""Compiled steps and the same steps on tensors: the same bits and values."""
 
 import sys
 from typing import Any
@@ -19,6 +19,7 @@ CASES: dict[str, dict[str, Any]] = {
     "nearly black": {"emissivity": (0.95, 0.88)},
     "metal": {"emissivity": (0.3, 0.15)},
     "three bands": {"emissivity": (0.86, 0.72, 0.8)},
+    "five bands": {"emissivity": (0.86, 0.72, 0.8, 0.78, 0.84), "pattern_std": ("band", [4.0] * 5)},
     "shutter event": {"segment": ("time", (TIME > 9.0).astype(int))},
     "pattern": {"pattern_std": ("band", [11.5, 2.3])},
     "linear": {"response_kind": "linear"},
@@ -40,8 +41,8 @@ def test_a_capture_on_a_device(case: str, device: str) -> None:
     """Bad, masked and saturated samples, rapid and constant objects, backgrounds at rest."""
     options = dict(CASES[case])
     emissivity = options.pop("emissivity", (0.86, 0.72))
-    names = ("8-14", "9.5", "10.6")[: len(emissivity)]
-    rig, rng = simulation.Rig(bands=names, noise=(0.03, 0.35, 0.15)[: len(names)]), 5
+    names = ("8-14", "9.5", "10.6", "12.1", "8.5")[: len(emissivity)]
+    rig, rng = simulation.Rig(bands=names, noise=(0.03, 0.35, 0.15, 0.2, 0.1)[: len(names)]), 5
     known = emissivity_of(*emissivity, bands=names)
     scene = simulation.walkers(TIME, (6, 8), known, np.random.default_rng(rng), crossings=4)
     warm = scene["object_temperature"]

@@ -13,12 +13,13 @@ from reproduction.experiments.pictures import Picture
 TIME = np.arange(300) / 10.0
 GLASS = emissivity_of(0.86, 0.72)
 RIG = simulation.Rig()
+FOUR = simulation.Rig(bands=("8-14", "9.5", "10.6", "12.1"), noise=(0.03, 0.35, 0.15, 0.2))
 RISES = {"6-20 s": (6.0, 20.0), "2-6 s": (2.0, 6.0), "0.5-2 s": (0.5, 2.0)}
 
 
-def heated(kind: str, rng: np.random.Generator) -> xr.Dataset:
+def heated(kind: str, rng: np.random.Generator, emissivity: xr.DataArray = GLASS) -> xr.Dataset:
     """Scene of walkers before an object of curves with kinks: (time, y, x) at random times."""
-    scene = Picture((32, 48)).draw(TIME, GLASS, rng)
+    scene = Picture((32, 48)).draw(TIME, emissivity, rng)
     rows, columns = np.indices((32, 48)) / 32.0
     since = TIME[:, None, None] - (4.0 + 16.0 * (1.0 - rows) + np.sin(5.0 * columns))
     constant = 0.3 + 2.0 * columns
@@ -34,9 +35,11 @@ def heated(kind: str, rng: np.random.Generator) -> xr.Dataset:
     return scene.assign(object_temperature=(warm.dims, 295.15 + curves[kind], warm.attrs))
 
 
-def assert_followed(name: str, scene: xr.Dataset, rng: np.random.Generator) -> None:
+def assert_followed(
+    name: str, scene: xr.Dataset, rng: np.random.Generator, rig: simulation.Rig = RIG
+) -> None:
     """Of the moving pixels 70 % have no flag; intervals hold in the rise and at the ends too."""
-    result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
+    result = separation.solve(simulation.observe(scene, rig.response(), rng), rig.response())
     moving = scene["background_temperature"].std("time") > 0.3
     good, truth = moving & (result["status"] == 0), scene["object_temperature"]
     error = abs(result["object_temperature"] - truth)
@@ -96,6 +99,13 @@ def test_an_object_that_heats_within_seconds_is_no_parallax(
     result = separation.separate(simulation.observe(scene, RIG.response(), rng), RIG.response())
     assert result.attrs["reflection_shift"] == "none"
     assert "warnings" not in result.attrs
+
+
+def test_a_kinked_rise_is_followed_in_four_bands() -> None:
+    """As of two bands, in the plane in which object and background change all four."""
+    rng = np.random.default_rng(1)
+    values = emissivity_of(0.86, 0.72, 0.8, 0.78, bands=FOUR.bands)
+    assert_followed("kink", heated("kink", rng, values), rng, FOUR)
 
 
 @pytest.mark.long

@@ -13,8 +13,7 @@ from dbthermal._compiled import kept
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._known_emissivity import AGREE
-from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels
+from dbthermal.separation._subspace import bars, kernels
 from dbthermal.separation._subspace.kernels import Table, allocating
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
 
@@ -248,10 +247,10 @@ def _object(
             break
     u, v = u + du * step, v + dv * step
     p = (t - table.middle) / table.half
-    # Eq. 6 by implicit differentiation, as in `emission`.
+    # Eq. 6 by implicit differentiation, as in `_subspace.bars`.
     sensitivity = (v + first * (u - v) - found[0, 0]) / steepness
     epsilon = w[1] ** 2 * maps[1]
-    through = sensitivity**2 * epsilon / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
+    through = sensitivity**2 * epsilon / (1.0 - bars.NORMAL95**2 * epsilon) ** 2
     smooth = variance / steepness**2
     patterned = camera.pattern[0] * w[0] / steepness, camera.pattern[1] * w[1] / steepness
     std = sqrt(through + smooth + patterned[0] ** 2 + patterned[1] ** 2)
@@ -336,7 +335,7 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
         pixel[i] = block.maps[i, y, x]
     k, noise = pixel[0], (camera.noise[0], camera.noise[1] * block.gain[y, x])
     first, last = pixel[2], pixel[3]
-    if np.isnan(first):  # of a constant object, as in `emission`
+    if np.isnan(first):  # of a constant object, as in `_subspace.pixel`
         largest = max(1.0, k)
         first = 0.5 * (1.0 + (largest - 1.0) / largest)
         last = 1.0 - k * (1.0 - first)

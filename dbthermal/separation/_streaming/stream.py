@@ -21,8 +21,8 @@ from dbthermal.separation._solve import require_workers
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
 from dbthermal.separation._streaming.kernels import Planes
+from dbthermal.separation._subspace.fused import FILMS
 from dbthermal.separation._subspace.method import METHOD
-from dbthermal.separation._subspace.steps import FILMS
 from dbthermal.separation._tiles import KEPT_ATTRS, Array
 
 if TYPE_CHECKING:

@@ -1,26 +1,30 @@
-"""Variances of the outputs of one pixel of two bands (eq. 8, 10), and if its residual is noise.
-
-Compiled; as in `emission` and `residuals`.
-"""
+"""Variances of the outputs of one pixel (eq. 8, 10), and if its residual is noise; compiled."""
 
 from math import log, sqrt
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from dbthermal._arrays import Array
-from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, regression, residuals
 from dbthermal.separation._subspace.kernels import inlined
-from dbthermal.separation._subspace.pixel import Line, Model, Ratio, Work, weights
+from dbthermal.separation._subspace.pixel import Line, Model, Ratio, Work, combined
+
+# The background counts as resting within so many standard deviations, in that share of frames.
+WITHIN: Final = 3.0
+RESTING: Final = 0.3
+# Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
+# and degrees of freedom lost: of the first three, one is along the object's curve.
+OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
+# Bound of a 95 % interval of the normal distribution.
+NORMAL95: Final = float(ndtri(0.975))
 
 
 class Bars(NamedTuple):
-    """Numbers of `emission.Emission`, of one pixel; its curves are in the work space."""
+    """Variances of one pixel; those over time are in the work space."""
 
-    covariance: tuple[float, float, float]  # of the emissivities
-    epsilon: float
-    level: float
+    epsilon: float  # of the error of the null combination's ratios [1]
     noise_variance: float
     drift_variance: float
     restless: bool
@@ -36,7 +40,7 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
 
 @inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
+    """Variance of the slope by a background that walks, and its bound; `tensors._walk`."""
     degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
     for t in range(kept.size):
@@ -47,8 +51,8 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
     for j in range(degrees):
         scale += curve[j] ** 2 / (j + 1.0) ** 2
         spectrum[j] -= curve[j] * product / energy
-    for octave in range(len(emissions.OCTAVES)):
-        low, high, lost = emissions.OCTAVES[octave]
+    for octave in range(len(OCTAVES)):
+        low, high, lost = OCTAVES[octave]
         walk, last = 0.0, min(high - 1, degrees)
         for j in range(low - 1, last):
             noise = model.noise[0] ** 2 / share + (curve_variance if j + 1 < count else 0.0)
@@ -62,7 +66,7 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 @inlined
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
-    """Variance of the slope by a linear drift, as `emission._linear_variance`."""
+    """Variance of the slope by a linear drift, as `tensors._linear`."""
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
     slope, level, _ = regression.moments(emitted, drift, weights)
@@ -73,7 +77,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
         size += part * residual[t]
     size /= length
     # Once more, with the weights of the residual less that drift.
-    inverse, kept = 1.0 / (residuals.TUNING * line.scale), work.variance
+    inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
     for t in range(frames):
         off = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
         inside = max(1.0 - off * off, 0.0)
@@ -87,43 +91,58 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     size /= length
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
-    variance = (variance + line.emissivity[0] ** 2 * curve) / length**2
+    variance = (variance + work.emissivity[0] ** 2 * curve) / length**2
     before = max((limit / model.spread) ** 2, size**2 + variance)
     share = before / (before + variance)
     return float(slope**2 * share * (share * size**2 + variance))
 
 
 @inlined
-def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: Work) -> bool:
-    """Variance of the object, and whether the background hardly rests; see `emission.estimate`."""
+def _propagate(model: Model, ratios: Ratio, epsilon: float, work: Work) -> bool:
+    r"""
+    Variance of the object, in place, and whether the background hardly rests.
+
+    By implicit differentiation of eq. 6, :math:`dx/d\epsilon = (dh/d\epsilon - dq/d\epsilon) / h'`
+    and :math:`var(x) = var(q) / h'^2`. The object is a ratio with an uncertain denominator: half
+    the width of its 95 % interval by Fieller's theorem (1954),
+    doi:10.1111/j.2517-6161.1954.tb00159.x
+    """
     count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
-    # Of eq. 6 by implicit differentiation, and what the residual of a frame of rest holds.
     sensitivity, smooth_variance, curve = work.sensitivity, work.smooth_variance, work.rapid
+    first, frames, total, factors = work.emissivity[0], work.first.size, 0.0, work.factors
     kernels.combined(model.object_part, model.spans, work.coefficients[0], count, curve)
-    resting, more, leverage = 0.0, 1.0 + log(work.first.size) / count, model.leverage
-    beside = 1.0 / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
-    one, two = weights(ratios, first)
-    inverse = 1.0 / two
-    for t in range(work.first.size):
+    # The error moves weight from the other bands to the first, by their share in its variance.
+    for m in range(1, factors.size):
+        error = model.noise[m] ** 2 + (work.ratio[m] * noise) ** 2
+        factors[m] = work.null_weights[m] ** 2 * error
+        total += factors[m]
+    emitted = work.at_object[0, :frames]
+    for t in range(frames):
+        sensitivity[t] = first * emitted[t] - curve[t]
+    for m in range(1, factors.size):
+        factor, emitted = (1.0 - first) * factors[m] / total, work.at_object[m, :frames]
+        for t in range(frames):
+            sensitivity[t] += factor * emitted[t]
+    # What the criterion for the order leaves of the object's curve is as large as the noise that
+    # one more function would have cost, log N times. The residual of a frame of rest holds both.
+    resting, more, leverage = 0.0, 1.0 + log(frames) / count, model.leverage
+    beside = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
+    for t in range(frames):
         flat = 1.0 / work.steepness[t]
-        # The second band's signal before the last step, of the value of h; see `emission._newton`.
-        other = (work.target[t] - work.lack[t] - one * work.emitted[t]) * inverse
-        partial = other + first * (work.emitted[t] - other)
-        sensitivity[t] = (partial - curve[t]) * flat
+        sensitivity[t] *= flat
         smooth_variance[t] = leverage[ratios.order - 1, t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
-        rests = work.residual[t] ** 2 < emissions.WITHIN**2 * expected
-        resting += 1.0 if rests else 0.0
+        resting += 1.0 if work.residual[t] ** 2 < WITHIN**2 * expected else 0.0
         work.variance[t] = square * beside + smooth_variance[t]
-    return resting < emissions.RESTING * work.first.size
+    return resting < RESTING * frames
 
 
 @inlined
-def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
-    """Variances of emissivities, object and background, as `emission.estimate`; in place."""
+def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -> Bars:
+    """Variances of emissivities, object and background, in place."""
     z, emitted, weights, kernel = work.first, work.emitted, work.weights, work.kernel
-    count, null, w = ratios.order + model.steps, ratios.null_variance, ratios.weights
+    count, null, w = ratios.order + model.steps, ratios.null_variance, work.null_weights
     # Kernel of the slope, sum k z; its variance, of the ordinate's noise and the abscissa's.
     total, product, reflected = 0.0, 0.0, 0.0
     for t in range(z.size):
@@ -132,7 +151,7 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
         reflected += z[t] - emitted[t]
     for t in range(z.size):
         kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
-    first = line.emissivity[0]
+    first = work.emissivity[0]
     noise_variance = line.variance
     noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
     walk, upper = _walk(model, first**2 * null, count, work)
@@ -140,92 +159,135 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
     linear = _linear(model, ratios, line, limit, work)
     drift_variance = (limit / kernels.range_of(emitted)) ** 2 + max(upper, linear)
     if line.known:
-        noise_variance, drift_variance = work.material[3], work.material[4]
-    # Of the ratio, through the background's level; see `emission._level_std`.
+        noise_variance, drift_variance = work.material[2], work.material[3]
+    # Rapid changes have the ratios k_m u_m'(y) / u_1'(y), and y is known as well as e_1, in the
+    # mean over time, dy = (u_1(y) - u_1(x)) de_1 / (1 - e_1); or as any temperature calibrated.
     level = abs(reflected / z.size) * sqrt(noise_variance + walk) / (1.0 - first) ** 2
     widest = (model.highest - model.lowest) / sqrt(12.0)
-    level = widest if np.isnan(level) else min(level, widest)
-    level *= ratios.ratio * model.rate
-    epsilon = ratios.inverse_energy * null + (w[1] * level) ** 2
-    restless = _propagate(model, ratios, epsilon, first, work)
-    _background(model, ratios, line, epsilon, noise_variance + drift_variance, work)
-    covariance = _covariance(model, ratios, first, noise_variance + drift_variance, level)
-    return Bars(covariance, epsilon, level, noise_variance, drift_variance, restless)
+    level, by_level = widest if np.isnan(level) else min(level, widest), 0.0
+    for m in range(w.size):
+        work.level[m] = level * work.ratio[m] * model.rates[m]
+        by_level += w[m] * work.level[m]
+    epsilon = ratios.inverse_energy * null + by_level**2
+    restless = _propagate(model, ratios, epsilon, work)
+    _background(model, ratios, epsilon, noise_variance + drift_variance, work)
+    _covariance(model, ratios, noise_variance + drift_variance, by_level, work, covariance)
+    return Bars(epsilon, noise_variance, drift_variance, restless)
 
 
 @inlined
 def _covariance(
-    model: Model, ratios: Ratio, first: float, slope_variance: float, level: float
-) -> tuple[float, float, float]:
-    """Covariance of the emissivities (eq. 8), as `emission._emissivity_covariance`."""
-    k, w, energy = ratios.ratio, ratios.weights, ratios.inverse_energy
-    one, two, reflectivity = model.noise[0] ** 2, model.noise[1] ** 2, 1.0 - first
-    with_epsilon = two * w[1] - k * one * w[0]
-    variance = energy * (two + k**2 * one)
-    through, cross = (first * reflectivity) ** 2 * ratios.null_variance, first * reflectivity**2
-    a = slope_variance + through * energy
-    b = k * slope_variance + (k * through + cross * with_epsilon) * energy
-    d = k**2 * (slope_variance + through * energy) + 2.0 * cross * k * with_epsilon * energy
-    d += reflectivity**2 * variance
-    by_level = reflectivity * first * w[1] * level, reflectivity * (k * first * w[1] + 1.0) * level
-    return a + by_level[0] ** 2, b + by_level[0] * by_level[1], d + by_level[1] ** 2
+    model: Model, ratios: Ratio, slope_variance: float, by_level: float, work: Work, covariance: Any
+) -> None:
+    r"""
+    Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
+
+    :math:`\delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o` and
+    :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`.
+    """
+    first, k, w, energy = work.emissivity[0], work.ratio, work.null_weights, ratios.inverse_energy
+    reflectivity, square = 1.0 - first, model.noise[0] ** 2
+    through = slope_variance + (first * reflectivity) ** 2 * ratios.null_variance * energy
+    cross = first * reflectivity**2 * energy
+    for m in range(k.size):
+        # Of kappa_m with epsilon, over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
+        one = model.noise[m] ** 2 * w[m] - k[m] * square * w[0] if m > 0 else 0.0
+        for n in range(m + 1):
+            two = model.noise[n] ** 2 * w[n] - k[n] * square * w[0] if n > 0 else 0.0
+            value = k[m] * k[n] * through + cross * (k[m] * two + k[n] * one)
+            # Of the ratios with one another, kappa_m kappa_n s_1^2, and their variances (eq. 4).
+            between = k[m] * k[n] * square if n > 0 else 0.0
+            between += model.noise[m] ** 2 if m == n and n > 0 else 0.0
+            # Through the background's level, -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
+            levels = (
+                k[m] * first * by_level + work.level[m],
+                k[n] * first * by_level + work.level[n],
+            )
+            value += reflectivity**2 * (between * energy + levels[0] * levels[1])
+            covariance[m, n] = covariance[n, m] = value
 
 
 @inlined
-def _background(
-    model: Model, ratios: Ratio, line: Line, epsilon: float, slope: float, work: Work
-) -> None:
-    """Variance of the background (eq. 10), and of both by a pattern, in place."""
-    noise, pattern, w = model.noise, model.pattern, ratios.weights
-    first, last = line.emissivity
-    one, two = ((1.0 - first) / noise[0]) ** 2, ((1.0 - last) / noise[1]) ** 2
-    precision = one + two
-    one, two = one / precision, two / precision
-    share = one * first / (1.0 - first) + two * last / (1.0 - last)
+def _background(model: Model, ratios: Ratio, epsilon: float, slope: float, work: Work) -> None:
+    r"""
+    Variance of the background (eq. 10), in place.
+
+    .. math:: \delta y = (y - x) \left( s_1 \delta v_1 - e_1 \epsilon
+              + \frac{\delta o}{1 - e_1} \right) - r \, \delta x
+
+    where r is the weighted mean of :math:`e_m / (1 - e_m)` and :math:`v = \kappa / s`.
+    """
+    noise, share, variance = model.noise, work.share, work.background_variance
+    first, total, object_share, length = work.emissivity[0], 0.0, 0.0, 0.0
+    for m in range(noise.size):
+        total += ((1.0 - work.emissivity[m]) / noise[m]) ** 2
+        object_share += share[m] * work.emissivity[m] / (1.0 - work.emissivity[m])
+        length += (work.ratio[m] / noise[m]) ** 2
     # Through epsilon, (y - x) e_1 + r dx/deps; its covariance with v_1, w_1 s_1^2 sigma^2; and the
     # variance of s_1 v_1, (s_1^2 - 1 / |v|^2) sigma^2.
-    covariance = 2.0 * noise[0] ** 2 * w[0] * ratios.inverse_energy
-    of_first = noise[0] ** 2 - 1.0 / (1.0 / noise[0] ** 2 + (ratios.ratio / noise[1]) ** 2)
-    steady = of_first * ratios.inverse_energy + slope / (1.0 - first) ** 2
-    variance = work.background_variance
+    covariance = 2.0 * noise[0] ** 2 * work.null_weights[0] * ratios.inverse_energy
+    steady = (noise[0] ** 2 - 1.0 / length) * ratios.inverse_energy + slope / (1.0 - first) ** 2
     for t in range(variance.size):
-        curvature = one * work.back_slope[t] ** 2 + two * work.other_back_slope[t] ** 2
         contrast = work.background[t] - work.temperature[t]
-        through = contrast * first + share * work.sensitivity[t]
-        value = 1.0 / (precision * curvature) + share**2 * work.smooth_variance[t]
+        through = contrast * first + object_share * work.sensitivity[t]
+        value = 1.0 / (total * work.curvature[t]) + object_share**2 * work.smooth_variance[t]
         value += through * (through * epsilon - contrast * covariance)
         variance[t] = value + contrast**2 * steady
-    if pattern[0] > 0.0 or pattern[1] > 0.0:
-        direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
-        kernels.blackbody(model.first, work.background, work.mean, work.spare)
-        kernels.blackbody(model.first, work.temperature, work.mean, work.kernel)
-        kernels.blackbody(model.second, work.temperature, work.mean, work.lack)
-        for t in range(variance.size):
-            slope0, slope1 = work.kernel[t], work.lack[t]
-            steepness = w[0] * first * slope0 + w[1] * last * slope1
-            through = direct0 * first * slope0 + direct1 * last * slope1
-            a, b = w[0] / steepness, w[1] / steepness
-            work.variance[t] += (pattern[0] * a) ** 2 + (pattern[1] * b) ** 2
-            value = (pattern[0] * (direct0 - through * a)) ** 2
-            value += (pattern[1] * (direct1 - through * b)) ** 2
-            variance[t] += value / work.spare[t] ** 2
+    patterned = 0.0
+    for m in range(noise.size):
+        patterned += model.pattern[m]
+    if patterned > 0.0:
+        _pattern(model, work)
+
+
+@inlined
+def _pattern(model: Model, work: Work) -> None:
+    r"""
+    Variance of object and background by a residual fixed pattern, added in place.
+
+    An offset :math:`\delta_m` of each band, constant in time, is no slope and no rapid change: the
+    emissivities are free of it. With the shares g of the bands in the background,
+
+    .. math:: \delta x = \frac{1}{h'} \sum w_m \delta_m, \quad
+              u' \delta y = \sum g_m \frac{\delta_m - e_m u_m' \delta x}{1 - e_m}
+    """
+    steepness, through, slope = work.kernel, work.lack, work.spare
+    kernels.fill(steepness, 0.0)
+    kernels.fill(through, 0.0)
+    for m in range(work.share.size):
+        table, e = kernels.response(model.tables, m), work.emissivity[m]
+        kernels.blackbody(table, work.temperature, work.mean, slope)
+        direct = work.share[m] * e / (1.0 - e)
+        for t in range(slope.size):
+            steepness[t] += work.null_weights[m] * e * slope[t]
+            through[t] += direct * slope[t]
+    kernels.blackbody(kernels.response(model.tables, 0), work.background, work.mean, slope)
+    for m in range(work.share.size):
+        direct, square = work.share[m] / (1.0 - work.emissivity[m]), model.pattern[m] ** 2
+        for t in range(slope.size):
+            part = work.null_weights[m] / steepness[t]
+            work.variance[t] += square * part**2
+            off = (direct - through[t] * part) / slope[t]
+            work.background_variance[t] += square * off**2
 
 
 @inlined
 def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
-    count, w = ratios.order + model.steps, ratios.weights
+    count, w, frames = ratios.order + model.steps, work.null_weights, work.first.size
     if model.stepless:  # the smooth curves of the object are those of the signals
         kernels.copy(work.target, residual)
     else:
-        for j in range(count):
-            work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
+        combined(w, coefficients, count, work.columns)
         kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
         kernels.combined(model.functions, model.spans, work.columns, count, residual)
-    for t in range(rapid.size):
-        rapid[t] = work.first[t] - rapid[t]
-        residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
+    for t in range(frames):
+        rapid[t], residual[t] = work.first[t] - rapid[t], -residual[t]
+    for m in range(w.size):
+        weight, signal = w[m], work.straight[m, :frames]
+        for t in range(frames):
+            residual[t] += weight * signal[t]
     record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
     for block in range(model.parts.size - 1):
         one, other = 0.0, 0.0
@@ -238,7 +300,7 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
 
 @inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
-    """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
+    """Autocorrelation, delay of the bands, and whether the residual is noise; see `tensors`."""
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
@@ -246,7 +308,7 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
     for lag in range(1, residuals.LAGS + 1):
         lagged += kernels.dot(residual[lag:], residual[: frames - lag])
     correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
-    common = ratios.weights[0] * noise**2
+    common = work.null_weights[0] * noise**2
     free = (frames - ratios.order - model.steps) * common
     # A matched filter with the differences between frames, of a band that is late or early.
     late, early, changes = free, -free, 0.0
@@ -276,7 +338,7 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 
 @inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
-    """As `residuals.unexplained`."""
+    """As `tensors._unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
     sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
     products, squares = work.kernel, work.mean

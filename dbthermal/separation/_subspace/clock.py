@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._subspace import pieces, reflection_ratio
 from dbthermal.separation._tiles import Array, Whole
 
 # Gain of the information criterion by the numbers of the frames, in units of a function's cost:
@@ -26,13 +26,15 @@ def check(signals: Array, time: Array, noise: Array, segment: Whole | None) -> N
     axis is compared, pixel by pixel, by :math:`N \ln(E_{time} / E_{number})`. Where it is as large
     in both, the object does not change smoothly, or its changes are too small to tell.
     """
-    frames = time.size
+    frames, white = time.size, pieces.plane(signals, noise)[0]
+    any_axis = np.full((2, white.shape[2]), np.nan)
     order = min(reflection_ratio.HIGHEST_ORDER, frames // 4)
     chi2 = []
     for clock in (time, np.arange(frames, dtype=np.float64)):
         functions = smooth.subspace(clock, order, segment=segment)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            chi2.append(reflection_ratio.estimate(signals, functions, noise).reduced_chi2)
+            energy, used = pieces.null_energy(white, functions, any_axis)
+            chi2.append(energy / (frames - used))
     good = (chi2[0] > 0) & (chi2[1] > 0)
     if not np.any(good):
         return

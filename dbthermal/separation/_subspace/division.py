@@ -1,9 +1,21 @@
-"""Divisions of the time into pieces, of one pixel of two bands after another, compiled.
+r"""Divisions of the time into pieces, of one pixel after another, compiled.
 
-The equations and choices of `pieces.divide`. In two bands the part of a signal across an axis v is
-one number, along the normal n: of a scatter the energy :math:`n^T S n`.
+The object's curve is a polynomial in each piece, and free from one piece to the next. Any division
+of the capture by repeated halving may be chosen; it is the one with the least description length
+
+.. math:: L(v) = \sum_i \left[ \mathrm{tr} \, S_i - v^T S_i v \right] + c \, n \qquad (12)
+
+of the n pieces i, with the scatter :math:`S_i` (eq. 3) of the signals in their plane, see
+`pieces.plane`, outside the piece's polynomials: the energy across the background's axis v
+in units of the noise, and a cost of each piece. In a plane the part across an axis is one number,
+along its normal n: the energy is :math:`n^T S n`. Given the division, the axis is the principal one
+of the sum of the scatters; given the axis, the best of all divisions is found from the shortest
+pieces upwards (Donoho 1997, CART and best basis, doi:10.1214/aos/1069362377). Alternated from many
+axes, this tells the rapid changes of the object, which lie along another line, from those of the
+background: of two lines that explain the data the object's is the one with fewer pieces.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from math import acos, sqrt
 from typing import Final, NamedTuple
@@ -38,7 +50,7 @@ class Tree(NamedTuple):
 class Scratch(NamedTuple):
     """Work space of one pixel."""
 
-    white: Array  # whitened signals of some pixels (pixel, 2, time)
+    white: Array  # signals of some pixels (pixel, 2, time)
     across: Array  # (time)
     products: Array  # with all functions of the pieces (2, product)
     energy: Array  # first, mixed and last element of the scatter of each piece (3, piece)
@@ -58,13 +70,29 @@ class Scratch(NamedTuple):
     begins: Mask  # (division, time)
 
 
-def divide(
-    signals: Array, time: Array, noise: Array, segment: Whole | None, known: Array | None = None
-) -> list[pieces.Division]:
-    """As `pieces.divide`, of two bands."""
+@dataclass(frozen=True)
+class Division:
+    """Division of the time of each pixel into pieces, and what it costs."""
+
+    first: Mask  # whether a piece begins with a frame (time, pixel)
+    cost: Array  # eq. 12 (pixel); infinite for none
+
+    @property
+    def functions(self) -> Whole:
+        """Number of functions by which the division is chosen (pixel)."""
+        return pieces.FUNCTIONS * self.first.sum(axis=0)
+
+
+def divide(white: Array, time: Array, segment: Whole | None, known: Array) -> list[Division]:
+    """
+    Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
+
+    The second one is that of the other line, if there is one, and costs more. The axis of a
+    material may be `known` (2, pixel), NaN for others.
+    """
     tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
-    frames, pixels = signals.shape[1:]
-    count, axes = len(tree.edges), len(tree.starts) + (known is not None)
+    frames, pixels = white.shape[1:]
+    count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(known).any())
     scratch = Scratch(
         white=np.empty((max(_BLOCK, _TURNED // frames), 2, frames)),
         across=np.empty(frames),
@@ -85,10 +113,9 @@ def divide(
         costs=np.empty(pieces.AXES),
         begins=np.empty((pieces.AXES, frames), dtype=bool),
     )
-    ratio = np.full(pixels, np.nan) if known is None else np.ascontiguousarray(known[1])
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
-    _divide(tree, np.ascontiguousarray(signals), noise, ratio, scratch, first, cost)
-    return [pieces.Division(*one) for one in zip(first.mT, cost, strict=True)]
+    _divide(tree, np.ascontiguousarray(white), np.ascontiguousarray(known), scratch, first, cost)
+    return [Division(*one) for one in zip(first.mT, cost, strict=True)]
 
 
 def _joining(most: int, event: Mask) -> joining.Scratch:
@@ -117,7 +144,7 @@ def _joining(most: int, event: Mask) -> joining.Scratch:
 
 @lru_cache(maxsize=4)
 def _packed(times: bytes, events: bytes | None) -> Tree:
-    levels, time = pieces.tree(times, events)[1], np.frombuffer(times)
+    levels, time = pieces.tree(times, events), np.frombuffer(times)
     every = [piece for level in levels for piece in level]
     bases = [basis for _, basis, _ in every]
     values = [_functions(bases, i) for i in range(len(bases))]
@@ -168,7 +195,7 @@ def _axis(a: float, b: float, d: float) -> tuple[float, float, float]:
 
 @compiled
 def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
-    """Scatter of each piece of whitened signals (2, time), in place.
+    """Scatter of each piece of signals (2, time), in place.
 
     From the shortest upwards: energies and products follow from those of a piece's halves.
     """
@@ -290,7 +317,7 @@ def _refine(
 
 
 @compiled
-def _pixel(tree: Tree, scratch: Scratch, white: Array, ratio: float, begins: Mask) -> None:
+def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask) -> None:
     """Divisions by four axes, and their costs, in place; infinite for none."""
     axes, costs, taken, across = scratch.axes, scratch.costs, scratch.taken, scratch.across
     _scatters(tree, scratch, white)
@@ -298,10 +325,9 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, ratio: float, begins: Mas
         a, b, d = scratch.scatter[:, tree.starts[i]]
         axes[0, i], axes[1, i], _ = _axis(a, b, d)
     if axes.shape[1] > len(tree.starts):
-        length = sqrt(1.0 + ratio * ratio)
-        known = not np.isnan(ratio)
-        axes[0, -1] = 1.0 / length if known else axes[0, 0]
-        axes[1, -1] = ratio / length if known else axes[1, 0]
+        known = not np.isnan(axis[0])
+        axes[0, -1] = axis[0] if known else axes[0, 0]
+        axes[1, -1] = axis[1] if known else axes[1, 0]
     _best(tree, scratch)
     kernels.copy(scratch.least[0], scratch.starting)
     apart = 0.0
@@ -334,32 +360,20 @@ def _near(axis: Array, taken: Array, count: int, apart: float) -> bool:
     return near
 
 
-@compiled
-def _turn(signals: Array, noise: Array, white: Array) -> None:
-    """Whitened signals (band, time, pixel) of a few pixels as (pixel, band, time), in place."""
-    for band in range(2):
-        for t in range(signals.shape[1]):
-            for p in range(signals.shape[2]):
-                white[p, band, t] = signals[band, t, p] / noise[band]
-
-
 @kernels.entered
 def _divide(
-    tree: Tree,
-    signals: Array,
-    noise: Array,
-    ratio: Array,
-    scratch: Scratch,
-    first: Mask,
-    cost: Array,
+    tree: Tree, white: Array, known: Array, scratch: Scratch, first: Mask, cost: Array
 ) -> None:
     """Divisions of all pixels of a tile."""
     begins, block = scratch.begins, len(scratch.white)
-    for start in range(0, signals.shape[2], block):
-        _turn(signals[:, :, start : start + block], noise, scratch.white)
-        for p in range(start, min(start + block, signals.shape[2])):
-            white = scratch.white[p - start]
-            _pixel(tree, scratch, white, ratio[p] * noise[0] / noise[1], begins)
+    for start in range(0, white.shape[2], block):
+        together = white[:, :, start : start + block]
+        for axis in range(2):
+            for t in range(together.shape[1]):
+                for p in range(together.shape[2]):
+                    scratch.white[p, axis, t] = together[axis, t, p]
+        for p in range(start, min(start + block, white.shape[2])):
+            _pixel(tree, scratch, scratch.white[p - start], known[:, p], begins)
             for rank in range(2):
                 best = 0
                 for number in range(1, pieces.AXES):

@@ -1,26 +1,22 @@
-r"""Steps 1 to 4 of `method` for two bands, one pixel after another, compiled.
-
-The equations of `steps`, whose results are repeated within rounding.
-"""
+"""Steps 1 to 4 of `method`, one pixel after another, compiled; `tensors` has them for a device."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
 from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
-from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Ratio, Work
-from dbthermal.separation._subspace.steps import FILMS, Solution
-from dbthermal.separation._tiles import Tile, Whole
+from dbthermal.separation._tiles import Mask, Pixels, Tile, Whole
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
@@ -29,6 +25,49 @@ _VECTOR: Final = 64  # numbers that a loop takes at once, at most
 _PAGE, _APART = 512, 24  # numbers of a page, and of three lines of the cache
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
+
+FILMS: Final = (
+    *("object_temperature", "object_temperature_std"),
+    *("background_temperature", "background_temperature_std"),
+)
+"""Names of the films of a solution."""
+
+
+@dataclass(frozen=True)
+class Solution(Pixels):
+    """Object, background, ratios and emissivities of each pixel, and statistics of the fit."""
+
+    object_temperature: Array  # (time, pixel) [K]; NaN where its deviation is of no use
+    object_temperature_std: Array
+    background_temperature: Array  # (time, pixel) [K]
+    background_temperature_std: Array
+    missing: Array  # samples without a number (2, pixel), of object and background
+    lost: Array  # samples without a number or a deviation of use (2, pixel)
+    beyond: Mask  # temperatures outside the calibrated range (2, pixel)
+    ratio: Array  # kappa: rapid change of each band over that of the first (band, pixel) [1]
+    ratio_variance: Array  # (band, pixel) [1], with that through the background's level
+    inverse_energy: Array  # see `pixel.Ratio` (pixel)
+    null_weights: Array  # w of eq. 5: no background, all of the object (band, pixel) [1]
+    null_variance: Array
+    order: Whole
+    freedom: Whole  # frames less the functions used (pixel)
+    contrast: Array
+    reduced_chi2: Array
+    pooled: Mask
+    scatter: Array  # noise-whitened, of rapid changes, less noise (band, band, pixel) [1]
+    rapid_scatter: Array  # the same at the `rapid_orders` (2, band, band, pixel) [1]
+    emissivity: Array  # (band, pixel) [1]
+    emissivity_covariance: Array  # (band, band, pixel) [1]
+    epsilon_variance: Array  # of the error of the null combination's ratios (pixel) [1]
+    noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
+    drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
+    constant: Mask  # the object changes too little for its emissivity (pixel)
+    restless: Mask  # the background hardly rests (pixel)
+    gray: Mask  # the signals as they are may be those of a gray body (pixel)
+    correlation: Array  # of the null residual (pixel)
+    delay: Array  # of the bands (pixel)
+    unexplained: Mask  # the residual is not noise (pixel)
+    sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
 
 @inlined
@@ -51,25 +90,20 @@ def _film(
     return lost, missing, beyond > zero
 
 
-_FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
-    np.float64: {
-        **dict.fromkeys(["inverse_energy", "null_variance", "contrast", "reduced_chi2"], ()),
-        **dict.fromkeys(["epsilon_variance", "noise_variance", "drift_variance"], ()),
-        **dict.fromkeys(["correlation", "delay", "cost"], ()),
-        **dict.fromkeys(["ratio", "ratio_variance", "null_weights", "emissivity"], (2,)),
-        **dict.fromkeys(["missing", "lost"], (2,)),
-        **dict.fromkeys(["scatter", "emissivity_covariance"], (2, 2)),
-        "rapid_scatter": (2, 2, 2),
-    },
-    np.bool_: {
-        **dict.fromkeys(["pooled", "gray", "constant", "restless", "unexplained"], ()),
-    },
-    np.intp: {"order": (), "beyond": (2,)},  # no arrays of truth values in a record
-}
-RECORD: Final = np.dtype(
-    [(name, kind, shape) for kind, shapes in _FIELDS.items() for name, shape in shapes.items()]
+_NUMBERS: Final = (
+    *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "epsilon_variance"),
+    *("noise_variance", "drift_variance", "correlation", "delay"),
 )
-"""Numbers of a pixel, the fields of a `Solution` without films and sums."""
+RECORD: Final = np.dtype(
+    [
+        *((name, np.float64) for name in _NUMBERS),
+        *((name, np.bool_) for name in ("pooled", "gray", "constant", "restless", "unexplained")),
+        *((name, np.float64, 2) for name in ("missing", "lost")),
+        *[("order", np.intp), ("beyond", np.intp, 2)],  # no arrays of truth values in a record
+    ]
+)
+"""Numbers of a pixel, the fields of a `Solution` without films, sums, and those of the bands."""
+_VECTORS: Final = ("ratio", "ratio_variance", "null_weights", "emissivity")
 
 
 class Solved(NamedTuple):
@@ -77,6 +111,8 @@ class Solved(NamedTuple):
 
     films: npt.NDArray[np.float32]  # object, deviation, background, deviation (4, time, pixel) [K]
     record: Any  # `RECORD` (pixel)
+    vectors: Array  # `_VECTORS` (pixel, 4, band)
+    matrices: Array  # scatter, two rapid scatters, covariance (pixel, 4, band, band)
     sums: Array  # (2, block, pixel) [K]
 
 
@@ -92,71 +128,70 @@ def _energy(bend: Array, removed: Array) -> float:
 
 
 @inlined
-def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums: Array) -> None:
+def _pixel(
+    model: Model, least: float, work: Work, films: Any, record: Any, vectors: Any, matrices: Any
+) -> Any:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
-    kernels.copy(work.second, work.straight)
-    kernels.fill(work.removed, 0.0)
-    gray, again = False, 0
+    frames, bands = work.first.size, model.noise.size
+    for m in range(bands):
+        kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
+        kernels.fill(work.removed[m, :frames], 0.0)
+    gray, again, bent = False, 0, True
     while True:
         ratios = pixel.ratios(model, work)
         line = pixel.emission(model, ratios, work, again)
-        pixel.background(model, line, work)
+        pixel.background(model, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
         if again == 0:
-            gray, used = pixel.may_be_gray(model, ratios), ratios.order + model.steps
-            free = work.bend.size - used
-            record.cost = ratios.reduced_chi2 * free + pieces.COST * used  # eq. 12
-        energy = _energy(work.bend, work.removed)
-        if again == emissions.BENDS or not energy > (least * model.noise[1]) ** 2:
+            gray = pixel.may_be_gray(model, ratios, work)
+        bent = False
+        for m in range(1, bands):
+            energy = _energy(work.bend[m, :frames], work.removed[m, :frames])
+            bent |= energy > (least * model.noise[m]) ** 2
+        if again == pixel.BENDS or not bent:
             break
-        least, again = emissions.BEND, again + 1
-        for t in range(work.bend.size):
-            work.removed[t] = work.bend[t]
-            work.straight[t] = work.second[t] - work.bend[t]
-    deviations = bars.bars(model, ratios, line, work)
-    bars.judge(model, ratios, work, record, sums)
+        least, again = pixel.BEND, again + 1
+        for m in range(1, bands):
+            bend, straight = work.bend[m, :frames], work.straight[m, :frames]
+            signal, removed = work.signals[m, :frames], work.removed[m, :frames]
+            for t in range(frames):
+                removed[t] = bend[t]
+                straight[t] = signal[t] - bend[t]
+    deviations = bars.bars(model, ratios, line, work, matrices[3])
+    _write(model, ratios, work, record, vectors, matrices)
     object_ = _film(work.temperature, work.variance, model, films[0], films[1])
     background = _film(work.background, work.background_variance, model, films[2], films[3])
     for i, judged in enumerate((object_, background)):
         record.lost[i], record.missing[i], record.beyond[i] = judged
-    _write_ratio(model, ratios, deviations.level, record)
-    _write_scatter(model, ratios, work.scatter, record)
     record.gray, record.constant, record.restless = gray, line.constant, deviations.restless
     record.epsilon_variance = deviations.epsilon
     record.noise_variance = deviations.noise_variance
     record.drift_variance = deviations.drift_variance
-    record.emissivity[0], record.emissivity[1] = line.emissivity
-    _write_symmetric(deviations.covariance, record.emissivity_covariance)
+    return ratios
 
 
 @inlined
-def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None:
-    record.ratio[0], record.ratio[1] = 1.0, ratios.ratio
-    error = model.noise[1] ** 2 + (ratios.ratio * model.noise[0]) ** 2  # eq. 4
-    record.ratio_variance[1] = ratios.inverse_energy * error + level**2
+def _write(
+    model: Model, ratios: Ratio, work: Work, record: Any, vectors: Any, matrices: Any
+) -> None:
+    """Ratios, emissivities, and scatter less noise, at the pixel's order and at `rapid_orders`."""
+    noise, orders = model.noise, len(work.scatter)
+    rows = model.functions.shape[1] - model.steps
+    for m in range(noise.size):
+        vectors[0, m], vectors[2, m] = work.ratio[m], work.null_weights[m]
+        vectors[3, m] = work.emissivity[m]
+        error = noise[m] ** 2 + (work.ratio[m] * noise[0]) ** 2 if m > 0 else 0.0  # eq. 4
+        vectors[1, m] = ratios.inverse_energy * error + work.level[m] ** 2 if m > 0 else 0.0
+    for place in range(3):
+        order = ratios.order
+        if place > 0:
+            order = max(1, orders - reflection_ratio.FEWER * (2 - place))
+        for m in range(noise.size):
+            kernels.copy(work.scatter[order - 1, m], matrices[place, m])
+            matrices[place, m, m] -= rows - order
     record.inverse_energy, record.null_variance = ratios.inverse_energy, ratios.null_variance
-    record.null_weights[0], record.null_weights[1] = ratios.weights
     record.order, record.pooled = ratios.order, ratios.pooled
     record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
-
-
-@inlined
-def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> None:
-    """Scatter less noise, at the order of the pixel and at `reflection_ratio.rapid_orders`."""
-    _write_symmetric(ratios.scatter, record.scatter)
-    orders, rows = len(scatter), model.functions.shape[1] - model.steps
-    for place in range(2):
-        order = max(1, orders - reflection_ratio.FEWER * (1 - place))
-        a, b, d = scatter[order - 1]
-        free = rows - order
-        _write_symmetric((a - free, b, d - free), record.rapid_scatter[place])
-
-
-@inlined
-def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
-    """First, mixed and last element of a symmetric matrix, in place."""
-    matrix[0, 0], matrix[0, 1], matrix[1, 0] = elements[0], elements[1], elements[1]
-    matrix[1, 1] = elements[2]
 
 
 @inlined
@@ -197,38 +232,38 @@ def _separate(
         _turn(signals, together, inside)
         for p in range(together.size):
             here = np.uintp(together[p])
-            kernels.copy(inside[p, 0], work.first)
-            kernels.copy(inside[p, 1], work.second)
+            for m in range(model.noise.size):
+                kernels.copy(inside[p, m], work.signals[m])
             kernels.copy(materials[here], work.material)
-            _pixel(model, least, work, outside[p], solved.record[here], solved.sums[..., here])
+            record, vectors = solved.record[here], solved.vectors[here]
+            ratios = _pixel(model, least, work, outside[p], record, vectors, solved.matrices[here])
+            bars.judge(model, ratios, work, record, solved.sums[..., here])
         _return(outside, together, solved.films)
 
 
-def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
-    """All that the pixels of a tile of two bands share."""
-    first, second = tile.curves
-    rate, gray = _ratios(first, second)
+def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
+    """All that the pixels of a tile share."""
+    curve, others = tile.curves[0], len(tile.noise) - 1
     degrees = functions.rising.shape[1]
-    freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
+    freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in bars.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
+    chances = reflection_ratio.CHANCE, reflection_ratio.GRAY_CHANCE
     return Model(
-        first=kernels.table(first, second),
-        second=kernels.table(second, first),
+        **_responses(tile.curves),
         **_columns(functions),
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        noise=(float(tile.noise[0]), float(tile.noise[1])),
-        pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
+        noise=np.array(tile.noise),
+        pattern=np.array(tile.pattern or np.zeros(others + 1)),
         drift=drift / np.sqrt(3.0),
-        rate=rate,
-        gray=gray,
-        widened=(stdtrit(np.maximum(freedom, 1), 0.975) / emissions.NORMAL95) ** 2,
+        chances=(float(chdtri(others, chances[0])), float(chdtri(others, chances[1]))),
+        widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
         edges=edges,
         limits=limits,
         parts=pieces.blocks(tile.time.size),
-        lowest=first.lowest,
-        highest=first.highest,
+        lowest=curve.lowest,
+        highest=curve.highest,
     )
 
 
@@ -249,34 +284,54 @@ def _columns(functions: smooth.Subspace) -> dict[str, Any]:
 
 
 @lru_cache
-def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
-    """Relative rate of the ratio of the slopes at the reference [1/K], and some of the ratios."""
+def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
+    """Fields of a `Model` that hold the responses."""
+    first = curves[0]
     around = first.reference + np.array([-0.5, 0.5])  # [K]
-    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
     temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
-    return float(rates[0]), second.slope(temperatures) / first.slope(temperatures)
+    rates = [np.diff(np.log(one.slope(around) / first.slope(around)))[0] for one in curves]
+    ratios = [one.slope(temperatures) / first.slope(temperatures) for one in curves]
+    return {
+        "tables": kernels.rows(curves),
+        "rates": np.array(rates),
+        "gray": np.stack(ratios, axis=1),
+    }
 
 
-def _work_space(frames: int, degrees: int) -> dict[str, Any]:
+def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
     # Places of one frame that lie a multiple of a page apart would drive each other from the cache.
     apart = -(-frames // _PAGE) * _PAGE + _APART
-    curves = dict(zip(Work._fields, np.empty((len(Work._fields), apart))[:, :frames], strict=True))
-    block = max(_BLOCK, _TURNED // frames)
-    return curves | {
+    names = Work._fields
+    together, banded = names[1 : names.index("signals")], names[names.index("signals") :][:6]
+    vectors = names[names.index("axis") : names.index("material")]
+    block, size = max(_BLOCK, _TURNED // frames), len(together)
+    space = np.empty((size + len(banded) * bands, apart))
+    rows = space[size:].reshape(len(banded), bands, apart)
+    return {
+        "first": rows[0, 0, :frames],  # of the signals
+        **dict(zip(together, space[:size, :frames], strict=True)),
+        **dict(zip(banded, rows, strict=True)),
+        **dict(zip(vectors, np.empty((len(vectors), bands)), strict=True)),
         # Whole vectors of infinite values behind the last frame: a rank is of those before.
         "few": np.full((5, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
         "spectra": np.empty((2, degrees)),
-        "material": np.empty(6),
-        "inside": np.empty((block, 2, frames)),
+        "turned": np.empty((bands, bands)),
+        "turns": np.empty((bands, bands)),
+        "material": np.empty(5 + bands),
+        "inside": np.empty((block, bands, frames)),
         "outside": np.empty((block, 4, frames), np.float32),
     }
 
 
 def solve(
-    tile: Tile, functions: smooth.Subspace, drift: float, least: float = emissions.BEND
+    tile: Tile, functions: smooth.Subspace, drift: float, least: float = pixel.BEND
 ) -> Solution:
-    """As `steps.solve`, of two bands."""
+    """
+    Steps 1 to 4, where it matters again on signals with proportional reflections.
+
+    With the limit of the background's `drift` [K], and the `least` bend that matters.
+    """
     every = np.arange(tile.signals.shape[2])
     return solve_parts(tile, functions, [(every, functions)], drift, least)
 
@@ -286,36 +341,43 @@ def solve_parts(
     functions: smooth.Subspace,
     parts: Iterable[tuple[Whole, smooth.Subspace]],
     drift: float,
-    least: float = emissions.BEND,
+    least: float = pixel.BEND,
 ) -> Solution:
     """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
 
     One part after another is taken: of a long capture the functions of all would be much memory.
     """
-    shared, material = _share(tile, functions, drift), tile.material
-    frames, pixels = tile.signals.shape[1:]
-    materials = np.full((pixels, 6), np.nan)
+    shared, material = share(tile, functions, drift), tile.material
+    bands, frames, pixels = tile.signals.shape
+    materials = np.full((pixels, 5 + bands), np.nan)
     if material is not None:
-        numbers = (material.ratio[1], material.inverse_energy, material.emissivity)
+        numbers = (material.inverse_energy, material.emissivity)
         rest = (material.noise_variance, material.drift_variance, material.spread)
-        materials[:] = np.stack([*numbers, *rest], 1)
+        materials[:] = np.stack([*numbers, *rest, *material.ratio], 1)
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
+    vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
-    solved, freedom = Solved(films, record, sums), np.empty(pixels, np.intp)
-    space = _work_space(frames, len(shared.rising))
+    solved = Solved(films, record, vectors, matrices, sums)
+    freedom, space = np.empty(pixels, np.intp), _work_space(frames, bands, len(shared.rising))
     for places, own in parts:
         model, count = shared._replace(**_columns(own)), own.functions.shape[1]
-        space["coefficients"], space["columns"] = np.empty((2, count)), np.empty(count)
-        space["scatter"] = np.empty((own.orders, 3))
+        space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
+        space["scatter"] = np.empty((own.orders, bands, bands))
         _separate(model, signals, places, materials, float(least), Work(**space), solved)
         freedom[places] = frames - own.steps - record["order"][places]
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }
+    squares = matrices.transpose(1, 2, 3, 0)
     named |= {
         "freedom": freedom,
         "beyond": named["beyond"] > 0,
+        "sums": sums,
+        "scatter": squares[0],
+        "rapid_scatter": squares[1:3],
+        "emissivity_covariance": squares[3],
+        **dict(zip(_VECTORS, vectors.transpose(1, 2, 0), strict=True)),
         **dict(zip(FILMS, films, strict=True)),
     }
-    return Solution(sums=sums, **named)
+    return Solution(**named)

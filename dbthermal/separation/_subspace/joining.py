@@ -1,10 +1,12 @@
 r"""Pieces of time that are joined with those beside them, of one pixel, compiled.
 
-The choices of `pieces._joined`. A signal is summed up in parts of the time by its products with the
-orthonormal polynomials of each part, :math:`c = Q^T z`, and its energy beside them. The functions
-of a piece of several parts, polynomials and steps of the camera, are combinations V of these, and
-what the piece leaves is the energy beside the parts' polynomials and :math:`\min |c - V f|^2`, of a
-few equations instead of all frames. A part after another is added to them by rotations.
+Halving makes more pieces than are needed: a change at a third of the time needs many. Of the ends
+of pieces at hand the best are found by going through them in their order. A signal is summed up in
+parts of the time by its products with the orthonormal polynomials of each part, :math:`c = Q^T z`,
+and its energy beside them. The functions of a piece of several parts, polynomials and steps of the
+camera, are combinations V of these, and what the piece leaves is the energy beside the parts'
+polynomials and :math:`\min |c - V f|^2`, of a few equations instead of all frames. A part after
+another is added to them by rotations.
 """
 
 from math import sqrt
@@ -140,7 +142,7 @@ def _split(event: Mask, scratch: Scratch, begins: Mask) -> tuple[int, int]:
 
 @compiled
 def join(time: Array, event: Mask, across: Array, scratch: Scratch, begins: Mask) -> float:
-    """Keep the best of the first frames of pieces, in place; the cost, as `pieces._joined`."""
+    """Keep the best of the first frames of pieces, in place; the cost (eq. 12)."""
     begun, edges, least, before = scratch.begins, scratch.edges, scratch.least, scratch.before
     count, parts = _split(event, scratch, begins)
     for number in range(parts):

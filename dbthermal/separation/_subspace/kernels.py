@@ -4,8 +4,9 @@ A pixel's curves stay in the processor's cache, and a step costs what its sums c
 for arrays in `response` is repeated within rounding.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+from math import sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ _TRIED: Final = (
     *((degree, 1.0) for degree in range(1, _TERMS)),
     *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
 )
+
+_SWEEPS, _ROUNDED = 20, 1e-30  # of a matrix's turns, at most; square of an element that is zero
 
 # Nothing is allocated within: to count references to the parts of arrays takes a fifth of the time.
 _OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
@@ -62,6 +65,32 @@ class Table(NamedTuple):
     wavelength: float  # A [m]
     shift: float  # B [m K]
     offset: float  # (O - U(T_r)) / a [K]
+
+
+def rows(curves: Sequence[Curve]) -> Array:
+    """Responses of some bands (band, number), on one range, for `response`."""
+    tables = [table(curve, *(other for other in curves if other is not curve)) for curve in curves]
+    return np.array([np.hstack(row) for row in tables])
+
+
+@compiled
+def response(rows: Array, band: int) -> Table:
+    """Response of a band of `rows`."""
+    c = rows[band]
+    return Table(
+        (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9]),
+        (c[10], c[11], c[12], c[13], c[14], c[15], c[16], c[17], c[18], c[19]),
+        (c[20], c[21], c[22], c[23], c[24], c[25], c[26], c[27], c[28], c[29]),
+        c[30],
+        c[31],
+        c[32],
+        c[33],
+        c[34] > 0.0,
+        c[35],
+        c[36],
+        c[37],
+        c[38],
+    )
 
 
 @lru_cache
@@ -227,6 +256,57 @@ def mean(values: Array) -> float:
     for t in range(values.size):
         total += values[t]
     return total / values.size
+
+
+@compiled
+def principal(matrix: Array, turned: Array, turns: Array, axis: Array) -> float:
+    """
+    Largest eigenvalue of a symmetric matrix; its vector, of any length, in place.
+
+    Of two rows the vector is the longer of two expressions; of more they are turned in pairs until
+    the matrix is diagonal (Jacobi).
+    """
+    count = axis.size
+    if count == 2:
+        a, b, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
+        largest = 0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b)
+        axis[0], axis[1] = (largest - d, b) if a >= d else (b, largest - a)
+        return largest
+    for i in range(count):
+        copy(matrix[i], turned[i])
+        fill(turns[i], 0.0)
+        turns[i, i] = 1.0
+    sweep, off = 0, 1.0
+    while off > 0.0 and sweep < _SWEEPS:
+        sweep, off = sweep + 1, 0.0
+        for p in range(count):
+            for q in range(p + 1, count):
+                off = max(off, turned[p, q] ** 2 - _ROUNDED * abs(turned[p, p] * turned[q, q]))
+                if turned[p, q] != 0.0:
+                    _turn(turned, turns, p, q)
+    best = 0
+    for i in range(1, count):
+        best = i if turned[i, i] > turned[best, best] else best
+    for i in range(count):
+        axis[i] = turns[best, i]
+    return turned[best, best]
+
+
+@compiled
+def _turn(turned: Array, turns: Array, p: int, q: int) -> None:
+    """Turn two rows and columns of a symmetric matrix until their product is zero, in place."""
+    half = 0.5 * (turned[q, q] - turned[p, p]) / turned[p, q]
+    tangent = (1.0 if half >= 0.0 else -1.0) / (abs(half) + sqrt(half * half + 1.0))
+    cosine = 1.0 / sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for i in range(len(turned)):
+        one, two = turned[p, i], turned[q, i]
+        turned[p, i], turned[q, i] = cosine * one - sine * two, sine * one + cosine * two
+        one, two = turns[p, i], turns[q, i]
+        turns[p, i], turns[q, i] = cosine * one - sine * two, sine * one + cosine * two
+    for i in range(len(turned)):
+        one, two = turned[i, p], turned[i, q]
+        turned[i, p], turned[i, q] = cosine * one - sine * two, sine * one + cosine * two
 
 
 @_numbers

@@ -4,7 +4,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
 
 .. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y) + n_m \qquad (1)
 
-1. The rapid changes of the bands lie along the reflection ratios (`reflection_ratio`)
+1. The rapid changes of the bands lie along the reflection ratios (`pixel`)
 
    .. math:: \kappa_m = (1 - e_m) / (1 - e_1) \qquad (2)
 
@@ -16,7 +16,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
    .. math:: \mathrm{var}(\kappa_m) = \sigma^2 (s_m^2 + \kappa_m^2 s_1^2) \qquad (4)
 
 2. The null combination of bands holds no background. Smoothed in the subspace, it is inverted for
-   the object temperature (`emission`):
+   the object temperature (`pixel`):
 
    .. math:: q = \sum w_m z_m, \quad \sum w_m \kappa_m = 0, \quad \sum w_m = 1 \qquad (5)
 
@@ -50,6 +50,7 @@ separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for
 formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
+import importlib
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Final
@@ -69,10 +70,9 @@ from dbthermal.separation._subspace import (
     pieces,
     reflection_ratio,
     residuals,
-    steps,
 )
-from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.steps import FILMS, Solution
+from dbthermal.separation._subspace.fused import FILMS, Solution
+from dbthermal.separation._subspace.pixel import BEND
 from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
@@ -120,9 +120,9 @@ class SubspaceSettings:
         down, over the capture [K], each drift as likely. No method can see that part; it only
         widens the error bars of emissivity and background.
     device : str, optional
-        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled for
-        two bands; or on tensors of torch (extra ``torch``), in torch's words, such as "cuda". All
-        else, such as flags and pieces of time, is the same code on the processor.
+        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled; or on
+        tensors of torch (extra ``torch``), in torch's words, such as "cuda". All else, such as
+        flags and pieces of time, is the same code on the processor.
     """
 
     background_drift: float = 3.0
@@ -194,18 +194,14 @@ def _solve(
     tile: Tile,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    least: float = emissions.BEND,
+    least: float = BEND,
 ) -> Solution:
-    """Steps 1 to 4, compiled for two bands, or on a device."""
-    solve = fused.solve if _compiled(tile, settings) else steps.solve
+    """Steps 1 to 4, compiled, or on a device."""
+    solve = fused.solve
     if settings.device is not None:
-        solve = partial(steps.solve_on, settings.device)
+        tensors = importlib.import_module("dbthermal.separation._subspace.tensors")
+        solve = partial(tensors.solve, settings.device)
     return solve(tile, functions, settings.background_drift, least)
-
-
-def _compiled(tile: Tile, settings: SubspaceSettings) -> bool:
-    """Steps 1 to 4 of a tile are those that are compiled."""
-    return len(tile.noise) == 2 and settings.device is None
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -323,10 +319,18 @@ def _followed(
     if suspect.size == 0:
         return result, first
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    cost = solution.cost[suspect]
-    known = None if part.material is None else part.material.ratio
-    divide = division.divide if len(noise) == 2 else pieces.divide  # compiled for two bands
-    divisions = divide(part.signals, tile.time, noise, tile.segment, known)
+    white, axes = pieces.plane(part.signals, noise)
+    axis = np.full((2, suspect.size), np.nan)
+    if part.material is not None:
+        axis = np.einsum("abp,bp->ap", axes, part.material.ratio / noise[:, np.newaxis])
+        axis /= np.sqrt((axis**2).sum(axis=0))
+    pooled = np.where(solution.pooled[suspect], axis, np.nan)
+    energy, count = pieces.null_energy(white, functions, pooled)
+    divisions = division.divide(white, tile.time, tile.segment, axis)
+    # Outside the plane a function fits noise in each further band.
+    further = (pieces.COST - 1.0) * (len(noise) - 2)
+    divisions = [replace(one, cost=one.cost + further * one.functions) for one in divisions]
+    cost = energy + (pieces.COST + further) * count  # of one smooth curve
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
     for one in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
@@ -361,7 +365,7 @@ def _divided(
     first: Mask,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    least: float = emissions.BEND,
+    least: float = BEND,
     number: int = smooth.PIECE_ORDER,
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
@@ -372,7 +376,7 @@ def _divided(
 
     groups = pieces.alike(first)
     parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
-    if _compiled(tile, settings):
+    if settings.device is None:
         return fused.solve_parts(tile, functions, parts, settings.background_drift, least)
     alone = [_solve(tile.select_pixels(places), own, settings, least) for places, own in parts]
     return alone[0].join(alone[1:]).select_pixels(np.argsort(np.concatenate(groups)))

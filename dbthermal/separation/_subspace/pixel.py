@@ -1,27 +1,32 @@
-"""Steps 1 to 4 of `method` for one pixel of two bands, compiled; their bars are in `bars`."""
+"""Steps 1 to 4 of `method` for one pixel, of any number of bands, compiled; bars are in `bars`."""
 
-from math import erfc, sqrt
+from math import erfc, exp, sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from dbthermal._arrays import Array
-from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, reflection_ratio, regression
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._tiles import Whole
 
-CHANCE: Final = float(chdtri(1, reflection_ratio.CHANCE))
-_GRAY_LIMIT: Final = float(chdtri(1, reflection_ratio.GRAY_CHANCE))
-_TINY: Final = float(np.finfo(np.float64).tiny)
+ROUNDS: Final = 3
+# Change of the slope with the emissivity that it starts from, below which it is extrapolated to
+# where both are the same (Aitken): the bands' responses differ far from the reference temperature.
+FASTEST: Final = 0.8
+# Energy of the object's change over that of its noise, below which its emissivity is undefined.
+OBJECT_TO_NOISE: Final = 10.0
+# Energy of the bend between the two responses, in units of the second band's noise, from which it
+# is worth taking out: it moves no linear function of the signal by more standard deviations.
+BEND: Final = 0.2
+# Times that it is taken out at most: it changes with the background that it is computed of.
+BENDS: Final = 2
 
 
 class Model(NamedTuple):
     """All that the pixels of a tile share; columns of functions lie along time."""
 
-    first: kernels.Table
-    second: kernels.Table
+    tables: Array  # responses, see `kernels.response` (band, number)
     functions: Array  # (column, time), of `smooth.Subspace`
     object_part: Array  # (column, time)
     spans: Whole  # first frames of these functions, and the ends (column, 2)
@@ -31,11 +36,12 @@ class Model(NamedTuple):
     leverage: Array  # (order, time)
     steps: int
     stepless: bool  # no function has a step of the camera: both are the same
-    noise: tuple[float, float]  # [K]
-    pattern: tuple[float, float]  # [K]
+    noise: Array  # (band) [K]
+    pattern: Array  # (band) [K]
     drift: float  # limit of the background's, over the square root of three [K]
-    rate: float  # change of the ratio of the responses' slopes with the background [1/K]
-    gray: Array  # ratios of the slopes at temperatures of the background [1]
+    rates: Array  # change of the ratios of the responses' slopes with the background (band) [1/K]
+    gray: Array  # ratios of the slopes at temperatures of the background (temperature, band) [1]
+    chances: tuple[float, float]  # limits of chi-squares: of a material's ratios, of a gray body
     widened: Array  # of the octaves' variances, at the end of their 95 % interval [1]
     edges: Whole  # of the blocks of a residual
     limits: tuple[float, float]  # of its chi-square statistics
@@ -47,9 +53,7 @@ class Model(NamedTuple):
 class Work(NamedTuple):
     """Signals and curves (time) of one pixel, and of some as they are read and written."""
 
-    first: Array  # signals [K]
-    second: Array
-    straight: Array  # the second less the bend of the reflections
+    first: Array  # signal of the first band [K]
     target: Array  # null combination of the bands, smoothed (eq. 5)
     temperature: Array  # of the object [K]
     emitted: Array  # signal of the object at the last regression
@@ -59,48 +63,55 @@ class Work(NamedTuple):
     residual: Array
     kernel: Array
     spare: Array
-    at_object: Array  # signals of the object
-    other_at_object: Array
     mean: Array  # signal of the background
     background: Array  # [K]
-    back_slope: Array
-    other_back_slope: Array
-    bend: Array  # of the reflections (eq. 11), and as it was taken out
-    removed: Array
-    sensitivity: Array  # see `emission.Emission`
-    smooth_variance: Array
+    curvature: Array  # of the sum of eq. 9 by the background
+    sensitivity: Array  # derivative of the object's temperature with epsilon [K]
+    smooth_variance: Array  # of the object, from the smoothed noise [K^2]
     variance: Array  # of the object, and of the background [K^2]
     background_variance: Array
     null_residual: Array
     rapid: Array
+    signals: Array  # (band, time) [K], as all that follow
+    straight: Array  # less the bend of the reflections
+    at_object: Array  # signals of the object
+    reflected: Array  # signals of the background in each band
+    bend: Array  # of the reflections (eq. 11), and as it was taken out
+    removed: Array
     few: Any  # in single precision (6, time)
-    coefficients: Array  # of the signals on the functions (2, column)
+    coefficients: Array  # of the signals on the functions (band, column)
     columns: Array  # (column)
     spectra: Array  # (2, degree)
-    scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
-    material: Array  # ratio, inverse energy, emissivity, its two variances, spread; NaN for none
-    inside: Array  # signals of some pixels [K] (pixel, 2, time)
+    scatter: Array  # whitened, outside the functions of each order (eq. 3) (order, band, band)
+    turned: Array  # (band, band), to find principal axes, and what turns it
+    turns: Array
+    axis: Array  # (band), along the rapid changes of the whitened signals, as all that follow
+    material_axis: Array  # the same of the material
+    ratio: Array  # reflection ratios [1]
+    null_weights: Array  # w of eq. 5
+    emissivity: Array
+    factors: Array  # w_m e_m of eq. 6
+    share: Array  # of the bands in the background
+    level: Array  # deviation of the ratios by the background's level
+    material: Array  # inverse energy, emissivity, its two variances, spread, ratios; NaN for none
+    inside: Array  # signals of some pixels [K] (pixel, band, time)
     outside: Any  # their films, in single precision (pixel, 4, time)
 
 
 class Ratio(NamedTuple):
-    """As `reflection_ratio.ReflectionRatio`, of one pixel."""
+    """Reflection ratios of one pixel and how well they are known; these are in the work space."""
 
-    ratio: float
-    inverse_energy: float
-    weights: tuple[float, float]
-    null_variance: float
-    order: int
-    contrast: float
-    reduced_chi2: float
-    scatter: tuple[float, float, float]
-    pooled: bool
+    inverse_energy: float  # sigma^2 of eq. 4 [1/K^2]; infinite without background energy
+    null_variance: float  # noise variance of the null combination [K^2]
+    order: int  # number of smooth functions used
+    contrast: float  # variance along the axis over that across it, at the largest order [1]
+    reduced_chi2: float  # variance across the axis over the noise's, 1 if the model holds
+    pooled: bool  # the material's ratios are used, and the pixel does not contradict them
 
 
 class Line(NamedTuple):
-    """Robust line of step 3 (eq. 7), and the emissivities that follow from it."""
+    """Robust line of step 3 (eq. 7)."""
 
-    emissivity: tuple[float, float]
     variance: float  # of the slope
     scale: float  # of the residual [K]
     energy: float  # of the object's curve [K^2]
@@ -110,141 +121,214 @@ class Line(NamedTuple):
 
 @inlined
 def ratios(model: Model, work: Work) -> Ratio:
-    """Step 1; coefficients (2, column) in place."""
-    curves = work.first, work.straight
-    kernels.projected_both(model.functions, model.spans, curves[0], curves[1], work.coefficients)
+    r"""
+    Step 1; coefficients, ratios and null combination in place.
+
+    The order is that of the lowest Bayesian information criterion (Schwarz 1978,
+    doi:10.1214/aos/1176344136) of the energy across the axis, **plus one**: a part of the object's
+    curve too small to be significant there still biases the ratio to first order, while one
+    function more costs little variance. A material's ratios are used unless the pixel's own rapid
+    changes contradict them by four standard deviations.
+
+    With S the background's energy in the first band, n = N - K degrees of freedom, and
+    :math:`|v|^2 = \sum \kappa_m^2 / s_m^2`, the variance of the ratios is that of eq. 4 with
+    :math:`\sigma^2 = 1 / S + n / (S^2 |v|^2)` (Fuller 1987, doi:10.1002/9780470316665). The first
+    term alone is the Cramer-Rao bound; see `limits.ratio_variance_bound`.
+    """
+    noise, material, ratio, axis = model.noise, work.material, work.ratio, work.axis
+    bands, orders, frames = noise.size, len(work.scatter), work.first.size
     _scatter(model, work)
-    noise, scatter, material = model.noise, work.scatter, work.material
-    orders, frames = len(scatter), work.first.size
-    known = material[0] / noise[1] * noise[0]
-    share = 1.0 / sqrt(1.0 + known**2), known / sqrt(1.0 + known**2)
-    pooled = False
-    if not np.isnan(known):
-        a, b, d = scatter[_order(scatter, share, True, frames)]
-        turned = a * share[0] + b * share[1], b * share[0] + d * share[1]
-        along = share[0] * turned[0] + share[1] * turned[1]
-        statistic = (turned[0] ** 2 + turned[1] ** 2) / along - along
-        pooled = statistic < CHANCE
-    order = _order(scatter, share, pooled, frames)
-    free = frames - model.steps - (order + 1.0)
-    a, b, d = scatter[order]
-    largest, null = _energies(a, b, d, share, False)
-    # The axis by the longer of two expressions.
-    across, up = (largest - d, b) if a >= d else (b, largest - a)
-    ratio = up / across * (noise[1] / noise[0])
+    pooled, along = False, work.material_axis
+    if not np.isnan(material[6]):
+        length = 0.0
+        for m in range(bands):
+            along[m] = material[5 + m] / noise[m]
+            length += along[m] ** 2
+        for m in range(bands):
+            along[m] /= sqrt(length)
+        pooled = _agrees(work.scatter[_order(work, True, frames)], along, model.chances[0])
+    order = _order(work, pooled, frames)
+    free, scatter = frames - model.steps - (order + 1.0), work.scatter[order]
+    null = _across(scatter, work, pooled)
+    largest = kernels.principal(scatter, work.turned, work.turns, axis)
     # Eq. 4: sigma^2 of the energy along the axis less the noise's, over |v|^2.
-    length = 1.0 / noise[0] ** 2 + (ratio / noise[1]) ** 2
+    ratio[0], length = 1.0, 0.0
+    for m in range(1, bands):
+        ratio[m] = axis[m] * noise[m] / (axis[0] * noise[0])
+    for m in range(bands):
+        length += (ratio[m] / noise[m]) ** 2
     energy = (largest - free) / length
     inverse = (energy + free / length) / energy**2 if energy > 0 else np.inf
     if pooled:
-        null = _energies(a, b, d, share, True)[1]
         # The mean of the posterior, of the material's ratio for a prior with its spread.
-        own = material[5] / (material[5] + inverse) if material[5] > 0 else 0.0
-        ratio = material[0] + own * (ratio - material[0]) if own > 0 else material[0]
-        inverse = (1.0 - own) * (material[5] + (1.0 - own) * material[1])
-    last = scatter[orders - 1]
-    most, least = _energies(last[0], last[1], last[2], share, pooled)
-    weights, variance = _null_combination(ratio, noise)
+        spread = material[4]
+        own = spread / (spread + inverse) if spread > 0 else 0.0
+        for m in range(1, bands):
+            ratio[m] = material[5 + m] + (own * (ratio[m] - material[5 + m]) if own > 0 else 0.0)
+        inverse = (1.0 - own) * (spread + (1.0 - own) * material[0])
+    variance = _null_combination(model, work)
+    last = work.scatter[orders - 1]
+    least, whole = _across(last, work, pooled), 0.0
+    for m in range(bands):
+        whole += last[m, m]
     return Ratio(
-        ratio,
         inverse,
-        weights,
         variance,
         order + 1,
-        most / least if least > 0 else np.inf,
-        null / free,
-        (a - free, b, d - free),
+        (whole - least) * (bands - 1.0) / least if least > 0 else np.inf,
+        null / ((bands - 1.0) * free),
         pooled,
     )
 
 
 @inlined
 def _scatter(model: Model, work: Work) -> None:
-    """Scatter (order, 3) of the whitened signals outside the functions of each order (eq. 3)."""
-    z, s, coefficients, steps = work.first, work.straight, work.coefficients, model.steps
-    a, b, d = kernels.dot(z, z), kernels.dot(z, s), kernels.dot(s, s)
-    one, two = 1.0 / model.noise[0], 1.0 / model.noise[1]
+    """Scatter of the whitened signals outside the functions of each order (eq. 3)."""
+    straight, coefficients = work.straight, work.coefficients
+    bands, frames = model.noise.size, work.first.size
+    for m in range(0, bands - 1, 2):
+        one, two = straight[m, :frames], straight[m + 1, :frames]
+        kernels.projected_both(model.functions, model.spans, one, two, coefficients[m : m + 2])
+    if bands % 2:
+        last, count = bands - 1, len(model.functions)
+        kernels.projected(
+            model.functions, model.spans, count, straight[last, :frames], coefficients[last]
+        )
     # The basis is orthonormal: |P z|^2 = |z|^2 - sum of squared coefficients.
-    for j in range(coefficients.shape[1]):
-        a -= coefficients[0, j] ** 2
-        b -= coefficients[0, j] * coefficients[1, j]
-        d -= coefficients[1, j] ** 2
-        if j >= steps:
-            scatter = work.scatter[j - steps]
-            scatter[0], scatter[1], scatter[2] = a * one * one, b * one * two, d * two * two
+    for m in range(bands):
+        for n in range(m + 1):
+            rest = kernels.dot(straight[m, :frames], straight[n, :frames])
+            one, two = coefficients[m], coefficients[n]
+            scale = 1.0 / (model.noise[m] * model.noise[n])
+            for j in range(model.steps):
+                rest -= one[j] * two[j]
+            for order in range(len(work.scatter)):
+                rest -= one[model.steps + order] * two[model.steps + order]
+                work.scatter[order, m, n] = work.scatter[order, n, m] = rest * scale
 
 
 @inlined
-def _null_combination(
-    ratio: float, noise: tuple[float, float]
-) -> tuple[tuple[float, float], float]:
-    """Weights w of eq. 5 and the variance of that combination, as `null_combination`."""
-    along0, along1, one, two = 1.0 / noise[0], ratio / noise[1], 1.0 / noise[0], 1.0 / noise[1]
-    part = (along0 * one + along1 * two) / (along0**2 + along1**2)
-    off0, off1 = one - part * along0, two - part * along1
-    variance = 1.0 / (off0**2 + off1**2)
-    return (off0 * variance * one, off1 * variance * two), variance
+def _agrees(scatter: Array, axis: Array, limit: float) -> bool:
+    """As `reflection_ratio.agrees`."""
+    along, square = 0.0, 0.0
+    for m in range(axis.size):
+        turned = kernels.dot(scatter[m], axis)
+        along += axis[m] * turned
+        square += turned**2
+    return square / along - along < limit
 
 
 @inlined
-def _energies(
-    a: float, b: float, d: float, axis: tuple[float, float], known: float
-) -> tuple[float, float]:
-    """Energy along the axis of a scatter, the principal one or a known one, and across it."""
+def _null_combination(model: Model, work: Work) -> float:
+    """Weights w of eq. 5, in place, and the variance; as `reflection_ratio.null_combination`."""
+    noise, ratio, weights = model.noise, work.ratio, work.null_weights
+    product, length, rest = 0.0, 0.0, 0.0
+    for m in range(noise.size):
+        product += ratio[m] / noise[m] ** 2
+        length += (ratio[m] / noise[m]) ** 2
+    for m in range(noise.size):
+        weights[m] = (1.0 - product / length * ratio[m]) / noise[m]
+        rest += weights[m] ** 2
+    for m in range(noise.size):
+        weights[m] /= rest * noise[m]
+    return 1.0 / rest
+
+
+@inlined
+def _across(scatter: Array, work: Work, known: float) -> float:
+    """Energy of a scatter across its principal axis, or across the material's."""
+    whole, along, axis = 0.0, 0.0, work.material_axis
     if known:
-        along = axis[0] ** 2 * a + 2.0 * axis[0] * axis[1] * b + axis[1] ** 2 * d
+        for m in range(axis.size):
+            along += axis[m] * kernels.dot(scatter[m], axis)
     else:
-        along = 0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b)
-    return along, a + d - along
+        along = kernels.principal(scatter, work.turned, work.turns, work.axis)
+    for m in range(axis.size):
+        whole += scatter[m, m]
+    return whole - along
 
 
 @inlined
-def _order(scatter: Array, axis: tuple[float, float], known: float, frames: int) -> int:
-    """Order less one of the lowest information criterion, see `reflection_ratio.choose_order`."""
+def _order(work: Work, known: float, frames: int) -> int:
+    """Order less one of the lowest information criterion, see `ratios`."""
+    scatter = work.scatter
     lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
     # N ln E + K ln N is least where E N^(K / N) is.
     best, least, price, step = lowest, np.inf, 1.0, frames ** (1.0 / frames)
-    for order in range(lowest, scatter.shape[0] - 1):
-        a, b, d = scatter[order]
-        criterion = price * max(_energies(a, b, d, axis, known)[1], _TINY)
+    for order in range(lowest, len(scatter) - 1):
+        criterion = price * max(_across(scatter[order], work, known), reflection_ratio.TINY)
         price *= step
         if criterion < least:
             best, least = order, criterion
-    return best + 1 if scatter.shape[0] > 1 else 0
+    return best + 1 if len(scatter) > 1 else 0
 
 
 @inlined
-def may_be_gray(model: Model, ratios: Ratio) -> bool:
-    """As `reflection_ratio.may_be_gray`: in two bands the part across the axis is one number."""
-    noise = model.noise
-    along0, along1 = 1.0 / noise[0], ratios.ratio / noise[1]
-    length = sqrt(along0**2 + along1**2)
-    nearest, chance, before = np.inf, 0.0, 0.0
-    for i in range(model.gray.size):
-        off = (model.gray[i] / noise[1] * along0 - along1 / noise[0]) / length
+def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
+    r"""
+    Say whether equal emissivities are not excluded by the signals as they are.
+
+    All that changes in a gray body changes the bands in proportion to the slopes of their
+    responses, :math:`\dot z_m = (1 - e) \, u_m'(y) \, \dot y`: before a background warmer than
+    the reference its ratios are not 1. That temperature cannot be told beside a gray body; it is as
+    likely to lie between any two of some temperatures. The chance is the mean over them of that of
+    the chi-square, with a degree of freedom for each band but one, of the nearest ratios between.
+    """
+    noise, ratio, bands, length = model.noise, work.ratio, model.noise.size, 0.0
+    for m in range(bands):
+        length += (ratio[m] / noise[m]) ** 2
+    nearest, chance, off, before = np.inf, 0.0, work.turned[0], work.turned[1]
+    for i in range(len(model.gray)):
+        # The part of g / s orthogonal to v; its variance is sigma^2.
+        product, step, square, turned = 0.0, 0.0, 0.0, 0.0
+        for m in range(bands):
+            product += model.gray[i, m] * ratio[m] / noise[m] ** 2 / length
+        for m in range(bands):
+            before[m] = off[m]
+            off[m] = (model.gray[i, m] - product * ratio[m]) / noise[m]
+            step += (off[m] - before[m]) ** 2
+            turned -= before[m] * (off[m] - before[m])
         if i > 0:
-            apart = 0.0 if off * before <= 0 else min(abs(off), abs(before))
-            statistic = apart**2 / ratios.inverse_energy
+            part = min(max(turned / max(step, reflection_ratio.TINY), 0.0), 1.0)
+            for m in range(bands):
+                square += (before[m] + part * (off[m] - before[m])) ** 2
+            statistic = square / ratios.inverse_energy
             nearest = min(nearest, statistic)
-            chance += erfc(sqrt(0.5 * statistic)) / (model.gray.size - 1)
-        before = off
-    return nearest < _GRAY_LIMIT and chance > reflection_ratio.GRAY_CHANCE
+            chance += _chance(statistic, bands - 1) / (len(model.gray) - 1.0)
+    return nearest < model.chances[1] and chance > reflection_ratio.GRAY_CHANCE
 
 
 @inlined
-def weights(ratios: Ratio, emissivity: float) -> tuple[float, float]:
-    """Weights w_m e_m of the bands' signals in h (eq. 6)."""
-    last = 1.0 - ratios.ratio * (1.0 - emissivity)
-    return ratios.weights[0] * emissivity, ratios.weights[1] * last
+def _chance(statistic: float, freedom: int) -> float:
+    """Chance of a larger chi-square: of two degrees of freedom less, and one more term."""
+    half, odd = 0.5 * statistic, freedom % 2
+    chance, power = erfc(sqrt(half)) if odd else exp(-half), 0.5 if odd else 1.0
+    term = exp(-half) * (2.0 * sqrt(half / np.pi) if odd else half)
+    while 2.0 * power < freedom:
+        chance, power = chance + term, power + 1.0
+        term *= half / power
+    return chance
 
 
 @inlined
-def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work, emitted: Array) -> None:
+def _mixed(model: Model, work: Work, emissivity: float) -> tuple[float, ...]:
+    """Polynomial of h (eq. 6); the weights w_m e_m in place."""
+    factors, tables = work.factors, model.tables
+    for m in range(factors.size):
+        factors[m] = work.null_weights[m] * (1.0 - work.ratio[m] * (1.0 - emissivity))
+    one, two = kernels.response(tables, 0), kernels.response(tables, 1)
+    mixed = kernels.mixed(factors[0], one.signal, factors[1], two.signal)
+    for m in range(2, factors.size):
+        mixed = kernels.mixed(1.0, mixed, factors[m], kernels.response(tables, m).signal)
+    return mixed
+
+
+@inlined
+def _approach(model: Model, emissivity: float, work: Work, emitted: Array) -> None:
     """A step of Newton towards h(x) = q (eq. 6); h' and q - h before it, u_1 after, in place."""
-    first, second, now, after = model.first, model.second, work.temperature, work.spare
+    first, now, after = kernels.response(model.tables, 0), work.temperature, work.spare
     target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
-    one, two = weights(ratios, emissivity)
-    mixed = kernels.mixed(one, first.signal, two, second.signal)
+    mixed = _mixed(model, work, emissivity)
     for t in range(now.size):
         x = (now[t] - middle) * scale
         value, slope = kernels.with_slope(mixed, x)
@@ -256,92 +340,147 @@ def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work, emitte
     if outside > 0.0:
         for t in range(now.size):
             if not max(abs(now[t] - middle), abs(after[t] - middle)) <= first.half:
-                a, slope = kernels.exact(first, now[t])
-                b, other_slope = kernels.exact(second, now[t])
-                work.lack[t] = target[t] - one * a - two * b
-                work.steepness[t] = one * slope + two * other_slope
+                value, slope = 0.0, 0.0
+                for m in range(work.factors.size):
+                    u, a = kernels.exact(kernels.response(model.tables, m), now[t])
+                    value += work.factors[m] * u
+                    slope += work.factors[m] * a
+                work.lack[t], work.steepness[t] = target[t] - value, slope
                 after[t] = now[t] + work.lack[t] / work.steepness[t]
                 emitted[t] = kernels.exact(first, after[t])[0]
     kernels.copy(after, now)
 
 
 @inlined
-def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
-    """Steps 2 and 3 in turns: the object (eq. 5, 6) and the first emissivity (eq. 7), in place."""
-    z, weights, temperature = work.first, work.weights, work.temperature
-    count, w, material = ratios.order + model.steps, ratios.weights, work.material
-    for j in range(count):
-        work.columns[j] = w[0] * work.coefficients[0, j] + w[1] * work.coefficients[1, j]
-    kernels.combined(model.object_part, model.spans, work.columns, count, work.target)
-    kernels.temperature(model.second, work.target, temperature)
-    largest = max(1.0, ratios.ratio)
-    middle = 0.5 * (1.0 + (largest - 1.0) / largest)
-    middle = material[2] if ratios.pooled and not np.isnan(material[2]) else middle
-    # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
-    kernels.blackbody(model.first, temperature, work.emitted, work.spare)
-    kernels.fill(work.lack, 1.0)
-    guess = regression.moments(work.emitted, z, work.lack)[0]
-    emissivity = guess if 0 < guess < 1 else middle
-    known = ratios.pooled and not np.isnan(material[2] + material[3])
-    constant = False
-    slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
-    before, slope_before = np.nan, np.nan
-    for turn in range(emissions.ROUNDS):
-        _approach(model, ratios, emissivity, work, work.emitted)
-        slope, variance, scale, energy = regression.regress(
-            work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
-        )
-        constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
-        rate = (slope - slope_before) / (emissivity - before)
-        before, slope_before = emissivity, slope
-        emissivity = material[2] if known else middle if constant else slope
-        if abs(rate) < emissions.FASTEST and not known and not constant:
-            emissivity += (slope - before) * rate / (1.0 - rate)
-    _approach(model, ratios, emissivity, work, work.at_object)
-    other = 1.0 - ratios.ratio * (1.0 - emissivity)
-    return Line((emissivity, other), variance, scale, energy, constant, known)
+def combined(weights: Array, coefficients: Array, count: int, columns: Array) -> None:
+    """Sum of the bands' coefficients (band, column), weighted, in place."""
+    kernels.fill(columns[:count], 0.0)
+    for m in range(weights.size):
+        for j in range(count):
+            columns[j] += weights[m] * coefficients[m, j]
 
 
 @inlined
-def background(model: Model, line: Line, work: Work) -> None:
-    """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
-    z, other, mean, result, bend = work.first, work.second, work.mean, work.background, work.bend
-    first, last = line.emissivity
-    one, two = ((1.0 - first) / model.noise[0]) ** 2, ((1.0 - last) / model.noise[1]) ** 2
-    one, two = one / (one + two), two / (one + two)
-    inverse, other_inverse, reflected = 1.0 / (1.0 - first), 1.0 / (1.0 - last), work.spare
-    kernels.blackbody(model.second, work.temperature, work.other_at_object, reflected)
-    for t in range(z.size):
-        reflected[t] = (z[t] - first * work.at_object[t]) * inverse
-        bend[t] = (other[t] - last * work.other_at_object[t]) * other_inverse
-        mean[t] = one * reflected[t] + two * bend[t]
+def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
+    """Steps 2 and 3 in turns: the object (eq. 5, 6) and the emissivities (eq. 7), in place."""
+    z, weights, temperature = work.first, work.weights, work.temperature
+    count, material, largest = ratios.order + model.steps, work.material, 1.0
+    combined(work.null_weights, work.coefficients, count, work.columns)
+    kernels.combined(model.object_part, model.spans, work.columns, count, work.target)
+    kernels.temperature(kernels.response(model.tables, 1), work.target, temperature)
+    # Middle of the interval that the ratios leave for e_1, for a constant object.
+    for m in range(1, work.ratio.size):
+        largest = max(largest, work.ratio[m])
+    middle = 0.5 * (1.0 + (largest - 1.0) / largest)
+    middle = material[1] if ratios.pooled and not np.isnan(material[1]) else middle
+    # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
+    first = kernels.response(model.tables, 0)
+    kernels.blackbody(first, temperature, work.emitted, work.spare)
+    kernels.fill(work.lack, 1.0)
+    guess = regression.moments(work.emitted, z, work.lack)[0]
+    emissivity = guess if 0 < guess < 1 else middle
+    known = ratios.pooled and not np.isnan(material[1] + material[2])
+    constant = False
+    slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
+    before, slope_before = np.nan, np.nan
+    for turn in range(ROUNDS):
+        _approach(model, emissivity, work, work.emitted)
+        slope, variance, scale, energy = regression.regress(
+            work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
+        )
+        constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not known
+        rate = (slope - slope_before) / (emissivity - before)
+        before, slope_before = emissivity, slope
+        emissivity = material[1] if known else middle if constant else slope
+        if abs(rate) < FASTEST and not known and not constant:
+            emissivity += (slope - before) * rate / (1.0 - rate)
+    _approach(model, emissivity, work, work.at_object[0, : z.size])
+    for m in range(work.ratio.size):
+        work.emissivity[m] = 1.0 - work.ratio[m] * (1.0 - emissivity)
+    return Line(variance, scale, energy, constant, known)
+
+
+@inlined
+def background(model: Model, work: Work) -> None:
+    """Step 4 (eq. 9), in place."""
+    tables, emissivity, share, frames = model.tables, work.emissivity, work.share, work.first.size
+    mean, result, step, curvature = work.mean, work.background, work.spare, work.curvature
+    first, total, outside = kernels.response(tables, 0), 0.0, 0.0
+    for m in range(share.size):
+        share[m] = ((1.0 - emissivity[m]) / model.noise[m]) ** 2
+        total += share[m]
+    kernels.fill(mean, 0.0)
+    for m in range(share.size):
+        share[m] /= total
+        e, part, inverse = emissivity[m], share[m], 1.0 / (1.0 - emissivity[m])
+        z, emitted = work.signals[m, :frames], work.at_object[m, :frames]
+        reflected = work.reflected[m, :frames]
+        if m > 0:
+            table = kernels.response(tables, m)
+            kernels.blackbody(table, work.temperature, emitted, work.spare)
+        for t in range(frames):
+            reflected[t] = (z[t] - e * emitted[t]) * inverse
+            mean[t] += part * reflected[t]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
-    kernels.temperature(model.first, mean, result)
-    middle, half, scale, outside = model.first.middle, model.first.half, 1.0 / model.first.half, 0.0
-    apart = kernels.mixed(1.0, model.second.signal, -1.0, model.first.signal)
-    for t in range(z.size):
+    kernels.temperature(first, mean, result)
+    kernels.fill(step, 0.0)
+    kernels.fill(curvature, 0.0)
+    middle, half, scale = first.middle, first.half, 1.0 / first.half
+    for m in range(share.size):
+        signal, part = kernels.response(tables, m).signal, share[m]
+        reflected = work.reflected[m, :frames]
+        for t in range(frames):
+            u, a = kernels.with_slope(signal, (result[t] - middle) * scale)
+            step[t] += part * a * (reflected[t] - u)
+            curvature[t] += part * a * a
+    for t in range(frames):
         x = (result[t] - middle) * scale
-        u, a = kernels.with_slope(model.first.signal, x)
-        v, b = kernels.with_slope(model.second.signal, x)
-        step = one * a * (reflected[t] - u) + two * b * (bend[t] - v)
-        y = x + step / (one * a**2 + two * b**2)
+        y = x + step[t] / curvature[t]
         outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
-        work.back_slope[t], work.other_back_slope[t] = a * scale, b * scale
-        mean[t] = middle + half * y
-        bend[t] = (1.0 - last) * kernels.polynomial(apart, y)
+        mean[t], curvature[t] = middle + half * y, curvature[t] * scale**2
     if outside > 0.0:
-        for t in range(z.size):
-            if not max(abs(result[t] - middle), abs(mean[t] - middle)) <= half:
-                u, a = kernels.exact(model.first, result[t])
-                v, b = kernels.exact(model.second, result[t])
-                other_reflected = (other[t] - last * work.other_at_object[t]) * other_inverse
-                step = one * a * (reflected[t] - u) + two * b * (other_reflected - v)
-                work.back_slope[t], work.other_back_slope[t] = a, b
-                mean[t] = result[t] + step / (one * a**2 + two * b**2)
-                apart_exactly = kernels.exact(model.second, mean[t])[0]
-                apart_exactly -= kernels.exact(model.first, mean[t])[0]
-                bend[t] = (1.0 - last) * apart_exactly
+        _outside(model, work)
     kernels.copy(mean, result)
-    finite = kernels.mean(bend) * 0.0
-    if not (0 < first < 1 and 0 < last < 1 and finite == 0):
-        kernels.fill(bend, 0.0)
+    _bend(model, work, outside)
+
+
+@inlined
+def _bend(model: Model, work: Work, outside: float) -> None:
+    r"""
+    Part of the reflections that the responses bend apart (eq. 11), in place.
+
+    :math:`(1 - e_m) \, (u_m(y) - u_1(y))`: taken from band m, it leaves the same signal
+    :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and
+    large changes of the background. Zero where a background or an emissivity is not physical.
+    """
+    first, result, frames = kernels.response(model.tables, 0), work.background, work.first.size
+    physical, scale = 0.0 < work.emissivity[0] < 1.0, 1.0 / first.half
+    for m in range(1, work.emissivity.size):
+        bend, factor = work.bend[m, :frames], 1.0 - work.emissivity[m]
+        other = kernels.response(model.tables, m)
+        apart = kernels.mixed(1.0, other.signal, -1.0, first.signal)
+        for t in range(frames):
+            bend[t] = factor * kernels.polynomial(apart, (result[t] - first.middle) * scale)
+        for t in range(frames if outside > 0.0 else 0):
+            if not abs(result[t] - first.middle) <= first.half:
+                part = kernels.exact(other, result[t])[0] - kernels.exact(first, result[t])[0]
+                bend[t] = factor * part
+        physical &= 0.0 < work.emissivity[m] < 1.0 and kernels.mean(bend) * 0.0 == 0.0
+    for m in range(1, work.emissivity.size if not physical else 1):
+        kernels.fill(work.bend[m, :frames], 0.0)
+
+
+@inlined
+def _outside(model: Model, work: Work) -> None:
+    """As `background`, of the frames where the polynomials do not hold."""
+    tables, result, mean = model.tables, work.background, work.mean
+    first = kernels.response(tables, 0)
+    for t in range(mean.size):
+        off = max(abs(result[t] - first.middle), abs(mean[t] - first.middle))
+        if not off <= first.half:
+            step, curvature = 0.0, 0.0
+            for m in range(work.share.size):
+                u, a = kernels.exact(kernels.response(tables, m), result[t])
+                step += work.share[m] * a * (work.reflected[m, t] - u)
+                curvature += work.share[m] * a * a
+            mean[t], work.curvature[t] = result[t] + step / curvature, curvature

@@ -1,14 +1,28 @@
-"""Robust regression line of one pixel, compiled; as in `residuals`, within rounding."""
+"""Robust regression, which finds a line beside outliers on one side; of one pixel, compiled."""
 
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 from dbthermal._arrays import Array
-from dbthermal.separation._subspace import kernels, residuals
+from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import compiled
 
+TUNING: Final = 4.685
+"""Tukey's constant: 95 % efficiency for normal noise (Huber 1981, doi:10.1002/0471725250)."""
+
+# Share of the points that must lie on the line: the scale is taken from their deviation, as an
+# absolute deviation of that rank -> standard deviation of a normal distribution.
+SHARE: Final = 0.3
+TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + SHARE)))
+ANNEALING: Final = 0.7
+STARTING_STEPS: Final = 5
+STARTING_POINTS: Final = 128
+STEPS: Final = 3
+# Largest correlation of neighbouring residuals: that of one all slow would be 1.
+MOST_CORRELATED: Final = 0.98
 _GUESSES: Final = 60  # of the value of a rank, at most
 
 
@@ -74,7 +88,7 @@ def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
     @compiled
     def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
         """As `moments`, with Tukey's bisquare weights of the residuals of another line."""
-        inverse = real(1.0 / (residuals.TUNING * scale))
+        inverse = real(1.0 / (TUNING * scale))
         total, first, second, square, product = zero, zero, zero, zero, zero
         for t in range(x.size):
             r = (y[t] - intercept - slope * x[t]) * inverse
@@ -100,18 +114,25 @@ _moments, _reweighted = _of(np.float32)
 
 @compiled
 def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
-    """Slope and intercept of the best of three starts; see `residuals.regress`."""
+    """
+    Slope and intercept of the best of three starts: all points, those above, those below the line.
+
+    Disturbances of a resting background lie mostly on one side of it, and one of the halves is
+    then nearly free of it. Each start closes in on the densest half of the points by a scale that
+    is a fraction of the deviation; the one with the smallest deviation wins. Some points in single
+    precision, about their mean, are enough to start from.
+    """
     middle, centre = kernels.mean(x), kernels.mean(y)
-    count = min(x.size, residuals.STARTING_POINTS)
+    count = min(x.size, STARTING_POINTS)
     xs, ys, weights = few[0, :count], few[1, :count], few[2, :count]
     plain, magnitude = few[3, :count], few[4, :count]
     for i in range(count):
-        t = i if count == x.size else i * x.size // residuals.STARTING_POINTS
+        t = i if count == x.size else i * x.size // STARTING_POINTS
         xs[i], ys[i], weights[i] = x[t] - middle, y[t] - centre, 1.0
     slope, intercept, _ = _moments(xs, ys, weights)
     for i in range(count):
         plain[i] = ys[i] - intercept - slope * xs[i]
-    rank, zero = int(residuals.SHARE * count), np.float32(0.0)
+    rank, zero = int(SHARE * count), np.float32(0.0)
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
     for start in range(3):
         sign = np.float32(2 * start - 3) if start > 0 else zero
@@ -119,16 +140,16 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
             weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
         slope, intercept, _ = _moments(xs, ys, weights)
         deviation = 0.0
-        for turn in range(residuals.STARTING_STEPS):
+        for turn in range(STARTING_STEPS):
             if turn > 0:
-                scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
+                scale = max(noise, ANNEALING * TO_STD * deviation)
                 slope, intercept, _ = _reweighted(xs, ys, slope, intercept, scale)
             total = zero
             for i in range(count):
                 magnitude[i] = abs(ys[i] - intercept - slope * xs[i])
                 total += magnitude[i]
             guess = deviation if turn > 0 else 0.5 * total / count
-            deviation = ranked(magnitude, rank, max(guess, noise / residuals.TO_STD))
+            deviation = ranked(magnitude, rank, max(guess, noise / TO_STD))
         if deviation < best:
             best, best_slope, best_intercept = deviation, slope, intercept
     return float(best_slope), float(centre + best_intercept - best_slope * middle)
@@ -138,27 +159,34 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 def regress(
     x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, again: int
 ) -> tuple[float, float, float, float]:
-    """
-    Robust line, as `residuals.regress`; residual and weights in place.
+    r"""
+    Robust line, with Tukey's bisquare weights: slope, its variance, scale, energy of the abscissa.
 
-    Slope, its variance, the scale, and the energy of the abscissa.
+    Iteratively reweighted least squares (Beaton and Tukey 1974, doi:10.1080/00401706.1974.10489171)
+    with :math:`w = (1 - (r / c s)^2)^2` inside :math:`c s` and 0 outside. The scale s is the
+    absolute deviation of rank 30 %, as a standard deviation, renewed at every step and never below
+    the `noise` of the ordinate. It starts from weights of nearly the same points, or anew.
+
+    With residuals of lag-one correlation :math:`\rho` only :math:`(1 - \rho) / (1 + \rho)` of
+    the points are independent; the variance is divided by that fraction. Residual and weights are
+    in place.
     """
     if again:
         slope, intercept, energy = moments(x, y, weights)
     else:
         slope, intercept = _started(x, y, noise, few)
         energy = 0.0
-    magnitude, rank, last = few[4], int(residuals.SHARE * x.size), (slope, intercept)
+    magnitude, rank, last = few[4], int(SHARE * x.size), (slope, intercept)
     deviation, scale = 0.0, noise
     # Residuals and weights are made anew where they are used: a long capture's leave the cache.
-    for _ in range(residuals.STEPS):
+    for _ in range(STEPS):
         last = slope, intercept
         for t in range(x.size):
             magnitude[t] = abs(y[t] - intercept - slope * x[t])
-        deviation = ranked(magnitude, rank, max(deviation, noise / residuals.TO_STD))
-        scale = max(noise, residuals.TO_STD * deviation)
+        deviation = ranked(magnitude, rank, max(deviation, noise / TO_STD))
+        scale = max(noise, TO_STD * deviation)
         slope, intercept, energy = reweighted(x, y, slope, intercept, scale)
-    inverse = 1.0 / (residuals.TUNING * scale)
+    inverse = 1.0 / (TUNING * scale)
     for t in range(x.size):
         residual[t] = y[t] - intercept - slope * x[t]
         off = (y[t] - last[1] - last[0] * x[t]) * inverse
@@ -169,6 +197,16 @@ def regress(
         one = residual[t] * weights[t]
         kept += one * one
         lagged += one * residual[t - 1] * weights[t - 1]
-    correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), residuals.MOST_CORRELATED)
+    correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), MOST_CORRELATED)
     independent = (1.0 - correlation) / (1.0 + correlation)
     return slope, scale**2 / energy / independent, scale, energy
+
+
+@kernels.entered
+def lines(x: Array, y: Array, noise: float, weights: Array, few: Any, numbers: Array) -> None:
+    """As `regress`, of many pixels (pixel, time), without a start; in place."""
+    for p in range(len(x)):
+        slope, variance, _, energy = regress(
+            x[p], y[p], noise, weights[p], numbers[p, 3:], few, False
+        )
+        numbers[p, 0], numbers[p, 1], numbers[p, 2] = slope, variance, energy
