@@ -1,6 +1,7 @@
 """The default way through a capture: all steps of the separation, in one call."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -24,7 +25,7 @@ from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.held import hold
-from dbthermal.separation._solve import get_method, separated, solve
+from dbthermal.separation._solve import get_method, separated
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Array, Material
 
@@ -120,26 +121,20 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
-    one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
-    if alone is not None:
-        made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}
-        if any(alone.attrs.get(name) != value for name, value in made.items()):
-            raise ValueError(
-                "Invalid result alone. Must be of 'subspace', without materials, with "
-                f"{made['settings']}."
-            )
-        alone = laid_on(alone, corrected, "the result alone", "the capture")
-    given = alone
+    alone = None if alone is None else _checked(alone, corrected, known)
+    given, source, apart = alone, "given", 0.0
     if reflection_shift is None:
-        alone, reflection_shift, doubts = _apart(one, corrected, response, alone)
+        reflection_shift, apart = _shift(corrected, response)
         source = "none" if reflection_shift is None else "found"
-    else:
-        alone = one(reflection_shift=reflection_shift) if alone is None else alone
-        source, doubts = "given", _unexplained(alone)
-    result = alone
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
+    if alone is None or source == "found":
+        alone = separated(known, workers=workers, progress=progress)
+    doubts = [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
+    if reflection_shift is not None:
+        doubts = _unexplained(alone)
+    result = alone
     again = partial(separated, alone=alone, workers=workers, progress=progress)
     if materials is not None:
         result = again(replace(known, labels=numbered(corrected, materials)))
@@ -154,6 +149,17 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if materials is not None:
         result["material"] = materials
     return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
+
+
+def _checked(alone: xr.Dataset, corrected: xr.Dataset, known: Inputs) -> xr.Dataset:
+    """Result of each pixel alone that is at hand, in the order of the capture."""
+    made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}
+    if any(alone.attrs.get(name) != value for name, value in made.items()):
+        raise ValueError(
+            "Invalid result alone. Must be of 'subspace', without materials, with "
+            f"{made['settings']}."
+        )
+    return laid_on(alone, corrected, "the result alone", "the capture")
 
 
 def _over_found_materials(
@@ -173,24 +179,15 @@ def _over_found_materials(
     return result, groups[-1]
 
 
-def _apart(
-    one: Callable[..., xr.Dataset],
-    corrected: xr.Dataset,
-    response: xr.Dataset,
-    known: xr.Dataset | None,
-) -> tuple[xr.Dataset, xr.Dataset | None, list[str]]:
-    """First separation, the shift of the reflections if it needs one, and what is not explained."""
+def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | None, float]:
+    """Shift of the reflections where cameras stand apart, else how many windows are so for none."""
     apart = cameras_apart(corrected, response)
     if apart > 0.0:
-        try:
+        with suppress(ValueError):  # no shift explains it: the pixels keep the flag
             shift = alignment.reflection_shift(corrected, response)
-        except ValueError:  # no shift explains it: the pixels keep the flag
-            shift = None
-        if shift is not None and seen_apart(shift):
-            alone = one(reflection_shift=shift)
-            return alone, shift, _unexplained(alone)
-    first = one() if known is None else known
-    return first, None, [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
+            if seen_apart(shift):
+                return shift, 0.0
+    return None, apart
 
 
 def _unexplained(alone: xr.Dataset) -> list[str]:
