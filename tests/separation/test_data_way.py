@@ -23,7 +23,7 @@ from dbthermal import separation, simulation
 
 PACKAGE = Path(dbthermal.__file__).parent
 MOST_ROOMS, MOST_RETURNS = 14, 8
-MOST_OF_SEPARATE = {"one place": (25, 27), "apart": (35, 61)}
+MOST_OF_SEPARATE = {"one place": (25, 29), "apart": (36, 72)}
 
 Function = tuple[str, str]
 

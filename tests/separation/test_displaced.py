@@ -39,7 +39,7 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
 
 def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     """A pixel that is far too warm in the first band passes for no change of the object."""
-    scene = painted(1, picture=SMALL, time=TIME, shift=STRAIGHT)
+    scene = painted(2, picture=SMALL, time=TIME, shift=STRAIGHT)
     capture, shift = scene.capture, STRAIGHT
     stuck = np.zeros(SMALL.shape, dtype=np.uint32)
     stuck[4::6, 7::9] = int(Status.DEAD_PIXEL)
@@ -50,7 +50,7 @@ def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
     error = abs(result["object_temperature"] - scene.truth["object_temperature"]).mean("time")
     error = error.where(result["status"] == 0)
     assert float(error.notnull().mean()) > 0.75
-    assert float(error.max()) < 0.5
+    assert float(error.max()) < 0.4
 
 
 def test_known_emissivities_and_rapid_heating() -> None:

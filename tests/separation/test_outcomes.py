@@ -61,7 +61,7 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "three bands": Bounds(0.96, 0.055, emissivity=0.002, p90=0.057),
     "shutter events": Bounds(0.97, 0.155, emissivity=0.009, p90=0.245),
     # In one call a delay is taken for a shift: of some seeds without a warning.
-    "two frames late": Bounds(p90=0.72, whole=0.82, shift="found", said=""),
+    "two frames late": Bounds(p90=1.2, whole=0.82, shift="found", said="The bands"),
     "uneven times": Bounds(0.93, 0.065, emissivity=0.003, p90=0.084),
     # More of a drift than the prior's, along the object's curve: emissivities are 0.08 off.
     "drift": Bounds(0.79, 0.058, emissivity=0.095, p90=0.37, whole=0.82),
@@ -75,7 +75,7 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "dust": Bounds(0.67, 0.255, (0.91, 0.98), 0.005, 0.016, p90=0.385),
     # Of two other seeds 2 and 14 % of the pixels are measured.
     "rapid, nearly black, apart": Bounds(
-        0.30, silent=0.01, cover=(0.90, 0.99), whole=0.9, shift="found"
+        0.18, silent=0.07, cover=(0.90, 0.99), whole=0.9, shift="found", said="The bands"
     ),
     "lamp": Bounds(0.96, 0.070, (0.91, 0.98), emissivity=0.004, p90=0.095),
     # Too short intervals of too few pixels, where one outline tells the shift.

@@ -31,8 +31,9 @@ from dbthermal.separation._quality import Bits
 _ROUNDS: Final = 100
 _SOLVED: Final = 1e-3
 _UNSOLVED: Final = 1e-2
-# A place so far outside of the image is still at its border [pixel].
-_OUTSIDE: Final = 0.1
+# A place so far outside of the image is still at its border, as a shift that is known may be off by
+# so much [pixel].
+_OUTSIDE: Final = 0.2
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
 # Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
@@ -40,7 +41,7 @@ _LOST_WEIGHT: Final = 0.25
 _FEW: Final = 0.5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
-# Memory of samples that are kept, for a capture is read some twenty times [byte].
+# Memory of samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**30
 
 
