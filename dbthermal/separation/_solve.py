@@ -159,10 +159,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
               I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
 
-    Each pixel is solved as if x(p) were x(r); then what all reflect, along a few functions of time
-    and blurred alike, gives ratios as certain as neighbours agree on them; with these all pixels are
-    solved together for the object, and each once more with what follows for x(p). A pixel of which
-    the second camera does not see the reflection has the bit `no_reflection_pair`.
+    Each pixel is solved as if x(p) were x(r). What all reflect, along functions of time and blurred
+    alike, then gives ratios as certain as neighbours agree on them; with these all pixels together
+    are solved for the object, and each once more with what follows for x(p). A pixel of which the
+    second camera does not see the reflection has the bit `no_reflection_pair`.
 
     References
     ----------
