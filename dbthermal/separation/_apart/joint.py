@@ -210,12 +210,12 @@ def solve(
             shares = system.coefficients(inputs, raw, solved)[:, places]
             target, size = _by_film(inputs, result, raw, equations, shares, before)
 
-        def both(at: Whole, equations: system.Equations) -> tuple[Floats, Floats, Floats]:
+        def objects_at(at: Whole, equations: system.Equations) -> tuple[Floats, Floats, Floats]:
             """Object at both places and the last step (solved, frame) [K] of some frames."""
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
                 return equations.packed.solve(*target(at), change(at))
 
-        here, beside, _ = both(some, equations)
+        here, beside, _ = objects_at(some, equations)
         others = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
         share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
         if places.size == 0 or np.nanquantile(share, _MOST) <= _MATTERS:
@@ -229,13 +229,13 @@ def solve(
         elif not inputs.method.knows_emissivity:
             band = first[:, places], steps[:, places]
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, lambda it: both(some, it)[:2], band
+                inputs, result, raw, solved, equations, lambda it: objects_at(some, it)[:2], band
             )
-            here, beside, _ = both(some, equations)
+            here, beside, _ = objects_at(some, equations)
         signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
         unsettled, parts = np.zeros(solved.size, dtype=bool), frames.parts()
-        objects = threads.map(lambda part: both(frames.nodes[part], equations), parts)
-        for part, (*pair, step) in zip(parts, objects, strict=True):
+        results = threads.map(lambda part: objects_at(frames.nodes[part], equations), parts)
+        for part, (*pair, step) in zip(parts, results, strict=True):
             signals[:, part, places] = np.swapaxes(pair, 1, 2)
             unsettled[places] |= step > 10.0 * system.CONVERGED
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].

@@ -49,29 +49,29 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     """
     Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
 
-    Their variance is times the reduced chi-square about the mean of those around. A pixel that
-    shows its bands apart takes that mean, with the variance of the ratios around beside their mean.
+    Their variance is times the reduced chi-square about the mean of those around. A pixel whose
+    model does not hold takes that mean, with the variance of the ratios around beside their mean.
     """
     noise, scatters = inputs.noise[inputs.bands], planes.scatters(BLUR)
     shape = (len(noise), *status.shape)
     ratio = scatters.ratio
     variance = scatters.variance(ratio)
-    apart = scatters.apart.reshape(status.shape)
-    # Before the difference between the places is known, flags of the object say nothing.
-    unsound = Status.NO_BACKGROUND_MOTION if inputs.difference is None else ~Status.CONSTANT_OBJECT
-    known = ((status & np.uint32(unsound & 0xFFFFFFFF)) == 0) & ~apart
-    known &= planes.usable & np.all(np.isfinite(variance), axis=0).reshape(status.shape)
+    moving = planes.usable & ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0)
+    sound = moving & ~scatters.apart.reshape(status.shape)
+    sound &= np.all(np.isfinite(variance), axis=0).reshape(status.shape)
+    if inputs.difference is not None:  # else flags of the object say nothing
+        sound &= (status & ~np.uint32(Status.CONSTANT_OBJECT)) == 0
     ratio, variance = ratio.reshape(shape), variance.reshape(shape)
-    weight = np.divide(1.0, variance, out=np.zeros(shape), where=known & (variance > 0))
-    weight[0] = known
+    weight = np.divide(1.0, variance, out=np.zeros(shape), where=sound & (variance > 0))
+    weight[0] = sound
     mean = _mean(ratio, weight, _WIDE)
-    chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), known, _WIDE)
-    apart |= ~known & planes.usable & ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0)
-    apart &= gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
+    chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
+    around = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
+    doubtful = moving & ~sound & around
     variance = np.where(
-        apart, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
+        doubtful, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
     )
-    ratio = np.where(apart, mean, np.where(known, ratio, np.nan)).reshape(len(noise), -1)
+    ratio = np.where(doubtful, mean, np.where(sound, ratio, np.nan)).reshape(len(noise), -1)
     inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
     none = np.full(status.size, np.nan)
     return Material(

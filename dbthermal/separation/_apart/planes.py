@@ -105,9 +105,7 @@ class Planes:
         energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
         lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
         cost = energy[lowest:] + np.arange(lowest, orders)[:, np.newaxis] * np.log(frames)
-        order = np.minimum(
-            lowest + cost.argmin(axis=0) + int(__import__("os").environ.get("PLUS", "1")), orders
-        )
+        order = np.minimum(lowest + cost.argmin(axis=0) + 1, orders)
         whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
         return whole, variance * (order + self.steps) / frames
 
@@ -209,10 +207,12 @@ def _straighten(
         for p in range(pixels):
             share = emissivity[0, p]
             emitted = share * _polynomial_at(response, (film[t, p] - middle) / half)
+            if np.isnan(emitted):
+                continue
             background = min(max((signals[0, t, p] - emitted) / (1.0 - share), low), high)
             for band in range(1, bands):
-                bend = (1.0 - emissivity[band, p]) * _polynomial_at(bends[band - 1], background)
-                signals[band, t, p] -= 0.0 if np.isnan(bend) else bend
+                bend = _polynomial_at(bends[band - 1], background)
+                signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
 
 
 @compiled
@@ -230,10 +230,11 @@ def _without_object(
     for t in range(frames):
         for p in range(pixels):
             signal = _polynomial_at(response, (film[t, p] - middle) / half)
+            if np.isnan(signal * emissivity[0, p]):
+                continue
             for band in range(bands):
                 bend = _polynomial_at(bends[band - 1], signal) if band > 0 else 0.0
-                emitted = emissivity[band, p] * (signal + bend)
-                signals[band, t, p] -= 0.0 if np.isnan(emitted) else emitted
+                signals[band, t, p] -= emissivity[band, p] * (signal + bend)
 
 
 def _polynomial(curve: Curve) -> tuple[Array, float, float]:

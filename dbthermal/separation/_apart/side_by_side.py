@@ -1,7 +1,8 @@
 """Separation of cameras side by side: each pixel alone, and all together for the object, in turns.
 
-The pixels alone take the object of the second camera's place for that of the first one's, or know
-by how much the two differ from all pixels together (`joint`); these need the emissivities.
+A first separation takes the object at the second camera's place for that at the first. All pixels
+together tell by how much the two differ (`joint`), from maps of the signals where the object is
+smooth, else from another separation; with that each pixel is separated once more.
 """
 
 from collections.abc import Callable
@@ -30,27 +31,27 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
     """Separate without materials, then by the ratios of bands that are blurred alike."""
     assert inputs.displacement is not None
     each(inputs, None)
-    material, blur, maps, both = None, 0.0, None, None
+    material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
     if inputs.method.survey is not None and inputs.displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
-            both = joint.solve(inputs, result, threads, frames)
-            inputs = inputs if both is None else replace(inputs, difference=both.difference)
+            objects = joint.solve(inputs, result, threads, frames)
+            inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
             each(inputs, None)
         shares = neighbours.emissivities(inputs, result)
         maps = planes.project(inputs, result, shares, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
         if not frames.smooth:
             each(inputs, material)
-    both = joint.solve(
-        inputs, result, threads, frames, maps=maps, material=material, before=both, blur=blur
+    objects = joint.solve(
+        inputs, result, threads, frames, maps=maps, material=material, before=objects, blur=blur
     )
-    if both is not None:
-        inputs = replace(inputs, difference=both.difference)
-    if both is not None or material is not None:
+    if objects is not None:
+        inputs = replace(inputs, difference=objects.difference)
+    if objects is not None or material is not None:
         each(inputs, material)
-    if both is not None:
-        both.finish(result)
+    if objects is not None:
+        objects.finish(result)
 
 
 def pooled(
@@ -64,14 +65,14 @@ def pooled(
 ) -> None:
     """Separate with materials, from a result of each pixel alone before.
 
-    The first are told with the object of pixels alone, and may be off as these are; the second,
-    which may regroup them, with that of the first; and the last with that of what they are then.
+    The first are those of the object and emissivities of pixels alone, and may be regrouped; the
+    second those of what the first make of these.
     """
     frames = joint.Frames.of(before)
-    both: joint.Joint | None = joint.from_result(inputs, before, frames)
+    objects: joint.Joint | None = joint.from_result(inputs, before, frames)
     shares = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
-        inputs = replace(inputs, difference=None if both is None else both.difference)
+        inputs = replace(inputs, difference=None if objects is None else objects.difference)
         maps = planes.project(inputs, before, shares, threads)
         survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
@@ -79,18 +80,18 @@ def pooled(
         if not frames.smooth:
             each(inputs, material)
             source = result
-        both = joint.solve(
-            inputs, source, threads, frames, maps=maps, material=material, before=both
+        objects = joint.solve(
+            inputs, source, threads, frames, maps=maps, material=material, before=objects
         )
-        if both is None:  # the object hardly differs between the places
+        if objects is None:  # the object hardly differs between the places
             inputs = replace(inputs, difference=None)
             break
-        shares = both.emissivity
-    if both is not None:
-        inputs = replace(inputs, difference=both.difference)
+        shares = objects.emissivity
+    if objects is not None:
+        inputs = replace(inputs, difference=objects.difference)
     each(inputs, material)
-    if both is not None:
-        both.finish(result)
+    if objects is not None:
+        objects.finish(result)
 
 
 def regrouped(
