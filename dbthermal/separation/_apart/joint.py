@@ -93,13 +93,19 @@ class Frames:
         weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
         some = looked_at(time.size)
         apart = np.abs(weights[some] @ film[nodes] - film[some]) / std[some]
-        if nodes.size == time.size or not np.nanquantile(apart, _MOST) < _NO_MATTER:
+        if nodes.size == time.size or not _most(apart) < _NO_MATTER:
             return cls(every, None)
         return cls(nodes, weights)
 
     def parts(self) -> list[slice]:
         """Nodes that are solved together."""
         return [slice(at, at + _FRAMES) for at in range(0, self.nodes.size, _FRAMES)]
+
+
+def _most(values: Floats) -> float:
+    """Value that all but a few of those that are numbers do not exceed; NaN of none."""
+    numbers = values[np.isfinite(values)]
+    return float(np.quantile(numbers, _MOST)) if numbers.size else np.nan
 
 
 def looked_at(frames: int) -> Whole:
@@ -218,7 +224,7 @@ def solve(
         here, beside, _ = objects_at(some, equations)
         others = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
         share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
-        if places.size == 0 or np.nanquantile(share, _MOST) <= _MATTERS:
+        if not _most(share) > _MATTERS:
             return None
         emissivity = system.inside(raw)
         of_slope: Floats = np.zeros(solved.size)
@@ -357,7 +363,7 @@ def _emissivities(
             shares=system.coefficients(inputs, emissivity, solved),
         )
         change = np.abs(emissivity - before)[0, solved]
-        if np.nanquantile(change, _MOST) < _SETTLED:
+        if _most(change) < _SETTLED:
             break
     return equations, emissivity, variance
 
