@@ -66,7 +66,7 @@ BOUNDS: Final[dict[str, Bounds]] = {
     # More of a drift than the prior's, along the object's curve: emissivities are 0.08 off.
     "drift": Bounds(0.79, 0.058, emissivity=0.095, p90=0.37, whole=0.82),
     "nobody": Bounds(p90=0.23),
-    "slow, apart": Bounds(0.82, 0.065, (0.92, 0.99), emissivity=0.02, p90=0.195, shift="found"),
+    "slow, apart": Bounds(0.82, 0.065, (0.92, 0.99), emissivity=0.03, p90=0.195, shift="found"),
     "hot, half still": Bounds(0.60, 0.095, (0.91, 1.0), emissivity=0.012, p90=12.0),
     "hot, half constant": Bounds(0.96, 0.027, emissivity=0.001, p90=0.039),
     "thermostat": Bounds(p90=0.88, whole=0.97),
