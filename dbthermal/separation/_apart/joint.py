@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
-from dbthermal.separation._tiles import Material
+from dbthermal.separation._tiles import USELESS, Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20
@@ -244,6 +244,7 @@ def solve(
         for part, (*pair, step) in zip(parts, results, strict=True):
             signals[:, part, places] = np.swapaxes(pair, 1, 2)
             unsettled[places] |= step > 10.0 * system.CONVERGED
+        signals[np.abs(signals) > USELESS] = np.nan
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
@@ -329,6 +330,7 @@ def from_result(inputs: Inputs, result: xr.Dataset, frames: Frames) -> Joint:
             signal = (curve.signal(nodes[part][:, places]) - curve.reference).T
             beside = equations.packed.beside(signal, change(frames.nodes[part]))
             signals[:, part, places] = signal.T, beside.T
+        signals[np.abs(signals) > USELESS] = np.nan
     unsettled = np.zeros(solved.size, dtype=bool)
     return Joint(inputs, frames, signals, emissivity, np.ones(solved.size), unsettled)
 
