@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 # how many times a window's changes have to exceed the noise, in variance.
 _FRAMES, _ALONG, _SIDES, _FEWEST, _BLUR = 400, 8, (8, 16), 4, 2.0
 _CHANCE, _LEAST, _LEAST_LATE, _STRONG = 1e-3, 0.3, 0.1, 3.0
-# Functions of time, pixels that tell them, and share of its samples that a pixel must have.
+# Functions of time, pixels that tell them, and samples of a pixel over those of others.
 _PLANES, _TOLD_BY, _COMMON = 32, 100, 0.9
 _UNEXPLAINED: Final = (
     "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
@@ -305,7 +305,7 @@ def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:
 def _filled(films: Array) -> Array:
     """Films (band, time, pixel) in which a sample that a band lacks is that before it.
 
-    Zero of a pixel that lacks more than a tenth of them.
+    Zero of a pixel that has fewer than nine tenths of those that another has: a frame may be lost.
     """
     known = schema.measured(films).all(axis=0)
     if known.all():
@@ -313,4 +313,5 @@ def _filled(films: Array) -> Array:
     frame = np.maximum.accumulate(np.where(known, np.arange(len(known))[:, np.newaxis], -1))
     frame = np.where(frame < 0, known.argmax(axis=0), frame)
     filled = np.take_along_axis(films, frame[np.newaxis], axis=1)
-    return np.where(known.mean(axis=0) > _COMMON, filled, np.float32(0.0))
+    share = known.mean(axis=0)
+    return np.where(share > _COMMON * share.max(), filled, np.float32(0.0))
