@@ -25,7 +25,7 @@ from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.held import hold
-from dbthermal.separation._solve import get_method, separated
+from dbthermal.separation._solve import get_method, require_workers, separated
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 from dbthermal.separation._tiles import Array, Material
 
@@ -115,6 +115,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
+    require_workers(workers)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
