@@ -115,10 +115,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
-    require_workers(workers)
     beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
+    require_workers(workers)
     known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
     response = known.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
