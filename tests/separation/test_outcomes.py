@@ -61,12 +61,12 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "three bands": Bounds(0.96, 0.055, emissivity=0.002, p90=0.057),
     "shutter events": Bounds(0.97, 0.155, emissivity=0.009, p90=0.245),
     # In one call a delay is taken for a shift: of some seeds without a warning.
-    "two frames late": Bounds(p90=1.2, whole=0.82, shift="found", said="The bands"),
+    "two frames late": Bounds(p90=0.72, whole=0.82, shift="found", said=""),
     "uneven times": Bounds(0.93, 0.065, emissivity=0.003, p90=0.084),
     # More of a drift than the prior's, along the object's curve: emissivities are 0.08 off.
     "drift": Bounds(0.79, 0.058, emissivity=0.095, p90=0.37, whole=0.82),
     "nobody": Bounds(p90=0.23),
-    "slow, apart": Bounds(0.82, 0.065, (0.92, 0.99), emissivity=0.03, p90=0.195, shift="found"),
+    "slow, apart": Bounds(0.82, 0.065, (0.92, 0.99), emissivity=0.02, p90=0.195, shift="found"),
     "hot, half still": Bounds(0.60, 0.095, (0.91, 1.0), emissivity=0.012, p90=12.0),
     "hot, half constant": Bounds(0.96, 0.027, emissivity=0.001, p90=0.039),
     "thermostat": Bounds(p90=0.88, whole=0.97),
@@ -75,7 +75,7 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "dust": Bounds(0.67, 0.255, (0.91, 0.98), 0.005, 0.016, p90=0.385),
     # Of two other seeds 2 and 14 % of the pixels are measured.
     "rapid, nearly black, apart": Bounds(
-        0.18, silent=0.07, cover=(0.90, 0.99), whole=0.9, shift="found", said="The bands"
+        0.30, silent=0.07, cover=(0.90, 0.99), whole=0.9, shift="found"
     ),
     "lamp": Bounds(0.96, 0.070, (0.91, 0.98), emissivity=0.004, p90=0.095),
     # Too short intervals of too few pixels, where one outline tells the shift.
@@ -85,16 +85,25 @@ BOUNDS: Final[dict[str, Bounds]] = {
         0.34, 0.82, (0.69, 0.98), 0.04, 0.026, p90=0.92, whole=0.75, shift="found", said="The bands"
     ),
 }
+# Bounds that are missed since the ratios of cameras apart are those of maps.
+MISSED: Final = {
+    "two frames late": "p90 1.05 K: the field of the shift explains more of a delay",
+    "slow, apart": "emissivity 0.027 off: the ratio is that of rapid changes alone",
+    "rapid, nearly black, apart": "measured 0.20, and a warning: flags of a first pass are lost",
+}
 SLOW: Final = {
     *("still half, apart", "rapid, apart", "rapid, nearly black, apart"),
     *("slow, apart", "lamp, apart", "two depths"),
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in BOUNDS],
-)
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    """Marks of a scene that takes long, or misses its bounds."""
+    missed = [pytest.mark.xfail(reason=MISSED[name], strict=True)] if name in MISSED else []
+    return missed + ([pytest.mark.slow] if name in SLOW else [])
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in BOUNDS])
 def test_separate(shelf: Shelf, name: str) -> None:
     """Temperatures, intervals, emissivities, flags, the shift and the warnings of each scene."""
     outcome, bounds = shelf.outcome(name), BOUNDS[name]
