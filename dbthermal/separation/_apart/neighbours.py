@@ -36,8 +36,6 @@ BLUR: Final = 1.0
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
-# Side of the squares whose sums tell what neighbours share: beyond the blur [pixel].
-_SQUARE: Final = 8
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
 _SOME: Final = 0.1
 # Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
@@ -104,7 +102,6 @@ def materials(
             image = Image(inputs.labels, places, planes.usable.shape[1])
             survey = _survey(planes.scatters(blur), alone, noise, places)
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
-            wider = replace(wider, inverse_energy=_of_squares(wider, survey, image, noise))
             sharp = wider if sharp is None else sharp
             material = wider if material is None else _blurred(sharp, material, wider, inputs)
     if material is None:
@@ -113,26 +110,6 @@ def materials(
     variance, none = material.inverse_energy + material.spread, np.zeros_like(material.spread)
     material = replace(material, inverse_energy=variance, spread=none)
     return pool.materials(inputs, threads, bar, known=material)
-
-
-def _of_squares(material: Material, survey: Survey, image: Image, noise: Array) -> Array:
-    """Variance (pixel) [1/K^2] of the ratios of materials, at least by what squares of them show.
-
-    Of a scatter C a pixel tells by c_1m - kappa_m c_11 how its ratio differs; errors of the shift,
-    which neighbours share, are larger in the sum over a square than noise is.
-    """
-    labels, places = image.labels[image.surveyed], np.divmod(image.surveyed, image.width)
-    count, used = int(image.labels.max()) + 1, survey.frames > 0
-    scatter = survey.scatter * noise[:, np.newaxis, np.newaxis] * noise[:, np.newaxis]
-    ratio = material.ratio[:, image.surveyed]
-    off = np.where(used, scatter[0] - ratio * scatter[0, 0], 0.0)
-    square = (places[0] // _SQUARE) * image.width + places[1] // _SQUARE
-    key, group = np.unique(square * count + labels, return_inverse=True)
-    energy = np.bincount(labels, np.where(used, scatter[0, 0], 0.0), count)
-    total = np.stack([np.bincount(group, part) ** 2 for part in off])
-    variance = np.stack([np.bincount(key % count, part, count) for part in total]) / energy**2
-    inverse = energy_of_variance(material.ratio, image.expand(variance), noise).max(axis=0)
-    return np.asarray(np.fmax(material.inverse_energy, inverse))
 
 
 def _survey(

@@ -11,7 +11,7 @@ they are, and a map of each product is blurred at once, not a film.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -142,8 +142,7 @@ def project(
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
     noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
-    response = _polynomial(inputs.curves[bands[0]])
-    bends = system.bends([inputs.curves[band] for band in bands])
+    response = _response([inputs.curves[band] for band in bands])
     film = result["object_temperature"].values.reshape(len(rapid), -1)
 
     def block(rows: slice) -> None:
@@ -157,7 +156,7 @@ def project(
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
                 x, shares = film[frames][:, places], emissivity[:, places].astype(np.float64)
                 signals = np.ascontiguousarray(tile.signals)
-                _straighten(signals, x, shares, *response, bends)
+                _straighten(signals, x, shares, response)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
@@ -165,7 +164,7 @@ def project(
                     there = np.searchsorted(cut.places, places)
                     for band, part in enumerate(more, 1):
                         straight[band][:, places] += inverse @ part[:, there]
-                _without_object(signals, x, shares, *response, bends)
+                _without_object(signals, x, shares, response)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = rest.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
@@ -175,6 +174,15 @@ def project(
 
     list(threads.map(block, inputs.blocks))
     return Planes(maps, straight, columns.object_part, columns.steps, noise, freedom, usable)
+
+
+class Response(NamedTuple):
+    """Responses of the bands, as polynomials."""
+
+    series: Array  # signal of the first less the reference [K], of temperatures over the range
+    middle: float  # of the range [K]
+    half: float
+    bends: Array  # signals of the others less that of the first (band - 1, degree), of it [K]
 
 
 @compiled
@@ -187,14 +195,15 @@ def _polynomial_at(series: Array, place: float) -> float:
 
 
 @compiled
+def _emitted(response: Response, temperature: float) -> float:
+    """Signal of a blackbody in the first band less the reference [K]."""
+    place = (temperature - response.middle) / response.half
+    return float(_polynomial_at(response.series, place))
+
+
+@compiled
 def _straighten(
-    signals: Array,
-    film: npt.NDArray[np.float32],
-    emissivity: Array,
-    response: Array,
-    middle: float,
-    half: float,
-    bends: Array,
+    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
     """Take the bend of the background out of signals (band, time, pixel) [K], in place.
 
@@ -202,48 +211,43 @@ def _straighten(
     not known nothing is taken out.
     """
     bands, frames, pixels = signals.shape
-    low, high = _polynomial_at(response, -1.0), _polynomial_at(response, 1.0)
+    low, high = _polynomial_at(response.series, -1.0), _polynomial_at(response.series, 1.0)
     for t in range(frames):
         for p in range(pixels):
             share = emissivity[0, p]
-            emitted = share * _polynomial_at(response, (film[t, p] - middle) / half)
+            emitted = share * _emitted(response, film[t, p])
             if np.isnan(emitted):
                 continue
             background = min(max((signals[0, t, p] - emitted) / (1.0 - share), low), high)
             for band in range(1, bands):
-                bend = _polynomial_at(bends[band - 1], background)
+                bend = _polynomial_at(response.bends[band - 1], background)
                 signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
 
 
 @compiled
 def _without_object(
-    signals: Array,
-    film: npt.NDArray[np.float32],
-    emissivity: Array,
-    response: Array,
-    middle: float,
-    half: float,
-    bends: Array,
+    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
     """Take an object (time, pixel) [K] out of signals (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
     for t in range(frames):
         for p in range(pixels):
-            signal = _polynomial_at(response, (film[t, p] - middle) / half)
+            signal = _emitted(response, film[t, p])
             if np.isnan(signal * emissivity[0, p]):
                 continue
             for band in range(bands):
-                bend = _polynomial_at(bends[band - 1], signal) if band > 0 else 0.0
+                bend = _polynomial_at(response.bends[band - 1], signal) if band > 0 else 0.0
                 signals[band, t, p] -= emissivity[band, p] * (signal + bend)
 
 
-def _polynomial(curve: Curve) -> tuple[Array, float, float]:
-    """Signal less the reference (degree) of temperatures over a middle and a half [K]."""
-    low, high = curve.lowest, curve.highest
+def _response(curves: list[Curve]) -> Response:
+    """Polynomials of the responses of the bands, the quietest first."""
+    low, high = curves[0].lowest, curves[0].highest
     kelvin = np.linspace(low, high, 64)
-    signal = curve.signal(kelvin) - curve.reference
-    series = Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef
-    return np.asarray(series, np.float64), 0.5 * (low + high), 0.5 * (high - low)
+    signal = curves[0].signal(kelvin) - curves[0].reference
+    series = np.asarray(Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef, np.float64)
+    bends = system.bends(curves).astype(np.float64)
+    return Response(series, 0.5 * (low + high), 0.5 * (high - low), bends)
 
 
 def _interpolated(inputs: Inputs) -> Array:
