@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -217,7 +217,7 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
         forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
-        bends=bends([inputs.curves[band] for band in inputs.bands]),
+        bends=bends(tuple(inputs.curves[band] for band in inputs.bands)),
     )
 
 
@@ -229,7 +229,8 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def bends(curves: list[Curve]) -> Floats:
+@lru_cache
+def bends(curves: tuple[Curve, ...]) -> Floats:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)

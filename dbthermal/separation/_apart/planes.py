@@ -142,7 +142,7 @@ def project(
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
     noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
-    response = _response([inputs.curves[band] for band in bands])
+    response = _response(tuple(inputs.curves[band] for band in bands))
     film = result["object_temperature"].values.reshape(len(rapid), -1)
 
     def block(rows: slice) -> None:
@@ -154,8 +154,10 @@ def project(
                 few = columns.functions[frames]
                 inverse = np.linalg.solve(few.T @ few, few.T)
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
-                x, shares = film[frames][:, places], emissivity[:, places].astype(np.float64)
-                signals = np.ascontiguousarray(tile.signals)
+                x = film[:, places] if frames.all() else film[np.ix_(frames, places)]
+                shares = emissivity[:, places].astype(np.float64)
+                inverse, rest = inverse.astype(np.float32), rest.astype(np.float32)
+                signals = np.ascontiguousarray(tile.signals, np.float32)
                 _straighten(signals, x, shares, response)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
@@ -168,7 +170,7 @@ def project(
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = rest.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
-                freedom[row, column] = np.sum(rest**2)
+                freedom[row, column] = np.sum(rest**2, dtype=np.float64)
                 usable[row, column] = True
         release()
 
@@ -240,7 +242,7 @@ def _without_object(
                 signals[band, t, p] -= emissivity[band, p] * (signal + bend)
 
 
-def _response(curves: list[Curve]) -> Response:
+def _response(curves: tuple[Curve, ...]) -> Response:
     """Polynomials of the responses of the bands, the quietest first."""
     low, high = curves[0].lowest, curves[0].highest
     kelvin = np.linspace(low, high, 64)

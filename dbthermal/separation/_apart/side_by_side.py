@@ -73,7 +73,9 @@ def pooled(
     shares = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
-        maps = planes.project(inputs, before, shares, threads)
+        # Of a smooth object the difference changes no rapid product.
+        plain = replace(inputs, difference=None) if frames.smooth else inputs
+        maps = planes.project(plain, before, shares, threads)
         survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
