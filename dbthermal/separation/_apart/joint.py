@@ -28,7 +28,7 @@ import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, copied, release
+from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours
@@ -200,20 +200,14 @@ def solve(
     else that of the result. None where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        raw = system.first_emissivity(inputs, result)
         maps = maps if frames.smooth else None
-        solved = system.told(film)[0]
-        if maps is not None and material is not None:
-            raw, given = system.of_material(inputs, raw, material)
-            solved |= given & maps.usable.ravel()
-        solved &= np.all(np.isfinite(raw), axis=0)
+        raw, solved = _solvable(inputs, result, maps, material)
         equations = system.equations(inputs, system.inside(raw), solved)
         pooled = material is not None and np.isfinite(material.emissivity).any()
-        places, sampled = equations.solved, looked_at(len(film))
+        places, sampled = equations.solved, looked_at(result.sizes["time"])
         if pooled and frames.smooth:
             sampled = frames.nodes
-        first, steps, change, variance = system.first_band(inputs, equations.loose, sampled)
+        change = system.change(inputs, equations.loose)
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)
         else:
@@ -227,7 +221,7 @@ def solve(
             combination, guess = target(at)
             guess = guess if start is None else np.where(np.isfinite(start), start, guess)
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
-                return equations.packed.solve(combination, guess, change(at))
+                return equations.packed.solve(combination, guess, change.at(at))
 
         # The object at both places at a few frames: does its gradient matter?
         start = None
@@ -246,31 +240,53 @@ def solve(
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
+            first, steps = system.samples(inputs, sampled)
             band = first[:, places], steps[:, places]
             solve_at = partial(objects_at, sampled)
             equations, emissivity, of_slope = _emissivities(
                 inputs, result, raw, solved, equations, solve_at, (here, beside), band
             )
             here, beside, _ = objects_at(sampled, equations, here)
-        # The object at all nodes.
-        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
-        unsettled = np.zeros(solved.size, dtype=bool)
         solutions = [(slice(None), (here, beside, step))]
         if sampled is not frames.nodes:
             parts = frames.parts()
             results = threads.map(lambda part: objects_at(frames.nodes[part], equations), parts)
             solutions = list(zip(parts, results, strict=True))
-        for part, (*pair, step) in solutions:
-            signals[:, part, places] = np.swapaxes(pair, 1, 2)
-            unsettled[places] |= step > 10.0 * system.CONVERGED
-        signals[np.abs(signals) > USELESS] = np.nan
+        signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
         off *= equations.spread(np.mean((beside - here) ** 2, axis=1))
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
-    errors = partial(_factor, inputs, equations, np.array(sizes), variance, blur)
+    errors = partial(_factor, inputs, equations, np.array(sizes), change.variance, blur)
     return Joint(inputs, frames, signals, emissivity, errors, unsettled)
+
+
+def _solvable(
+    inputs: Inputs, result: xr.Dataset, maps: Planes | None, material: Material | None
+) -> tuple[Floats, Mask]:
+    """Emissivities (band, pixel) [1] of the equations, and the pixels that have one."""
+    film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
+    raw, solved = system.first_emissivity(inputs, result), system.told(film)[0]
+    if maps is not None and material is not None:
+        raw, given = system.of_material(inputs, raw, material)
+        solved |= given & maps.usable.ravel()
+    return raw, solved & np.all(np.isfinite(raw), axis=0)
+
+
+def _spread(
+    solutions: list[tuple[slice, tuple[Floats, Floats, Floats]]],
+    shape: tuple[int, int],
+    places: Whole,
+) -> tuple[Floats, Mask]:
+    """Signals (2, node, pixel) [K] of solutions of some nodes, and the pixels that go on moving."""
+    signals = np.full((2, *shape), np.nan, np.float32)
+    unsettled = np.zeros(shape[1], dtype=bool)
+    for part, (*pair, step) in solutions:
+        signals[:, part, places] = np.swapaxes(pair, 1, 2)
+        unsettled[places] |= step > 10.0 * system.CONVERGED
+    signals[np.abs(signals) > USELESS] = np.nan
+    return signals, unsettled
 
 
 Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
@@ -334,27 +350,6 @@ def _by_film(
     return target, np.sqrt(np.mean(stds**2, axis=0))
 
 
-def from_result(inputs: Inputs, result: xr.Dataset, frames: Frames) -> Joint:
-    """Object of both places of a result that is solved already."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        emissivity = system.inside(system.first_emissivity(inputs, result))
-        solved = np.all(np.isfinite(emissivity), axis=0) & system.told(film)[0]
-        equations = system.equations(inputs, emissivity, solved)
-        change = system.first_band(inputs, equations.loose, looked_at(len(film)))[2]
-        curve, places = inputs.curves[inputs.bands[0]], equations.solved
-        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
-        nodes = system.bridge(film[frames.nodes], solved)
-        for part in frames.parts():
-            signal = (curve.signal(nodes[part][:, places]) - curve.reference).T
-            beside = equations.packed.beside(signal, change(frames.nodes[part]))
-            signals[:, part, places] = signal.T, beside.T
-        signals[np.abs(signals) > USELESS] = np.nan
-    unsettled = np.zeros(solved.size, dtype=bool)
-    ones = np.ones(solved.size)
-    return Joint(inputs, frames, signals, emissivity, lambda: ones, unsettled)
-
-
 def _emissivities(
     inputs: Inputs,
     result: xr.Dataset,
@@ -363,7 +358,7 @@ def _emissivities(
     equations: system.Equations,
     solve_at: Callable[[system.Equations, Floats], tuple[Floats, Floats, Floats]],
     places: tuple[Floats, Floats],
-    band: tuple[Array, Array],
+    band: tuple[Floats, Floats],
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
@@ -393,7 +388,7 @@ def _emissivities(
 
 
 def _emission(
-    places: tuple[Floats, Floats], band: tuple[Array, Array], emissivity: Floats, noise: float
+    places: tuple[Floats, Floats], band: tuple[Floats, Floats], emissivity: Floats, noise: float
 ) -> tuple[Floats, Floats, Mask]:
     """
     Emissivity of the first band as its slope over the object, its variance, and where it is told.
@@ -402,7 +397,7 @@ def _emission(
     the camera in it (frame, solved).
     """
     own = places[0].T.astype(np.float64)
-    line = residuals.regress(own, band[0], noise)
+    line = residuals.regress(own, np.asarray(band[0], np.float64), noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     steep = np.maximum(_slope(*places), 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
@@ -419,6 +414,7 @@ def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
     return np.where(np.isfinite(slope), slope, 1.0)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _factor(
     inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
 ) -> Floats:
