@@ -265,7 +265,7 @@ def gpu() -> str:
 
 
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
-"""Marks around the default call's figures in README.md and docs/benchmarks.md."""
+"""Marks around the default call's figures in docs/benchmarks.md."""
 
 DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
 pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` treats each
@@ -427,10 +427,10 @@ def figure(times: Times) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, and write results/bench/benchmarks.md and .png; README and docs too, if asked."""
+    """Measure, and write results/bench/benchmarks.md and .png; the page in docs too, if asked."""
     parser = argparse.ArgumentParser(prog="reproduction.benchmark", description=__doc__)
     parser.add_argument("--default-call", action="store_true", help="measure nothing else")
-    parser.add_argument("--write", action="store_true", help="write README.md and docs, too")
+    parser.add_argument("--write", action="store_true", help="write docs/benchmarks.md, too")
     chosen = parser.parse_args(arguments)
     busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
     folder.mkdir(parents=True, exist_ok=True)
@@ -440,7 +440,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             calls[name] = call
             print(*name, call, flush=True)
     text = default = default_figures(calls, busy)
-    readme, page = paths.root() / "README.md", paths.root() / "docs" / "benchmarks.md"
+    page = paths.root() / "docs" / "benchmarks.md"
     if not chosen.default_call:
         times = all_series()
         with TemporaryDirectory(dir=folder) as place:
@@ -451,9 +451,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             page.write_text(text, encoding="utf-8")
     store.save_text(text, folder / "benchmarks.md", record)
     if chosen.write:
-        for path in (readme, page):
-            old = path.read_text(encoding="utf-8")
-            path.write_text(verify.enclosed(old, MARKS, default, path.name), encoding="utf-8")
+        old = page.read_text(encoding="utf-8")
+        page.write_text(verify.enclosed(old, MARKS, default, page.name), encoding="utf-8")
     print(text)
     return 0
 
