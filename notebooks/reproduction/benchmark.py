@@ -261,20 +261,20 @@ def machine() -> str:
 
 def gpu() -> str:
     """Name of the first GPU of torch."""
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "a GPU was not at hand"
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
 
 
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
 """Marks around the default call's figures in docs/benchmarks.md."""
 
 DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
-pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` treats each
-pixel alone, and is told the shift between cameras apart. Times are of one thread's processor,
-after a first call that compiles; errors are medians over the pixels without a flag. What is
-measured of 640x512 pixels is one capture, by the clock, with two threads.
+pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` works pixel
+by pixel, and for displaced cameras its time does not include the shift of the reflections. Times
+are processor times of one thread, after a first call that compiles; errors are medians over the
+unflagged pixels. Frames of 640x512 are one capture, timed by the clock, with two threads.
 
 {machine}.
-Load when it began: {busy:.1f}; the clock's figures are too slow where others work on it.
+Load average at the start: {busy:.1f}; on a loaded computer, times by the clock are too long.
 
 {table}
 """
@@ -282,8 +282,8 @@ Load when it began: {busy:.1f}; the clock's figures are too slow where others wo
 HEAD: Final = """# Benchmarks
 
 Made by `make bench` on {machine}.
-Load of the machine when it began: {busy:.1f}; where others work on it, what is of the clock is too
-slow. All captures are simulated.
+Load average at the start: {busy:.1f}; on a loaded computer, times by the clock are too long. All
+captures are simulated.
 
 ## The default call
 
@@ -293,22 +293,22 @@ slow. All captures are simulated.
 
 {ratios}
 
-Processor time of one thread, {frames} frames, two bands, the most pixels. Exponents are those of a
-power law over the sizes in brackets, for at small ones what has nothing to do with the size counts;
-over frames of {few} pixels, over bands of {pixels}.
+Processor time of one thread, {frames} frames, two bands, the largest number of pixels. Exponents
+are those of a power law over the sizes in brackets; small sizes contain a constant part. Series
+over frames have {few} pixels, series over bands {pixels}.
 
 {methods}
 
 `subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
 
-`subspace` by the form of its steps ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
-thread, of a GPU the clock's; {gpu}. Bytes are those of the samples and of the four films
-of results, against what a copy reads and writes in the same memory.
+`subspace` compiled and on tensors ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
+thread, on a GPU by the clock; {gpu}. Bytes are those of the samples and of the four films
+of results, compared with a copy in the same memory.
 
 {forms}
 
-On paper, from the rate of {processes} processes, with nothing lost between machines, which share
-only a disk.
+Estimates from the rate of {processes} processes, without any loss between computers that share only
+a disk.
 
 {costs}
 """
