@@ -40,6 +40,6 @@ def test_links_lead_to_files() -> None:
 
 def test_continuous_integration_runs_its_test_command() -> None:
     """The command that README prints for the tests is the one that .ci/run calls."""
-    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert "\nmake test " in README
-    assert "\nmake test " in script
+    if (script := ROOT / ".ci" / "run").exists():  # not in a source distribution
+        assert "\nmake test " in script.read_text(encoding="utf-8")

@@ -195,6 +195,7 @@ def _pivot(
     yield ("case", *heads.values())
     for row, values in cells.items():
         case = ", ".join(_WORDS.get(word, word) for word in row.split(", "))
+        case = case.replace(" frames apart", " frames between the clocks")
         yield (case, *(values.get(head, "") for head in heads.values()))
 
 
