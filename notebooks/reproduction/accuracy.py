@@ -16,7 +16,7 @@ _SCENE: Final = "scene of README"
 _HELD: Final = "95 % intervals that hold"
 _MODERATE: Final = ": error at moderate noise"
 
-_SINGLE: Final = {
+_SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
     "Temperature and emissivity": {
         "03_simulation": (
             ("object: median RMSE", r"0\.86/0\.72, to 60 C: object temperature RMSE", "K"),
@@ -175,7 +175,8 @@ def _lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
 def _value(numbers: Numbers, stem: str, pattern: str, unit: str) -> str:
     """Range of the numbers of a notebook whose names, without their unit, fit a pattern."""
     named = re.compile(rf"({pattern})( \[.*\])?")
-    found = [v for k, v in numbers.get(stem, {}).items() if named.fullmatch(k)]
+    values = numbers.get(stem, {}).items()
+    found = [v for k, v in values if named.fullmatch(k) and not isinstance(v, str)]
     if not found:
         return "not measured"
     ends = dict.fromkeys(_text(end, unit) for end in (min(found), max(found)))
