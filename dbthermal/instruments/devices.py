@@ -243,8 +243,12 @@ def open_devices(
             opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
             wheel = stack.enter_context(opened)
         if session.thermocouples:
-            url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
-            logger = stack.enter_context(TC08.from_url(url, world=world))
+            if world is None:
+                logger = TC08.from_url(session.devices["thermocouples"])
+            else:
+                unit = _emulated("tc08").EmulatedTC08(world.thermocouple_temperature, world.clock)
+                logger = TC08(unit).open()
+            stack.enter_context(logger)
             logger.set_channels(session.thermocouples)
             thermocouples = Thermocouples(logger, session.thermocouples)
         yield Devices(session, sources, cameras, wheel, thermocouples, world)

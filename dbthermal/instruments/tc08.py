@@ -11,7 +11,6 @@ blackbody, and see whether the reading follows.
 
 import ctypes
 import ctypes.util
-import importlib
 import os
 from collections.abc import Collection, Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
@@ -130,6 +129,16 @@ class TC08(Closing):
     """A TC-08, for one thread at a time; opened by `from_url` or `open`.
 
     The `library` is from `load`, or an emulated one.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.emulated import tc08, world
+    >>> bench = world.World(blackbody_temperature=310.0)
+    >>> bench.thermocouples[1] = "blackbody"
+    >>> with TC08(tc08.EmulatedTC08(bench.thermocouple_temperature, bench.clock)).open() as logger:
+    ...     logger.set_channels([1])
+    ...     print(f"{logger.single().temperature[1]:.2f} K")
+    310.00 K
     """
 
     def __init__(self, library: Library) -> None:
@@ -139,30 +148,12 @@ class TC08(Closing):
         self._has_channels = False
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: Any = None) -> Self:
-        """Load the library and open the first free unit, at ``tc08:`` or ``sim://tc08`` in a world.
+    def from_url(cls, url: str = "tc08:") -> Self:
+        """Load the vendor's library and open the first free unit, at the address ``tc08:``.
 
         No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
-        another address, or the world is missing or given to a real unit; else the errors of `load`
-        and `open`.
-
-        Examples
-        --------
-        >>> from dbthermal.instruments.emulated.world import World
-        >>> bench = World(blackbody_temperature=310.0)
-        >>> bench.thermocouples[1] = "blackbody"
-        >>> with TC08.from_url("sim://tc08", world=bench) as logger:
-        ...     logger.set_channels([1])
-        ...     print(f"{logger.single().temperature[1]:.2f} K")
-        310.00 K
+        another address; else the errors of `load` and `open`.
         """
-        if (url == "sim://tc08") != (world is not None):
-            raise ValueError(
-                f"Invalid address '{url}'. Must be sim://tc08 with a world, and only then."
-            )
-        if world is not None:
-            module: Any = importlib.import_module("dbthermal.instruments.emulated.tc08")
-            return cls(module.EmulatedTC08(world.thermocouple_temperature, world.clock)).open()
         parse(url, ("tc08",))
         return cls(load()).open()
 

@@ -1,13 +1,17 @@
-"""Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
+"""Raw 16-bit frames (Y16) of any camera on Linux, with the kernel's stamps, numbers and flags.
 
 A thin use of Video4Linux2, in ten calls; numbers, sizes and layouts are those of 64-bit Linux
 (``linux/videodev2.h``, https://docs.kernel.org/userspace-api/media/v4l). The kernel's stamp of a
 frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure; likely,
 unless that module is told to use the camera's clock, it is of the frame's first packet.
+
+`KIND` is a camera without command port or telemetry: nothing is known of it but its frames. The
+state of its shutter follows from frozen images, see `camera.next_shutter`, and it corrects its
+offsets when it decides to.
 """
 
 import errno
-import fcntl
+import importlib
 import mmap
 import os
 import select
@@ -23,6 +27,7 @@ from dbthermal.instruments.camera import (
     DAMAGED,
     FRAME_TIMEOUT,
     GOOD,
+    CameraKind,
     Counts,
     Frame,
     FrameFlag,
@@ -34,18 +39,15 @@ from dbthermal.instruments.camera import (
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
-if not sys.platform.startswith("linux"):
-    raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
-
-__all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
+__all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
 
 Y16: Final = 0x20363159
 """Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control."""
 
 BUFFERS: Final = 32
-"""Frames that the kernel holds while no program reads, the most it can; beyond, it drops: half a
-second at 60 Hz, in which a busy computer gets round to read again."""
+"""Frames that the kernel holds while no program reads, the most it can: half a second at 60 Hz, in
+which a busy computer gets round to read again. Beyond, it drops frames."""
 
 QUERYCAP: Final = 0x80685600
 ENUM_FMT: Final = 0xC0405602
@@ -87,7 +89,9 @@ class Kernel:
 
     open: Callable[[str, int], int] = os.open
     close: Callable[[int], None] = os.close
-    ioctl: Callable[[int, int, bytearray], int] = fcntl.ioctl
+    ioctl: Callable[[int, int, bytearray], int] = field(
+        default_factory=lambda: importlib.import_module("fcntl").ioctl  # not on Windows
+    )
     map: Callable[[int, int, int], Any] = field(
         default=lambda file, length, offset: mmap.mmap(file, length, offset=offset)
     )
@@ -244,8 +248,18 @@ class Capture(Closing):
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
-    """Open the node of an address ``v4l2:///dev/video0``; ValueError if it is of another kind."""
-    return Capture(parse(url, ("v4l2",)).target, stream, decode=decode)
+    """Open the node of an address ``v4l2:///dev/video0``.
+
+    ValueError if the address is of another kind; OSError on another system than Linux.
+    """
+    node = parse(url, ("v4l2",)).target
+    if not sys.platform.startswith("linux"):
+        raise OSError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
+    return Capture(node, stream, decode=decode)
+
+
+KIND: Final = CameraKind(open_url)
+"""The kind of camera of a session's ``kind: y16``."""
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

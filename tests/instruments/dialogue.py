@@ -5,8 +5,7 @@ The idea is pymeasure's ``expected_protocol``.
 
 from collections.abc import Iterable, Sequence
 
-from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated.clock import EmulatedClock
+from dbthermal.instruments.clock import Clock, EmulatedClock
 from dbthermal.instruments.transport import Closing
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]

@@ -17,8 +17,8 @@ from device_benches import FILTERS
 from device_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 from faulty_camera import frames
 
-from dbthermal.instruments import inventory
-from dbthermal.instruments.boson import Boson, commands
+from dbthermal.instruments import boson, inventory
+from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import (
     FfcMode,
     FfcStatus,
@@ -114,7 +114,7 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
     assert camera.identity()["serial_number"] == str(camera.serial_number())
     assert camera.serial_number() > 0
     assert 220 < camera.fpa_temperature() < 380
-    before = camera.read(commands.LAST_FFC_FRAME)
+    before = camera.read(boson.LAST_FFC_FRAME)
     camera._clock.sleep(0.05)
     assert camera.run_ffc() > before
     assert camera.ffc_status() is FfcStatus.COMPLETE
@@ -124,14 +124,14 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
 def test_a_camera_keeps_a_mode(opened: Opened) -> None:
     """The FFC mode is set and read back; an unknown mode raises a ValueError."""
     camera: Boson = opened.device
-    before = camera.get(commands.FFC_MODE)
-    camera.set(commands.FFC_MODE, FfcMode.MANUAL)
-    assert camera.get(commands.FFC_MODE) is FfcMode.MANUAL
+    before = camera.get(boson.FFC_MODE)
+    camera.set(boson.FFC_MODE, FfcMode.MANUAL)
+    assert camera.get(boson.FFC_MODE) is FfcMode.MANUAL
     wrong: Any = 4
     with pytest.raises(ValueError, match="Invalid FFC mode 4"):
-        camera.set(commands.FFC_MODE, wrong)
-    camera.set(commands.FFC_MODE, before)
-    assert camera.get(commands.FFC_MODE) is before
+        camera.set(boson.FFC_MODE, wrong)
+    camera.set(boson.FFC_MODE, before)
+    assert camera.get(boson.FFC_MODE) is before
 
 
 @opens(*WHEELS)

@@ -6,8 +6,8 @@ import pytest
 from device_benches import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
-from dbthermal.instruments.boson import Boson, commands
-from dbthermal.instruments.boson.commands import Ir16Mode, Switch
+from dbthermal.instruments import boson
+from dbthermal.instruments.boson import Boson, Ir16Mode, Switch
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.devices import (
     Devices,
@@ -81,9 +81,9 @@ def test_prepared_for_a_measurement(devices: Devices) -> None:
     devices.prepare()
     for camera in devices.cameras.values():
         assert isinstance(camera, Boson)
-        assert camera.get(commands.IR16_MODE) == Ir16Mode.COUNTS_16
-        assert camera.get(commands.FFC_MODE) == FfcMode.MANUAL
-        assert camera.get(commands.TELEMETRY) == Switch.ON
+        assert camera.get(boson.IR16_MODE) == Ir16Mode.COUNTS_16
+        assert camera.get(boson.FFC_MODE) == FfcMode.MANUAL
+        assert camera.get(boson.TELEMETRY) == Switch.ON
         assert camera.ffc_status() == FfcStatus.COMPLETE
     assert devices.wheel is not None
     assert devices.world is not None
@@ -101,7 +101,7 @@ class Kept(dict[int, int]):
 def test_setting_that_is_not_taken_is_an_error() -> None:
     """A camera that acknowledges a setting but does not change raises an error."""
     bench = BosonBench()
-    bench.device.settings = Kept({**bench.device.settings, commands.IR16_MODE.set_command: 2})
+    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.set_command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
         Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()

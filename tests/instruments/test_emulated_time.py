@@ -12,9 +12,8 @@ import pytest
 from rig_session import bench, from_yaml, pictures, replaced, rig, scene_text
 
 from dbthermal.instruments import protocols
-from dbthermal.instruments.clock import SYSTEM, Task
+from dbthermal.instruments.clock import START, SYSTEM, EmulatedClock, Task
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.clock import START, EmulatedClock
 from dbthermal.instruments.recording import Limits, Preview, open_capture
 
 LIMITS, LIMIT = Limits(chunk=30, reserve=0, queue=3), 600.0

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal.instruments.emulated.apt import EmulatedApt
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import Line, World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,

@@ -25,8 +25,8 @@ from rig_session import (
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
 

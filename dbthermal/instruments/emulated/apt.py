@@ -15,8 +15,7 @@ from typing import Final, NamedTuple
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import Line, World
 
 SERIAL_NUMBER: Final = 40_000_000
 NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
