@@ -15,11 +15,11 @@ import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import store
+from dbthermal.instruments import recording
 from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.recording import Limits, Preview, Summary, record
-from dbthermal.instruments.recording import _reader as reader
+from dbthermal.instruments.recording import Limits, Preview, Summary
 from dbthermal.instruments.session import BLACKBODY, Session
 
 __all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
@@ -152,7 +152,7 @@ def record_sweep(
     Path(folder).mkdir(parents=True, exist_ok=True)
     held = store.HeldFolder(Path(folder))
     plan = [
-        (number, temperature, band, reader.step_path(folder, session.name, number, band))
+        (number, temperature, band, recording.step_path(folder, session.name, number, band))
         for number, temperature in enumerate(session.blackbody.temperatures)
         for band in session.swept or (None,)
     ]
@@ -167,7 +167,7 @@ def record_sweep(
             resting = number
         path = held.place() / planned.name
         summaries.append(was or _record_step(devices, band, path, limits, preview))
-        reader.mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
+        recording.mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
     return summaries
 
 
@@ -217,21 +217,23 @@ def _record(
 ) -> Summary:
     """Record all sources and readings of open devices, with the options of `record`."""
     session, sources, readings = devices.session, devices.sources, devices.readings()
-    return record(session, sources, path, readings=readings, identities=identities, **options)
+    return recording.record(
+        session, sources, path, readings=readings, identities=identities, **options
+    )
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
     """Summary of a recording of the sweep that exists already; None if it does not."""
     if not path.exists():
         return None
-    if not reader.is_complete(path):
+    if not recording.is_complete(path):
         rule = "Must be complete: move it away, and this step is recorded again"
         raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
     was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
     if was[number : number + 1] != [temperature]:
         raise ValueError(f"Recording '{path}' of temperatures {was} K. Must be of {temperature} K.")
-    reader.require_filter(path, band)
+    recording.require_filter(path, band)
     return Summary(path, attrs["ended"], attrs["totals"])
 
 
@@ -249,5 +251,5 @@ def _record_step(
     summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
-    reader.require_filter(summary.path, band)
+    recording.require_filter(summary.path, band)
     return summary

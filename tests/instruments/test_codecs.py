@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments._apt import LENGTHS, Id, Message, command
+from dbthermal.instruments._apt import Id, Message, command
 from dbthermal.instruments._fslp import Frame
 
 # Requests quoted in the tests of PnPQ, many of them from the maker's documentation; that of 0018
@@ -53,8 +53,7 @@ MOD_REQ_CHANENABLESTATE 0211 0, MOD_GET_CHANENABLESTATE 0212 0, MOT_SET_VELPARAM
 MOT_REQ_VELPARAMS 0414 0, MOT_GET_VELPARAMS 0415 14, MOT_SET_HOMEPARAMS 0440 14,
 MOT_REQ_HOMEPARAMS 0441 0, MOT_GET_HOMEPARAMS 0442 14, MOT_MOVE_HOME 0443 0, MOT_MOVE_HOMED 0444 0,
 MOT_MOVE_ABSOLUTE 0453 0 6, MOT_MOVE_COMPLETED 0464 0 14, MOT_MOVE_STOP 0465 0,
-MOT_MOVE_STOPPED 0466 0 14, MOT_REQ_STATUSUPDATE 0480 0, MOT_GET_STATUSUPDATE 0481 14 28,
-MOT_GET_DCSTATUSUPDATE 0491 14
+MOT_MOVE_STOPPED 0466 0 14, MOT_REQ_STATUSUPDATE 0480 0, MOT_GET_STATUSUPDATE 0481 14 28
 """
 BITS = [4, 5, 6, 7, 8, 9, 10, 14, 24, 31]  # of `StatusBits`, in its order
 
@@ -108,7 +107,7 @@ def test_messages_have_the_published_bytes() -> None:
     assert decode(ENDS[0]) == Message(Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, 0x22)
     for line, record in RECORDS:
         assert type(record).parse(decode(line)) == record
-    entries = [f"{known.name} {known:04X} " + " ".join(map(str, LENGTHS[known])) for known in Id]
+    entries = [f"{known.name} {known:04X} " + " ".join(map(str, known.lengths)) for known in Id]
     assert entries == PUBLISHED.strip().replace(",\n", ", ").split(", ")
     assert [bit.bit_length() - 1 for bit in apt.StatusBits] == BITS
 
@@ -204,7 +203,7 @@ def test_parsers_meet_arbitrary_data(content: bytes) -> None:
     """A parser returns its record of any data of each length that the decoder lets pass."""
     parsers: dict[type[apt.Record], Id] = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
     for parser, identifier in parsers.items():
-        for length in filter(None, LENGTHS[identifier]):
+        for length in filter(None, identifier.lengths):
             message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
             assert isinstance(parser.parse(message), parser)
 
@@ -250,6 +249,18 @@ def test_what_a_computer_hears(header: str, heard: int) -> None:
     decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert len(decoder.feed(bytes.fromhex(header))) == heard
     assert decoder.dropped == 1 - heard
+
+
+@pytest.mark.parametrize("home", ["44 04 01 00 01 21", STATUS.replace("81 22", "81 21")])
+def test_an_unknown_message_is_skipped_whole(home: str) -> None:
+    """Data of a message that the driver does not know are not read as messages."""
+    decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
+    inner = bytes.fromhex(home)
+    header = bytes((0xFE, 0x0E, len(inner), 0x00, 0x81, 0x21))
+    unknown, message = decoder.feed(header + inner + bytes.fromhex("66 04 01 00 01 21"))
+    assert (unknown.id, unknown.data, message.id) == (0x0EFE, inner, Id.MOT_MOVE_STOPPED)
+    assert (decoder.dropped, decoder.pending) == (0, b"")
+    assert [message.id for message in decoder.feed(bytes.fromhex("fe 0e 00 00 01 21"))] == [0x0EFE]
 
 
 @pytest.mark.parametrize("size", [fslp.MAXIMUM_FRAME, fslp.MAXIMUM_FRAME + 1])

@@ -20,8 +20,7 @@ from test_capture_file import CaptureFile
 from test_record import SMALL, bench, session
 
 from dbthermal import store
-from dbthermal.instruments.recording import Preview, record
-from dbthermal.instruments.signals import SignalExit, raised_signals
+from dbthermal.instruments.recording import Preview, SignalExit, raised_signals, record
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 SCENE = scene_text().replace('3: "11"', "3: 10.6")
