@@ -1,8 +1,8 @@
 """Procedures of the rig: wait for the blackbody, record a blackbody sweep, record a scene.
 
-Gain, offset and response are calibrated before a blackbody that goes through several temperatures,
-the emissivity bench with samples. At each temperature the wheel goes through its filters, and each
-of these is a recording of its own. `dbthermal.instruments.recording` opens the recordings.
+A blackbody at several temperatures calibrates gain, offset and response, and with samples beside it
+the emissivity bench. At each temperature the wheel goes through its filters, and there is a
+recording for each filter. `dbthermal.instruments.recording` opens the recordings.
 """
 
 import threading
@@ -159,15 +159,17 @@ def record_sweep(
     kept = [_kept(*step) for step in plan]
     summaries: list[Summary] = []
     resting: int | None = None
-    for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
-        if was is None and resting != number:
+    for (number, temperature, band, planned), summary in zip(plan, kept, strict=True):
+        # The blackbody, once for all filters of a temperature.
+        if summary is None and resting != number:
             set_temperature(temperature)
             wait_stable(session, temperature, readings[BLACKBODY].read, clock=devices.clock)
             devices.correct_offsets()
             resting = number
+        # The recording, which must have a reading of the blackbody.
         path = held.place() / planned.name
-        summaries.append(was or _record_step(devices, band, path, limits, preview))
-        recording.mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
+        summaries.append(summary or _record_step(devices, band, path, limits, preview))
+        recording.mean_reading(path if summary else summaries[-1].path, BLACKBODY)
     return summaries
 
 
@@ -230,9 +232,10 @@ def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summ
         rule = "Must be complete: move it away, and this step is recorded again"
         raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
-    was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
-    if was[number : number + 1] != [temperature]:
-        raise ValueError(f"Recording '{path}' of temperatures {was} K. Must be of {temperature} K.")
+    steps = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
+    if steps[number : number + 1] != [temperature]:
+        rule = f"Must be of {temperature} K"
+        raise ValueError(f"Recording '{path}' of temperatures {steps} K. {rule}.")
     recording.require_filter(path, band)
     return Summary(path, attrs["ended"], attrs["totals"])
 

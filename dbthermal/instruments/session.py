@@ -208,8 +208,8 @@ class Session:
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
         if not self.simulated:
             pairs = [(camera.video, camera.control) for camera in self.cameras.values()]
-            listed = [address for pair in pairs for address in pair if address is not None]
-            _check_unique("address", [*listed, *self.devices.values()])
+            addresses = [address for pair in pairs for address in pair if address is not None]
+            _check_unique("address", [*addresses, *self.devices.values()])
 
     def _check_devices(self) -> None:
         for name, address in self.devices.items():

@@ -114,7 +114,7 @@ class Flag(IntFlag):
 
 @dataclass(frozen=True)
 class Scan:
-    """One reading of all nine channels, of which index 0 is the cold junction.
+    """A reading of all nine channels, of which index 0 is the cold junction.
 
     `time` is the middle of the scan on the host's clock [s], for the channels are converted one
     after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`.

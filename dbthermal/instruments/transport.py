@@ -142,8 +142,8 @@ class SerialTransport(Closing):
         with self._named("read from"):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
-            more = min(size - 1, self._port.in_waiting) if first else 0
-            return first + (self._port.read(more) if more else b"")
+            waiting = min(size - 1, self._port.in_waiting) if first else 0
+            return first + (self._port.read(waiting) if waiting else b"")
 
     def pulse_rts(self) -> None:
         """Take the line RTS down and up again."""

@@ -375,12 +375,12 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
 
 def _bands(paths: list[Path]) -> Iterator[tuple[str, xr.Dataset]]:
     """Each band with the first recording that has it."""
-    listed: set[str] = set()
+    yielded: set[str] = set()
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
         for band in map(str, capture["band"].values):
-            if band not in listed:
-                listed.add(band)
+            if band not in yielded:
+                yielded.add(band)
                 yield band, capture
 
 
