@@ -95,10 +95,9 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of a message to send; with data in the long form.
+    """Bytes of a message to send; with data in the long form, which has no parameters.
 
-    ValueError if a number is not whole, or does not fit its field, the data are too long, or there
-    are both data and parameters, which the long form does not have.
+    ValueError if a number is not whole, or does not fit its field, or the data are too long.
     """
     size = len(message.data)
     if size > _LONGEST or message.destination & _HAS_DATA:
@@ -120,9 +119,9 @@ def command(
 ) -> bytes:
     """Bytes of a message from the computer to a controller.
 
-    Short, it has two parameters, the `channel` from 1, which in a rack is 1 in every bay, and a
-    `value`; long, the `data` of a record. A controller silently ignores messages to another
-    `destination`. ValueError if a number does not fit its field, or the data have no such length.
+    Short, it has the `channel` from 1, which in a rack is 1 in every bay, and a `value`; long, the
+    `data` of a record. A controller silently ignores messages to another `destination`. ValueError
+    if a number does not fit its field, or the data have no such length.
     """
     if len(data) not in identifier.lengths:
         rule = f"Must be one of {identifier.lengths}"
@@ -202,8 +201,7 @@ class Decoder:
 class StatusBits(IntFlag):
     """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
 
-    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here. The
-    jogging bits of one controller were seen to stick: nothing here relies on them.
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
     """
 
     MOVING_FORWARD = 1 << 4
@@ -220,10 +218,9 @@ class StatusBits(IntFlag):
 
 @dataclass(frozen=True)
 class Record:
-    """Data of a message: numbers in the order of the record's fields.
+    """Data of a message from a `Decoder`: numbers in the order of the record's fields.
 
-    The message must be from a `Decoder`, which checked its length, and of an identifier of the
-    record. Data behind the last field are not read.
+    Data behind the last field are not read.
     """
 
     _FORMAT: ClassVar[struct.Struct]

@@ -28,33 +28,12 @@ from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMod
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 __all__ = [
-    "FFC_IN_PROGRESS",
-    "FFC_MODE",
-    "FFC_STATUS",
-    "FPA_TEMPERATURE",
-    "GAIN_MODE",
-    "IR16_MODE",
     "KIND",
-    "LAST_FFC_FRAME",
-    "PART_NUMBER",
-    "RUN_FFC",
-    "SENSOR_SERIAL_NUMBER",
-    "SERIAL_NUMBER",
-    "SETTINGS",
-    "SOFTWARE_REVISION",
-    "STATUSES",
-    "TELEMETRY",
-    "TELEMETRY_LOCATION",
     "Boson",
     "BosonError",
     "BosonReplyError",
     "BosonStatusError",
     "BosonTimeoutError",
-    "Ir16Mode",
-    "Reading",
-    "Setting",
-    "Switch",
-    "TelemetryLocation",
 ]
 __dir__ = __all__.copy
 
@@ -157,18 +136,11 @@ IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
 TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
 TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
 
-SETTINGS: Final[tuple[Setting[Any], ...]] = (
-    FFC_MODE,
-    GAIN_MODE,
-    IR16_MODE,
-    TELEMETRY,
-    TELEMETRY_LOCATION,
-)
-"""All settings."""
+_MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
+SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
+RUN_FFC: Final = 0x00050007  # command that starts a flat-field correction
 
-RUN_FFC: Final = 0x00050007
-"""Command that starts a flat-field correction."""
-
+# Meaning of each status of a refusal.
 STATUSES: Final = MappingProxyType(
     {
         0x161: "bad command identifier",
@@ -196,7 +168,6 @@ STATUSES: Final = MappingProxyType(
         **dict.fromkeys(range(0x6A4, 0x6AE), "flash error"),
     }
 )
-"""Meaning of each status of a refusal."""
 
 
 class BosonError(RuntimeError):
@@ -396,7 +367,7 @@ class Boson(Closing):
         raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
 
 
+# Of a session's ``kind: boson``.
 KIND: Final = CameraKind(
     partial(v4l2.open_url, decode=telemetry.metadata), Boson.from_url, (0, telemetry.ROWS)
 )
-"""The kind of camera of a session's ``kind: boson``."""

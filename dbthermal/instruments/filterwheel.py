@@ -87,8 +87,7 @@ Speed = Annotated[float, Field(strict=True, ge=0.1, le=90.0)]
 class Settings:
     """Properties of a wheel and its controller; ValueError if one is out of its range.
 
-    Which direction and switch a wheel needs for homing is uncertain: None keeps what the controller
-    has.
+    Which direction and switch a wheel needs is uncertain: None keeps what the controller has.
     """
 
     # Of the controller; any other is then refused.
@@ -113,8 +112,7 @@ class Scale:
     def target(self, position: int, offset: float) -> int:
         """Absolute place [count] of a slot, 1 to 6; `offset` [deg] is that of slot 1 after homing.
 
-        A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
-        errors never add up. ValueError if the slot does not exist.
+        Each place is rounded by itself, so that errors never add up. ValueError for any other slot.
         """
         if position not in range(1, POSITIONS + 1):
             raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
@@ -207,9 +205,8 @@ class _Line:
     def request(self, identifier: Id, reply: Id) -> apt.Message:
         """Reply of the motor to a request; NoReplyError without a reply.
 
-        Only requests are repeated, never what moves the wheel. A reply that comes too late may be
-        taken for that of the repetition, and is then older than it seems, but replies never change
-        their order.
+        Only requests are repeated, never what moves the wheel. A late reply may be taken for that of
+        the repetition, and is older than it seems, but replies never change their order.
         """
         return self._exchange(identifier, reply, self.motor, CHANNEL, attempts=ATTEMPTS)
 
@@ -360,11 +357,10 @@ class FilterWheel(Closing):
         return apt.Status.parse(reply)
 
     def home(self) -> None:
-        """Search for the home switch, from which all places count.
+        """Search for the home switch, from which all places count; the speeds are set before.
 
-        The speeds are set before: where they are near 0, as in some controllers that were just
-        switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
-        the wheel does not start, stops before the switch, or takes too long, and was stopped.
+        StalledWheelError or WheelTimeoutError if the wheel does not start, stops before the switch,
+        or takes too long, and was stopped.
         """
         self._prepare()
         self._require_rest()

@@ -31,17 +31,12 @@ STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperatur
 def ask_for_blackbody(name: str, temperature: float) -> None:
     """Ask the user to set the blackbody to a temperature, and wait for Enter.
 
+    RuntimeError if there is no keyboard, as under papermill.
+
     Parameters
     ----------
-    name : str
-        Name of the session, for the question.
-    temperature : float
-        Temperature [K].
-
-    Raises
-    ------
-    RuntimeError
-        If there is no keyboard, as under papermill.
+    name, temperature : str, float
+        Name of the session, for the question; temperature [K].
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
     question = (
@@ -66,23 +61,15 @@ def wait_stable(
     """Wait until a temperature is stable near its set point, and return its mean [K].
 
     Within the session's `window` the readings must lie within its `stability` of one another, and
-    their mean within its `tolerance` of the set point.
+    their mean within its `tolerance` of the set point; TimeoutError after its `timeout`, ValueError
+    if it has no blackbody.
 
     Parameters
     ----------
-    session : Session
-        Session with a blackbody.
-    temperature : float
-        Set point [K].
-    read : callable
-        Reads the temperature [K].
-    clock : Clock
-        Clock of the device.
-
-    Raises
-    ------
-    TimeoutError, ValueError
-        After the session's `timeout`; if it has no blackbody.
+    session, temperature : Session, float
+        Session with a blackbody; set point [K].
+    read, clock : callable, Clock
+        Reads the temperature [K]; clock of the device.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -115,9 +102,9 @@ def record_sweep(
     """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
-    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
-    interrupted goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on
-    in it. Call `Devices.prepare` before.
+    Complete recordings of this sweep that are in the folder are kept, so that an interrupted sweep
+    goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on in it. Call
+    `Devices.prepare` before.
 
     Parameters
     ----------
@@ -134,8 +121,7 @@ def record_sweep(
     Returns
     -------
     list of Summary
-        In the order of the session, by temperature, then filter, with those that were recorded
-        before.
+        In the order of the session, by temperature, then filter, with those that were kept.
 
     Raises
     ------
@@ -198,9 +184,9 @@ def record_scene(
     >>> from dbthermal.instruments.session import Camera, Session
     >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
-    >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
     >>> with open_devices(session) as devices:
     ...     devices.prepare()
+    ...     folder, small = getfixture("tmp_path"), Limits(reserve=0)
     ...     summary = record_scene(devices, folder / "demo.zarr", limits=small)
     >>> summary.ended, summary.totals["8-14"]["lost"]
     ('duration', 0)
@@ -217,7 +203,7 @@ def record_scene(
 def _record(
     devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
 ) -> Summary:
-    """Record all sources and readings of open devices, with the options of `record`."""
+    """Record all sources and readings of open devices, with the options of `recording.record`."""
     session, sources, readings = devices.session, devices.sources, devices.readings()
     return recording.record(
         session, sources, path, readings=readings, identities=identities, **options

@@ -92,11 +92,9 @@ class Camera:
 
     Attributes
     ----------
-    video, control : str
+    video, control, kind : str
         Addresses of its frames, ``"v4l2:///dev/video0"``, and of its command port, if it has one,
-        ``"serial:///dev/ttyACM0"``.
-    kind : str
-        Of `dbthermal.instruments.camera.KINDS`.
+        ``"serial:///dev/ttyACM0"``; and its kind, of `dbthermal.instruments.camera.KINDS`.
     """
 
     video: Video
@@ -114,13 +112,11 @@ class Blackbody:
 
     Attributes
     ----------
-    temperatures : tuple of float
-        Set points [K].
-    stability, window : float
-        Largest range of the readings [K] in a window, and how long it is [s].
-    tolerance, timeout : float
-        Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
-        by half a kelvin or so each, and the recordings keep the reading. Longest wait for it [s].
+    temperatures, tolerance : tuple of float, float
+        Set points [K]; largest distance of the mean reading from a set point [K]: thermocouple and
+        logger are off by half a kelvin or so each, and the recordings keep the reading.
+    stability, window, timeout : float
+        Largest range of the readings [K] in a window, how long it is, and longest wait for it [s].
     """
 
     temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
@@ -251,6 +247,10 @@ class Session:
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
         """Read a session from a file, and from the file that it names as its ``rig``.
 
+        FileNotFoundError if a file does not exist. ValueError if it is not YAML, or a key is
+        missing, unknown, repeated or in both files, or a value is invalid: a line for each error,
+        with file, place and rule.
+
         Parameters
         ----------
         path : str or Path
@@ -258,13 +258,6 @@ class Session:
             in another file, whose name relative to this one is the key ``rig``.
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If a file does not exist; if it is not YAML, or a key is missing, unknown, repeated or
-            in both files, or a value is invalid: one line for each error, with file, place and
-            rule.
         """
         content, files = texts.read_yaml(path), dict[str, str]()  # file of each key of the rig's
         if "rig" in content:

@@ -29,11 +29,9 @@ from dbthermal.instruments.transport import Closing, parse
 __all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
+# A library bound by `load`, or an object with the same functions, such as the emulated one. Where C
+# takes a pointer to one value, an array of length one is passed, which suits either.
 Library = Any
-"""A library bound by `load`, or an object with the same functions, such as the emulated one.
-
-Where C takes a pointer to one value, an array of length one is passed, which both accept.
-"""
 
 ENVIRONMENT: Final = "DBTHERMAL_USBTC08"  # variable with the path of the library
 CHANNELS: Final = 9  # 0 is the cold junction, 1 to 8 are the sockets
@@ -42,6 +40,7 @@ KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
 OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
 POLL: Final = 0.05  # [s] between two progress requests
 
+# Meaning of the library's error numbers; 15 and 16 are often taken for one another.
 ERRORS: Final[Mapping[int, str]] = MappingProxyType(
     {
         0: "no error",
@@ -63,7 +62,6 @@ ERRORS: Final[Mapping[int, str]] = MappingProxyType(
         16: "the communication with the unit is lost",
     }
 )
-"""Meaning of the library's error numbers; 15 and 16 are often taken for one another."""
 
 
 class TC08Error(RuntimeError):
@@ -89,6 +87,7 @@ class UnitInfo(ctypes.Structure):
     )
 
 
+# Argument types of the functions that are used; each of them returns 16 bits.
 SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
     {
         "usb_tc08_open_unit_async": [],
@@ -100,7 +99,6 @@ SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
         "usb_tc08_close_unit": [c_int16],
     }
 )
-"""Argument types of the functions that are used; each of them returns 16 bits."""
 
 
 class Flag(IntFlag):
@@ -215,11 +213,10 @@ class TC08(Closing):
         }
 
     def set_channels(self, channels: Collection[int]) -> None:
-        """Set the channels that have a thermocouple, of type T: 1 to 8.
+        """Set the channels that have a thermocouple, of type T, 1 to 8; the rest are switched off.
 
-        All other sockets are switched off; the cold junction is always read. ValueError if a
-        channel is another one, or none is given; TC08Error or RuntimeError if the library fails,
-        or the unit is not open.
+        The cold junction is always read. ValueError for another channel, or none; TC08Error or
+        RuntimeError if the library fails, or the unit is not open.
         """
         if not channels:
             raise ValueError("Invalid channels. Must be one at least.")
@@ -272,8 +269,8 @@ def flagged(
 def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
     """Load the vendor's library and declare the types of its functions.
 
-    Its `path`, else the variable `ENVIRONMENT`, names the file; else the system's own search must
-    find ``usbtc08`` (FileNotFoundError). OSError if it cannot be loaded, or lacks a function.
+    Its `path`, the variable `ENVIRONMENT`, or the system's search for ``usbtc08`` names the file
+    (FileNotFoundError without any). OSError if it cannot be loaded, or lacks a function.
     """
     name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:

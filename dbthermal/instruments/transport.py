@@ -19,16 +19,7 @@ from dbthermal.instruments.clock import SYSTEM, Clock
 if TYPE_CHECKING:
     import serial
 
-__all__ = [
-    "EMULATORS",
-    "Address",
-    "Closing",
-    "SerialTransport",
-    "Transport",
-    "TransportError",
-    "open_serial",
-    "parse",
-]
+__all__ = ["SerialTransport", "Transport", "TransportError", "open_serial", "parse"]
 __dir__ = __all__.copy
 
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]

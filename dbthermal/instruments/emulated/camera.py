@@ -35,7 +35,7 @@ from dbthermal.instruments.camera import (
     NoFrameError,
     SourceLostError,
 )
-from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, Line, World
+from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, Device, Line, World
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 
@@ -190,13 +190,11 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     return {band: of_band(number, band) for number, band in enumerate(bands)}
 
 
-class EmulatedBoson:
-    """The command port of a camera of a world, on the world's clock, as an `emulated.world.Device`.
-
-    KeyError if the world has no camera of this name.
-    """
+class EmulatedBoson(Device):
+    """The command port of a camera of a world; KeyError if there is no camera of this name."""
 
     def __init__(self, world: World, name: str) -> None:
+        super().__init__()
         self.camera = world.camera(name)
         # At power-on, by the identifier that sets them; not those of a real camera.
         self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
@@ -204,11 +202,9 @@ class EmulatedBoson:
         self._world = world
         self._name = name
         self._decoder = fslp.Decoder()
-        self._replies: list[bytes] = []
 
-    @property
-    def plugged(self) -> bool:
-        """False once it was pulled out."""
+    def is_plugged(self) -> bool:
+        """False once the camera was pulled out."""
         return self.camera.plugged
 
     def receive(self, data: bytes) -> None:
@@ -220,15 +216,6 @@ class EmulatedBoson:
     def request(self, frame: fslp.Frame) -> None:
         """Take in one request, and answer at once."""
         self._replies.append(self.reply(frame))
-
-    def poll(self) -> list[bytes]:
-        """Give the replies that are due, each piece for a write of its own."""
-        replies, self._replies = self._replies, []
-        return replies
-
-    def next_due(self) -> float:
-        """Time until a reply is due [s]; infinite without a request."""
-        return 0.0 if self._replies else math.inf
 
     def reply(self, request: fslp.Frame) -> bytes:
         """Bytes of the reply to a request."""

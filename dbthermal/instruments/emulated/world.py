@@ -11,7 +11,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from dbthermal.instruments.clock import Clock, EmulatedClock
 from dbthermal.instruments.session import Session
@@ -157,21 +157,29 @@ def emulated_world(session: Session, **settings: Any) -> World:
     return world
 
 
-class Device(Protocol):
-    """An emulated device: it takes bytes, and gives bytes when it is polled."""
+class Device:
+    """An emulated device at the end of a line: it takes bytes, and gives replies when polled."""
 
-    @property
-    def plugged(self) -> bool:
+    def __init__(self) -> None:
+        self.plugged = True  # set to False to pull out the cable
+        self._replies: list[bytes] = []
+
+    def is_plugged(self) -> bool:
         """False once it was pulled out."""
+        return self.plugged
 
     def receive(self, data: bytes) -> None:
         """Take in bytes from the driver."""
+        raise NotImplementedError
 
     def poll(self) -> list[bytes]:
-        """Give the bytes that are due, each piece to be read by itself."""
+        """Give the replies that are due, each piece to be read by itself."""
+        replies, self._replies = self._replies, []
+        return replies
 
     def next_due(self) -> float:
         """Time until something may be due [s]; infinite if it waits for bytes."""
+        return 0.0 if self._replies else math.inf
 
 
 class Line(Closing):
@@ -217,5 +225,5 @@ class Line(Closing):
         self._closed = True
 
     def _check(self) -> None:
-        if self._closed or not self._device.plugged:
+        if self._closed or not self._device.is_plugged():
             raise TransportError("Lost the emulated device. It must stay connected and open.")

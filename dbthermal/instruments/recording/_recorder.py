@@ -5,9 +5,6 @@ waits for another: a camera that corrects its offsets answers late, and that cos
 of bounded length leads to the thread that writes. If the disk is too slow the queue fills, frames
 are refused, and the log has their number and time. The caller's thread shows the preview; whatever
 ends that, the frames that came before are written.
-
-A terminal that is closed sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM.
-Either ends a Python program at once, unless it is raised, as an interrupt by the keyboard is.
 """
 
 import errno
@@ -72,11 +69,9 @@ class Limits:
         Frames of a chunk, the most that a kill may cost, and of each band held until written.
     reserve : int
         Space that must stay free [byte].
-    silence, patience : float
-        Wait for a frame before it is noted that none came, and at the end for a device that
-        hangs [s].
-    reading_period, preview_period : float
-        Time from reading to reading, and least time from preview to preview [s].
+    silence, reading_period, patience, preview_period : float
+        Wait for a frame before it is noted that none came, time from reading to reading, wait at
+        the end for a device that hangs, and least time from preview to preview [s].
     """
 
     chunk: int = CHUNK
@@ -96,10 +91,8 @@ class Preview:
     ----------
     time : float
         Time since the start [s].
-    frames : mapping of str to Frame
-        Last frame of each band that had one.
-    totals : mapping
-        Numbers of frames of each band: ``frames``, ``lost``, ``refused``, ``damaged``.
+    frames, totals : mapping
+        By band, its last frame and its numbers of ``frames``, ``lost``, ``refused``, ``damaged``.
     readings, units : mapping
         Last value of each reading, NaN if it failed, and its unit, else kelvin.
     """
@@ -117,13 +110,11 @@ class Summary:
 
     Attributes
     ----------
-    path : Path
-        Folder of the recording, wherever it lies now.
+    path, totals : Path, mapping
+        Folder of the recording, wherever it lies now; as in `Preview`.
     ended : str
         ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is lost),
         or ``"no frames"`` if a band had none.
-    totals : mapping
-        As in `Preview`.
     """
 
     path: Path
@@ -149,9 +140,9 @@ class SignalExit(SystemExit):
 def raised_signals() -> Iterator[None]:
     """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
 
-    The first signal is raised, those after it are ignored: a closed terminal sends several, and
-    what is being closed must be left to end. Nothing changes for a signal that the program handles
-    by itself or ignores, as under ``nohup``.
+    A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
+    first signal is raised, those after it are ignored: what is being closed must be left to end. A
+    signal that the program handles by itself or ignores, as under ``nohup``, stays so.
     """
     previous: dict[int, Any] = {}
     raised: list[int] = []
@@ -199,10 +190,8 @@ def record(
 
     Parameters
     ----------
-    session : Session
-        Bands, format, duration.
-    sources : mapping
-        Band to an open source, in the session's order; they stay open.
+    session, sources : Session, mapping
+        Bands, format, duration; band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
     readings, identities : mapping, optional
