@@ -205,8 +205,8 @@ class _Line:
     def request(self, identifier: Id, reply: Id) -> apt.Message:
         """Reply of the motor to a request; NoReplyError without a reply.
 
-        Only requests are repeated, never what moves the wheel. A late reply may be taken for that of
-        the repetition, and is older than it seems, but replies never change their order.
+        Only requests are repeated, never what moves the wheel. A late reply may be taken for that
+        of the repetition, and is older than it seems, but replies stay in order.
         """
         return self._exchange(identifier, reply, self.motor, CHANNEL, attempts=ATTEMPTS)
 
@@ -366,9 +366,14 @@ class FilterWheel(Closing):
         self._require_rest()
         self._is_lost = True
         self._line.begin(Id.MOT_MOVE_HOME, CHANNEL)
-        # The counter may stand while a controller searches for the switch: no stall limit.
-        limits = HOME_TIMEOUT, HOME_TIMEOUT
-        self._follow(_Motion("Search for home", Id.MOT_MOVE_HOMED, *limits), _is_home)
+
+        def is_home(status: apt.Status) -> bool:
+            return status.bits & (StatusBits.HOMED | StatusBits.HOMING) == StatusBits.HOMED
+
+        # The counter may stand while a controller searches for the switch: no stall limit. The
+        # homed bit alone may be that of an earlier search: the wheel must have moved.
+        name, limits = "Search for home", (HOME_TIMEOUT, HOME_TIMEOUT)
+        self._follow(name, Id.MOT_MOVE_HOMED, limits, is_home, must_move=True)
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
@@ -383,15 +388,14 @@ class FilterWheel(Closing):
         target = scale.target(position, self.settings.home_offset)
         self._require_home(self._require_rest())
 
-        def has_arrived(motion: _Motion, status: apt.Status) -> bool:
-            distance = abs(scale.degrees(status.position - target))
-            return distance <= TOLERANCE and (motion.reported or motion.rests > 0)
-
-        name = f"Move to {scale.degrees(target):.2f} deg"
         self._line.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.Position(CHANNEL, target).pack())
-        motion = _Motion(name, Id.MOT_MOVE_COMPLETED, MOVE_TIMEOUT, STALL_TIMEOUT)
+
+        def has_arrived(status: apt.Status) -> bool:
+            return abs(scale.degrees(status.position - target)) <= TOLERANCE
+
+        name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
         try:
-            self._follow(motion, has_arrived)
+            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, has_arrived, must_move=False)
         except StalledWheelError:
             self._is_lost = True
             raise
@@ -513,10 +517,21 @@ class FilterWheel(Closing):
     def _place(self, status: apt.Status) -> str:
         return f"at {self._scale.degrees(status.position):.2f} deg"
 
-    def _follow(self, motion: "_Motion", is_over: "Callable[[_Motion, apt.Status], bool]") -> None:
-        """Poll until a motion is over; stop the wheel if it takes too long."""
-        motion.began = motion.changed = self._clock()
-        confirmed = 0
+    def _follow(
+        self,
+        name: str,
+        end: Id,
+        limits: tuple[float, float],
+        is_there: Callable[[apt.Status], bool],
+        *,
+        must_move: bool,
+    ) -> None:
+        """Poll until a motion is over; raise if it fails, with the wheel stopped if it moves.
+
+        `limits` are the longest motion, and the longest time at one place [s].
+        """
+        start = changed = self._clock()
+        moved, rests, confirmed, count = False, 0, 0, None
         while confirmed < CONFIRMATIONS:
             status = self.status()
             self._line.check()
@@ -526,63 +541,36 @@ class FilterWheel(Closing):
                     f"The controller reports {faults.name}, and the wheel was stopped. "
                     "Must be none."
                 )
-            motion.update(status, self._clock())
-            motion.reported = self._line.has_reported(motion.end)
-            confirmed = confirmed + 1 if is_over(motion, status) else 0
-            if not confirmed:
-                self._check(motion, self._place(status))
+            # The course of the motion so far.
+            now, moving = self._clock(), bool(status.bits & MOVING)
+            moved |= moving or count not in {None, status.position}
+            if status.position != count:
+                count, changed = status.position, now
+            rests = 0 if moving else rests + 1
+            # Over, by its end and its place.
+            rested = rests > 0 and (moved or not must_move)
+            ended = rested or self._line.has_reported(end)
+            confirmed = confirmed + 1 if ended and is_there(status) else 0
+            # Failed: at rest elsewhere, too long under way, or standing still.
+            place = self._place(status)
+            if confirmed:
+                pass  # until it is confirmed as often as needed
+            elif rests >= CONFIRMATIONS and (moved or now - start > START_TIMEOUT):
+                action = "stopped" if moved else "did not start and is"
+                raise StalledWheelError(f"{name}: the wheel {action} {place}. Must arrive.")
+            elif now - start > limits[0]:
+                self.stop()
+                raise WheelTimeoutError(
+                    f"{name}: the wheel was still {place} after {limits[0]} s, and was "
+                    "stopped. Must arrive in this time."
+                )
+            elif now - changed > limits[1]:
+                self.stop()
+                raise StalledWheelError(
+                    f"{name}: the wheel stood {place} for {limits[1]} s while it should "
+                    "move, and was stopped. Must turn freely."
+                )
             self._clock.sleep(POLL_INTERVAL)
-
-    def _check(self, motion: "_Motion", place: str) -> None:
-        """Raise if the wheel rests where it should not, stands still, or takes too long."""
-        now = self._clock()
-        started = motion.moved or now - motion.began > START_TIMEOUT
-        if started and motion.rests >= CONFIRMATIONS:
-            action = "stopped" if motion.moved else "did not start and is"
-            raise StalledWheelError(f"{motion.name}: the wheel {action} {place}. Must arrive.")
-        if now - motion.began > motion.timeout:
-            self.stop()
-            raise WheelTimeoutError(
-                f"{motion.name}: the wheel was still {place} after {motion.timeout} s, and was "
-                "stopped. Must arrive in this time."
-            )
-        if now - motion.changed > motion.stall:
-            self.stop()
-            raise StalledWheelError(
-                f"{motion.name}: the wheel stood {place} for {motion.stall} s while it should "
-                "move, and was stopped. Must turn freely."
-            )
-
-
-@dataclass
-class _Motion:
-    """Name, end report and limits [s] of a motion, and its course so far, times in s."""
-
-    name: str
-    end: Id
-    timeout: float
-    stall: float
-    began: float = 0.0
-    changed: float = 0.0
-    last: int | None = None
-    moved: bool = False
-    reported: bool = False
-    rests: int = 0
-
-    def update(self, status: apt.Status, time: float) -> None:
-        """Take in a status."""
-        moving = bool(status.bits & MOVING)
-        self.moved |= moving or (self.last is not None and status.position != self.last)
-        if status.position != self.last:
-            self.last, self.changed = status.position, time
-        self.rests = 0 if moving else self.rests + 1
-
-
-def _is_home(motion: _Motion, status: apt.Status) -> bool:
-    """True if the switch was found: the homed bit alone may be that of an earlier search."""
-    homed = status.bits & (StatusBits.HOMED | StatusBits.HOMING)
-    done = motion.reported or (motion.moved and motion.rests > 0)
-    return done and homed == StatusBits.HOMED
 
 
 def _must_agree(name: str, actual: int, expected: int) -> None:
