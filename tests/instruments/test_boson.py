@@ -76,10 +76,10 @@ def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
 
 def test_commands_are_the_published_ones() -> None:
     """Readings, settings, states and errors have their published numbers, none of them twice."""
-    known = vars(boson).items()
-    readings = {name: value for name, value in known if isinstance(value, Reading)}
-    assert {name: (one.command, one.layout) for name, one in readings.items()} == READINGS
-    settings = {name: value for name, value in known if isinstance(value, Setting)}
+    entries = vars(boson).items()
+    readings = {name: value for name, value in entries if isinstance(value, Reading)}
+    assert {name: (entry.command, entry.layout) for name, entry in readings.items()} == READINGS
+    settings = {name: value for name, value in entries if isinstance(value, Setting)}
     for name, setting in settings.items():
         kind: Any = setting.kind
         members = [*kind]
@@ -103,7 +103,7 @@ def test_every_setting_is_kept(bench: BosonBench, setting: Setting[Any]) -> None
         bench.camera.set(setting, value)
         assert bench.camera.get(setting) == value
     bench.state.serial_number = 0x8E9EAE81  # its bytes need escapes
-    readings = [one for one in vars(boson).values() if isinstance(one, Reading)]
+    readings = [entry for entry in vars(boson).values() if isinstance(entry, Reading)]
     values = {reading.name: bench.camera.read(reading) for reading in readings}
     assert (values["serial number"], values["part number"]) == (0x8E9EAE81, "EMULATED-BOSON-640")
     assert values["FFC status"] is FfcStatus.NONE_PERFORMED
@@ -163,10 +163,10 @@ def test_readings_that_fail(
     reading: int, answer: bytes | list[Pair], error: type[BosonError], message: str
 ) -> None:
     """A mute camera is asked three times; other replies are errors with what is wrong."""
-    (known,) = (r for r in vars(boson).values() if getattr(r, "command", None) == reading)
+    (entries,) = (r for r in vars(boson).values() if getattr(r, "command", None) == reading)
     pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
     with Dialogue(pairs) as line, pytest.raises(error, match=message) as caught:
-        camera_of(line).read(known)
+        camera_of(line).read(entries)
     status = getattr(caught.value, "status", 0)
     assert f"0x{status:X}" in message or not status
 
@@ -250,13 +250,13 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
     """The camera still says that the last correction is complete: not that of this one."""
     complete = (boson.FFC_STATUS.command, struct.pack(">i", FfcStatus.COMPLETE))
     last = boson.LAST_FFC_FRAME.command
-    asked = [(last, struct.pack(">I", 700)), complete, (boson.RUN_FFC, b"")]
+    requests = [(last, struct.pack(">I", 700)), complete, (boson.RUN_FFC, b"")]
     for frame in (700, 700, 1234):
         busy = (boson.FFC_IN_PROGRESS.command, b"\x00\x00")
-        asked += [busy, complete, (last, struct.pack(">I", frame))]
+        requests += [busy, complete, (last, struct.pack(">I", frame))]
     pairs: list[Pair] = [
         (request(number, command), reply(number, command, data))
-        for number, (command, data) in enumerate(asked, start=1)
+        for number, (command, data) in enumerate(requests, start=1)
     ]
     with Dialogue(pairs) as line:
         assert camera_of(line).run_ffc() == 1234

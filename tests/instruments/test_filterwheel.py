@@ -121,8 +121,8 @@ def test_by_name_of_an_emulator() -> None:
             with pytest.raises(NotHomedError, match="Must be homed"):
                 attempt()
         with ThreadPoolExecutor(max_workers=4) as pool:
-            asked = [pool.submit(wheel.status) for _ in range(200)]
-            assert len({status.result().position for status in asked}) == 1
+            futures = [pool.submit(wheel.status) for _ in range(200)]
+            assert len({status.result().position for status in futures}) == 1
     with pytest.raises(ValueError, match="Invalid model 'X'"):
         EmulatedApt(world, model="X")
 

@@ -161,16 +161,16 @@ def test_frames_come_in_order_with_stamp_number_and_telemetry() -> None:
     """Image and telemetry apart, both clocks, the number; each buffer goes back to the kernel."""
     driver = Driver(answers=[(BYTES, GOOD, 250_000, number) for number in range(20)])
     with opened(driver) as capture:
-        first, *rest = frames(capture, 20)
+        first, *later_frames = frames(capture, 20)
         for memory in driver.maps:  # the kernel may write its buffers again: frames stay
             memory[:] = bytes(BYTES)
     np.testing.assert_array_equal(first.counts.ravel(), np.arange(24))
     assert first.telemetry is not None
     np.testing.assert_array_equal(first.telemetry.ravel(), np.arange(24, 36))
     assert (first.device_time, first.host_time, first.sequence, first.flags) == (7.25, 12.5, 0, 0)
-    assert [frame.sequence for frame in rest] == list(range(1, 20))
-    found = "/dev/video0", "Boson: FLIR Video", "usb-1.2", "uvcvideo 6.12.5"
-    assert capture.identity == dict(zip(("device", "model", "bus", "driver"), found, strict=True))
+    assert [frame.sequence for frame in later_frames] == list(range(1, 20))
+    texts = "/dev/video0", "Boson: FLIR Video", "usb-1.2", "uvcvideo 6.12.5"
+    assert capture.identity == dict(zip(("device", "model", "bus", "driver"), texts, strict=True))
     assert driver.calls == [
         *(v4l2.QUERYCAP, *(3 * [v4l2.ENUM_FMT]), v4l2.S_FMT, v4l2.S_PARM, v4l2.REQBUFS),
         *(v4l2.BUFFERS * [v4l2.QUERYBUF, v4l2.QBUF]),
