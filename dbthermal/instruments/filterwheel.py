@@ -293,10 +293,7 @@ class FilterWheel(Closing):
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        filters: Mapping[int, str],
-        settings: Settings | None = None,
+        self, transport: Transport, filters: Mapping[int, str], settings: Settings | None = None
     ) -> None:
         self.filters, self.settings = filters, settings or Settings()
         self.is_simulated = transport.is_simulated

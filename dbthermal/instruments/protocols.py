@@ -52,11 +52,7 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
 
 
 def wait_stable(
-    session: Session,
-    temperature: float,
-    read: Callable[[], float],
-    *,
-    clock: Clock = SYSTEM,
+    session: Session, temperature: float, read: Callable[[], float], *, clock: Clock = SYSTEM
 ) -> float:
     """Wait until a temperature is stable near its set point, and return its mean [K].
 
