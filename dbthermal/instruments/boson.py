@@ -323,15 +323,18 @@ class Boson(Closing):
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again if no reply comes, and return the data of its reply."""
+        # A reading is requested again.
         for _ in range(repeats):
             try:
                 return self._exchange(name, command, data)
             except BosonTimeoutError:
                 continue
+        # The exchange, under a new number.
         with self._clock.hold(self._lock):
             self._sequence = fslp.next_sequence(self._sequence)
             self._transport.write(fslp.encode(self._sequence, command, data))
             reply = self._reply(name)
+        # What the reply says.
         if reply.command != command:
             raise BosonReplyError(
                 f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "

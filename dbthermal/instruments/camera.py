@@ -54,14 +54,12 @@ __dir__ = __all__.copy
 Counts = npt.NDArray[np.uint16]
 Identity = Mapping[str, str | bool]
 
-FRAME_TIMEOUT: Final = 1.0
-"""Longest wait for a frame by default [s]; a Boson gives 30 or 60 a second."""
-
-FPA_READING: Final = "fpa "
-"""Prefix of the name of a reading of the focal-plane array's temperature; the band follows."""
-
-FFC_READING: Final = "ffc "
-"""Prefix of the name of a reading of the `FfcStatus`; the band follows."""
+FRAME_TIMEOUT: Final = (
+    1.0  # longest wait for a frame by default [s]; a Boson gives 30 or 60 a second
+)
+# Beginnings of the names of two readings, which the band follows.
+FPA_READING: Final = "fpa "  # temperature of the focal-plane array [K]
+FFC_READING: Final = "ffc "  # `FfcStatus`
 
 KINDS: Final = MappingProxyType(
     {"boson": "dbthermal.instruments.boson", "y16": "dbthermal.instruments.v4l2"}
@@ -84,8 +82,7 @@ class FrameFlag(Flags):
     IMAGE_REPEATED = 512, "no pixel differs from the frame before: frozen, or saturated"
 
 
-GOOD: Final = FrameFlag(0)
-"""No flag."""
+GOOD: Final = FrameFlag(0)  # no flag
 
 UNTIMED: Final = (
     FrameFlag.DRIVER_ERROR

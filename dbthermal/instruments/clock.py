@@ -21,9 +21,7 @@ __dir__ = __all__.copy
 
 Item = TypeVar("Item")
 
-START: Final = datetime(2000, 1, 1, tzinfo=UTC)
-"""Date and time of day at time 0 of every emulated clock."""
-
+START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # at time 0 of every emulated clock
 _ROOM: Final = 1.0  # emulated wait for a place in a buffer whose reader has ended [s]
 _POLL: Final = 0.05  # between two looks at the waits, by the computer's clock [s]
 

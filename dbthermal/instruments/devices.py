@@ -117,6 +117,7 @@ class Devices:
         """
         identities: dict[str, Identity] = {}
         for band, source in self.sources.items():
+            # The frames of a camera, and its command port.
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
             if band in self.cameras:
                 control = self.cameras[band].identity()
@@ -128,6 +129,7 @@ class Devices:
                     )
                 identity = {**identity, **control}
             identities[band] = identity
+        # The devices.
         if self.wheel is not None:
             identities[WHEEL] = self.wheel.identity()
         if self.thermocouples is not None:

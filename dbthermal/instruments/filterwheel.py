@@ -226,6 +226,7 @@ class _Line:
     ) -> apt.Message:
         """Reply to a request; what came before the request is not its reply."""
         request = apt.command(identifier, channel, destination=source)
+        # Ask, as often as needed.
         with self._clock.hold(self._lock):
             for _ in range(attempts):
                 self._collect()

@@ -145,11 +145,13 @@ def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
 
 def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     """Device of the bus with its nodes and the warnings about their use."""
+    # The device, where Linux lists it.
     device = Device(kind, raw.bus, tuple(raw.port_numbers or ()), SPEEDS.get(raw.speed, "unknown"))
     folder = sysfs / "bus" / "usb" / "devices" / device.path
     if not folder.is_dir():
         warning = f"Its nodes and number are not known: there is no {folder}."
         return replace(device, warnings=(warning,))
+    # Its nodes, by families.
     number, nodes, warnings = folder / "serial", list[Path](), list[str]()
     for family, module, pattern in kind.families:
         names = sorted(

@@ -72,12 +72,15 @@ def wait_stable(
     steps, start = session.blackbody, clock()
     readings: deque[tuple[float, float]] = deque()
     while clock() - start <= steps.timeout:
+        # The next reading.
         readings.append((clock(), read()))
         values = np.array([value for _, value in readings])
+        # The rule of the session.
         whole = readings[-1][0] - readings[0][0] >= steps.window
         near = abs(values.mean() - temperature) <= steps.tolerance
         if whole and near and np.ptp(values) <= steps.stability:
             return float(values.mean())
+        # Readings before the window are dropped.
         while whole and readings[-1][0] - readings[0][0] >= steps.window:
             readings.popleft()
         clock.sleep(STABILITY_PERIOD)

@@ -61,12 +61,7 @@ BLACKBODY: Final = "blackbody"  # name of its thermocouple, and of its readings 
 
 def _by(check: Callable[[Any], object]) -> AfterValidator:
     """Validator of a value that a check lets pass."""
-
-    def checked(value: Any) -> Any:
-        check(value)
-        return value
-
-    return AfterValidator(checked)
+    return AfterValidator(lambda value: (check(value), value)[1])
 
 
 def _check_printable(text: str) -> None:
@@ -259,6 +254,7 @@ class Session:
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
         """
+        # The file, and that of the rig.
         content, files = texts.read_yaml(path), dict[str, str]()  # file of each key of the rig's
         if "rig" in content:
             name = content.pop("rig")
@@ -274,9 +270,11 @@ class Session:
                 raise ValueError(f"{path}: Repeated key of session and rig '{key}'. {rule}.")
             files = dict.fromkeys(shared, str(rig))
             content = {**shared, **content}
+        # The changes.
         changed = {**content, **(changes or {})}
         if changes and isinstance(steps := content.get(BLACKBODY), dict) and BLACKBODY in changes:
             changed[BLACKBODY] = {**steps, **changes[BLACKBODY]}
+        # The checks, whose errors name the file of the key.
         try:
             session: Self = TypeAdapter(cls).validate_python(changed)
         except ValidationError as error:

@@ -168,8 +168,10 @@ class TC08(Closing):
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
+        # The library opens a unit meanwhile.
         if not self._library.usb_tc08_open_unit_async():
             raise self._error("be opened")
+        # Wait until its firmware is there.
         handle, percent = (c_int16 * 1)(), (c_int16 * 1)()
         deadline = self.clock() + timeout
         while not (progress := self._library.usb_tc08_open_unit_progress(handle, percent)):
@@ -179,6 +181,7 @@ class TC08(Closing):
                     "firmware by then: pull it out and plug it in again."
                 )
             self.clock.sleep(POLL)
+        # The result.
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:

@@ -22,11 +22,8 @@ from dbthermal.instruments.camera import Counts, Metadata
 __all__ = ["FIELDS", "ROWS", "WORDS", "Field", "decode", "encode", "metadata"]
 __dir__ = __all__.copy
 
-ROWS: Final = 2
-"""Rows of telemetry on USB: 514 rows of the frame are requested instead of 512."""
-
-WORDS: Final = 142
-"""Least number of words that hold all the fields."""
+ROWS: Final = 2  # of telemetry on USB: 514 rows of the frame are requested instead of 512
+WORDS: Final = 142  # least number of words that hold all the fields
 
 
 @dataclass(frozen=True)

@@ -169,12 +169,14 @@ def open_serial(
     emulator pass for hardware; TransportError if the port cannot be opened.
     """
     scheme, path, name = parse(url, ("serial", "sim"))
+    # An emulator.
     if scheme == "sim":
         if path not in EMULATORS:
             rule = f"Must be one of {sorted(EMULATORS)} after sim://"
             raise ValueError(f"Invalid address '{url}'. {rule}.")
         emulated: Transport = importlib.import_module(EMULATORS[path]).start(name, world)
         return emulated
+    # A serial port.
     if Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
 
@@ -187,6 +189,7 @@ def open_serial(
     except OSError as error:
         rule = "It must exist, be yours to use, and in no other program's use"
         raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
+    # Its flow control.
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:

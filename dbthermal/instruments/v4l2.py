@@ -42,12 +42,11 @@ from dbthermal.instruments.transport import Closing, parse
 __all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
 
+# Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control.
 Y16: Final = 0x20363159
-"""Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control."""
-
+# Frames that the kernel holds while no program reads, the most it can: half a second at 60 Hz, in
+# which a busy computer gets round to read again. Beyond, it drops frames.
 BUFFERS: Final = 32
-"""Frames that the kernel holds while no program reads, the most it can: half a second at 60 Hz, in
-which a busy computer gets round to read again. Beyond, it drops frames."""
 
 QUERYCAP: Final = 0x80685600
 ENUM_FMT: Final = 0xC0405602
@@ -171,6 +170,7 @@ class Capture(Closing):
 
     def _agree(self, file: int) -> dict[str, str]:
         """Set format and rate; a driver sets the nearest that it can, which is an error here."""
+        # The node must give video in the format.
         captures, identity = _capability(file, self._kernel)
         offered = _formats(file, self._kernel) if captures else []
         if Y16 not in offered:
@@ -178,6 +178,7 @@ class Capture(Closing):
                 code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered
             ]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
+        # The format, with every row.
         rows, columns = self.stream.rows, self.shape[1]
         line = _BYTES * columns
         wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
@@ -189,6 +190,7 @@ class Capture(Closing):
                 f"Invalid format of '{self.path}': {agreed} (columns, rows, code, field, bytes of "
                 f"a row, bytes of a frame). Must be {wanted}: is the telemetry set as requested?"
             )
+        # The rate.
         rate = self.frame_rate
         argument = bytearray(PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(1000 * rate), 0, 0))
         self._kernel.ask(file, S_PARM, argument)
@@ -258,8 +260,7 @@ def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
     return Capture(node, stream, decode=decode)
 
 
-KIND: Final = CameraKind(open_url)
-"""The kind of camera of a session's ``kind: y16``."""
+KIND: Final = CameraKind(open_url)  # of a session's ``kind: y16``
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

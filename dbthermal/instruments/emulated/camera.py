@@ -168,14 +168,17 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
     """
+    # Bands with a filter that is known.
     names = dict.fromkeys((*session.bands, *session.filters.values()))
     bands = tuple(name for name in names if name in FILTERS)
     if not bands:
         return {}
+    # The cameras, with noise and a fixed pattern.
     rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
     detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
     response = rig.response()
 
+    # A picture of the blackbody in each band.
     def of_band(number: int, band: str) -> Picture:
         curve, pattern = responses.curve(response, band), detector.sel(band=band)
         noise = float(response["noise"].sel(band=band))
@@ -246,11 +249,13 @@ class EmulatedBoson(Device):
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
+        # The state of the shutter.
         camera, status = self.camera, FfcStatus.NONE_PERFORMED
         if self._world.ffc_in_progress(self._name):
             status = FfcStatus.IN_PROGRESS
         elif camera.ffc_count:
             status = FfcStatus.COMPLETE
+        # What each command reads.
         values: dict[boson.Reading[Any], tuple[int | bytes, ...]] = {
             boson.SERIAL_NUMBER: (camera.serial_number,),
             boson.PART_NUMBER: (b"EMULATED-BOSON-640",),

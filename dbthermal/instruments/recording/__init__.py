@@ -227,11 +227,13 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         fewer good frames in a band, or no reading of the blackbody, or those of a step differ by
         more than the session's stability.
     """
+    # The movie and the mean temperature of each step.
     steps, stability, shared = _sweep(folder, name)
     temperatures, movies = [], []
     for paths in steps:
         temperatures.append(_agreed(paths, BLACKBODY, stability))
         movies.append(_movie(paths, frames))
+    # In the order of the temperatures.
     order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
     axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
     counts = xr.concat([movies[place] for place in order], "temperature")
@@ -266,6 +268,7 @@ def bench_series(
         (measurement), means of the readings during the recordings [K]. FileNotFoundError or
         ValueError as for `open_sweep`; or if a region has no pixel or a band no good frame.
     """
+    # Means of each step, by material.
     steps, stability, shared = _sweep(folder, name)
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in steps:
@@ -279,6 +282,7 @@ def bench_series(
                 "background_temperature": background,
             }
             series[material].append(xr.Dataset(values, {"band": list(captures)}))
+    # All steps of a material together.
     joined = {}
     for material, measurements in series.items():
         dataset = xr.concat(measurements, "measurement").transpose("band", "measurement")
@@ -329,6 +333,7 @@ def mean_reading(path: str | Path, source: str) -> float:
 
 def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict[str, Any]]:
     """Recordings of each temperature, one for each filter, stability [K] and origin of a sweep."""
+    # The session, from the first recording that is of it.
     for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
         attrs = store.open_dataset(path).attrs
         session = attrs["provenance"]["parameters"]
@@ -336,6 +341,7 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
             break
     else:
         raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
+    # Its recordings, each of which must be whole.
     behind = [band for band in session["cameras"] if band in session["filters"].values()]
     bands, steps = session["sweep"] or behind or [None], []
     for number in range(len(blackbody["temperatures"])):

@@ -188,18 +188,21 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
+        # The variables, of one size.
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
             raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
         (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
+        # The state of the recording.
         self._origin, self._chunk = origin, chunk
         self._clock = next(iter(sources.values())).clock
         self._start: dict[str, Any] = {}  # attributes of `begin`
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []  # rows of the log that are not written yet
         self.broken = False
+        # The store, explained by its attributes.
         self.recording = store.Recording(
             path,
             self._variables,
@@ -234,11 +237,13 @@ class CaptureFile:
         `refused` is the number of frames of this band that came before it and were not taken.
         """
         state = self._bands[band]
+        # Flags, from the frame before and from the shutter.
         flags = frame.flags | self._compared(band, frame, refused)
         flags |= self._watch_shutter(band, frame, flags)
         if flags & DAMAGED:
             state.totals["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
+        # Values of the frame, into the chunk.
         timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,

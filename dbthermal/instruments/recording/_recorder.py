@@ -157,6 +157,7 @@ def raised_signals() -> Iterator[None]:
             raise SignalExit(number)
 
     try:
+        # Only signals that would end the program, and only in the main thread, which gets them.
         if threading.current_thread() is threading.main_thread():
             for number in _ENDING:
                 if signal.getsignal(number) is signal.SIG_DFL:
@@ -220,9 +221,11 @@ def record(
     _check(session, sources)
     clock = next(iter(sources.values())).clock
     with raised_signals(), clock.joined():
+        # The file.
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
         start = clock()  # to make the file may have taken a while
         file.begin(start, _utc(clock))
+        # The threads: the writer starts the rest, this one shows the preview.
         end, stop = start + session.duration, stop or threading.Event()
         run = _Run(file, sources, readings, limits, clock, start, end, stop)
         # No daemon: it ends its work whatever becomes of this thread.
@@ -271,11 +274,13 @@ def _new_file(
     limits: Limits,
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
+    # Room on the disk.
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
     _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
     clock = next(iter(sources.values())).clock
+    # What the recording says of its devices.
     devices = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
@@ -343,11 +348,13 @@ class _Run:
         refused = 0
         try:
             while self.is_going():
+                # The next frame.
                 try:
                     frame = source.read(self.limits.silence)
                 except NoFrameError:
                     self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
                     continue
+                # Into the queue, if there is room.
                 if self.clock.has_room(self._room[band]):
                     self._frames.put((band, frame, refused))
                     refused = 0
