@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import dbthermal
@@ -73,6 +74,24 @@ def test_what_is_named_in_one_place() -> None:
     assert {path for path in users if path.parts[:1] == ("instruments",)} == {
         path for path in users if "emulated" in path.parts
     }
+
+
+def test_the_rig_is_apart() -> None:
+    """Only the command line imports the instruments; none of their modules imports in a circle."""
+    assert {module for module, target in inner_imports() if target == "instruments"} == {"_cli"}
+    modules = {
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
+        for path in (PACKAGE / "instruments").rglob("*.py")
+    }
+    graph: dict[str, set[str]] = {}
+    for module in modules:
+        file = PACKAGE.parent.joinpath(*module.split("."))
+        text = (file / "__init__.py" if file.is_dir() else file.with_suffix(".py")).read_text()
+        nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
+        names = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
+        graph[module] = modules & (names | {f"{node.module}" for node in nodes}) - {module}
+    assert [*TopologicalSorter(graph).static_order()]
+    assert len(modules) <= 24
 
 
 def test_importing_the_package_is_light() -> None:

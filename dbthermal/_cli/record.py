@@ -18,9 +18,8 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording import Preview, Summary
+from dbthermal.instruments.recording import Preview, SignalExit, Summary, raised_signals
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.signals import SignalExit, raised_signals
 
 
 def record(options: argparse.Namespace) -> int:
@@ -39,7 +38,7 @@ def record(options: argparse.Namespace) -> int:
 
 
 def _say(text: str, *, end: str = "\n", file: TextIO | None = None) -> None:
-    """Print a text; where nobody reads any more, this and all that follows is passed over."""
+    """Print, ignoring a closed terminal or pipe."""
     stream = file or sys.stdout
     try:
         print(text, end=end, file=stream, flush=True)
@@ -89,7 +88,7 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
 
 
 def _progress(watch: Watch, preview: Preview) -> str:
-    """Progress of a recording in one line, written over the one before."""
+    """Progress of a recording in a line that is written over the line before."""
     watch.note(preview)
     bands = "; ".join(
         f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])

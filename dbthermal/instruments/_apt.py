@@ -1,13 +1,10 @@
 """Thorlabs APT, the binary protocol of stepper controllers: bytes to messages, and back.
 
-Pure functions and one `Decoder`, without input or output; `dbthermal.instruments.filterwheel`
-speaks it. A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
+Pure functions and a `Decoder`, without input or output, for `dbthermal.instruments.filterwheel`.
+A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
 ``id, id, length, length, destination | 0x80, source`` followed by data; all little-endian, without
 checksum or start byte. A receiver therefore drops bytes until identifier, length and both addresses
-are possible. Data are records: `parse` reads a message, `pack` gives its data again; positions are
-in counts, speeds in the device's units, channels count from 1.
-
-This is what a filter wheel needs, and what a controller may send by itself.
+are possible. Positions are in counts, speeds in the device's units, channels count from 1.
 
 References
 ----------
@@ -17,7 +14,7 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 """
 
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import astuple, dataclass
 from enum import IntEnum, IntFlag
 from typing import Any, ClassVar, Final, Self
@@ -39,58 +36,55 @@ _SHORT = struct.Struct("<HBBBB")
 _LONG = struct.Struct("<HHBB")
 _HAS_DATA = 0x80
 _LONGEST = 0xFF  # data, as documented [byte]
+_IDENTIFIERS = 0x1000  # all documented identifiers of controllers are below
 _RACK_TYPE = 45  # of a controller in its `Info`
 
 
 class Id(IntEnum):
-    """Identifiers of the messages that are known here, by the maker's names."""
+    """Messages that a filter wheel needs, and that a controller may send, by the maker's names.
+
+    `lengths` are those that the data of a message can have [byte], 0 without data.
+    """
+
+    lengths: tuple[int, ...]
+
+    def __new__(cls, value: int, *lengths: int) -> Self:
+        """Make an identifier from its number and its lengths."""
+        member = int.__new__(cls, value)
+        member._value_, member.lengths = value, lengths or (0,)
+        return member
 
     HW_REQ_INFO = 0x0005
-    HW_GET_INFO = 0x0006
+    HW_GET_INFO = 0x0006, 84
     HW_STOP_UPDATEMSGS = 0x0012  # nothing starts them: some BSC then stop answering after 5 s
     HW_NO_FLASH_PROGRAMMING = 0x0018  # first of all messages
     HW_RESPONSE = 0x0080
-    HW_RICHRESPONSE = 0x0081
+    HW_RICHRESPONSE = 0x0081, 68
     MOD_SET_CHANENABLESTATE = 0x0210
     MOD_REQ_CHANENABLESTATE = 0x0211
     MOD_GET_CHANENABLESTATE = 0x0212
-    MOT_SET_VELPARAMS = 0x0413
+    MOT_SET_VELPARAMS = 0x0413, 14
     MOT_REQ_VELPARAMS = 0x0414
-    MOT_GET_VELPARAMS = 0x0415
-    MOT_SET_HOMEPARAMS = 0x0440
+    MOT_GET_VELPARAMS = 0x0415, 14
+    MOT_SET_HOMEPARAMS = 0x0440, 14
     MOT_REQ_HOMEPARAMS = 0x0441
-    MOT_GET_HOMEPARAMS = 0x0442
+    MOT_GET_HOMEPARAMS = 0x0442, 14
     MOT_MOVE_HOME = 0x0443
     MOT_MOVE_HOMED = 0x0444
-    MOT_MOVE_ABSOLUTE = 0x0453
-    MOT_MOVE_COMPLETED = 0x0464
+    MOT_MOVE_ABSOLUTE = 0x0453, 0, 6
+    MOT_MOVE_COMPLETED = 0x0464, 0, 14
     MOT_MOVE_STOP = 0x0465  # value 1 at once, 2 by a ramp
-    MOT_MOVE_STOPPED = 0x0466
+    MOT_MOVE_STOPPED = 0x0466, 0, 14
     MOT_REQ_STATUSUPDATE = 0x0480
-    MOT_GET_STATUSUPDATE = 0x0481
-    MOT_GET_DCSTATUSUPDATE = 0x0491
+    MOT_GET_STATUSUPDATE = 0x0481, 14, 28
 
 
-LENGTHS: Final[Mapping[int, tuple[int, ...]]] = {
-    **dict.fromkeys(Id, (0,)),
-    Id.HW_GET_INFO: (84,),
-    Id.HW_RICHRESPONSE: (68,),
-    Id.MOT_SET_VELPARAMS: (14,),
-    Id.MOT_GET_VELPARAMS: (14,),
-    Id.MOT_SET_HOMEPARAMS: (14,),
-    Id.MOT_GET_HOMEPARAMS: (14,),
-    Id.MOT_MOVE_ABSOLUTE: (0, 6),
-    Id.MOT_MOVE_COMPLETED: (0, 14),
-    Id.MOT_MOVE_STOPPED: (0, 14),
-    Id.MOT_GET_STATUSUPDATE: (14, 28),
-    Id.MOT_GET_DCSTATUSUPDATE: (14,),
-}
-"""Lengths of data that each message can have [byte]; 0 is the form without data."""
+_LENGTHS = {int(identifier): identifier.lengths for identifier in Id}
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
+    """A message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
 
     id: int
     param1: int
@@ -101,10 +95,9 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of a message to send; with data in the long form.
+    """Bytes of a message to send; with data in the long form, which has no parameters.
 
-    ValueError if a number is not whole, or does not fit its field, the data are too long, or there
-    are both data and parameters, which the long form does not have.
+    ValueError if a number is not whole, or does not fit its field, or the data are too long.
     """
     size = len(message.data)
     if size > _LONGEST or message.destination & _HAS_DATA:
@@ -126,13 +119,12 @@ def command(
 ) -> bytes:
     """Bytes of a message from the computer to a controller.
 
-    Short, it has two parameters, the `channel` from 1, which in a rack is 1 in every bay, and a
-    `value`; long, the `data` from the ``pack`` of a record. A controller silently ignores messages
-    to another `destination`. ValueError if a number does not fit its field, or the message never
-    has data of this length.
+    Short, it has the `channel` from 1, which in a rack is 1 in every bay, and a `value`; long, the
+    `data` of a record. A controller silently ignores messages to another `destination`. ValueError
+    if a number does not fit its field, or the data have no such length.
     """
-    if len(data) not in LENGTHS[identifier]:
-        rule = f"Must be one of {LENGTHS[identifier]}"
+    if len(data) not in identifier.lengths:
+        rule = f"Must be one of {identifier.lengths}"
         raise ValueError(f"Invalid data of {len(data)} bytes of {identifier.name}. {rule}.")
     return encode(Message(identifier, channel, value, destination, HOST, data))
 
@@ -163,7 +155,8 @@ class Decoder:
     def feed(self, received: bytes) -> list[Message]:
         """Messages that the next bytes of the stream complete.
 
-        An unknown identifier, or one of `Id` with a length that it never has, is not a message.
+        A message that is well formed but not in `Id` is returned whole, so that nothing in its data
+        is taken for a message. A message of `Id` with a length that it never has is noise.
         """
         self.pending += received
         messages, start = [], 0
@@ -187,12 +180,14 @@ class Decoder:
     def _data_length(self, start: int) -> int | None:
         """Length of the data after a header [byte], None if the header is impossible."""
         identifier, length, destination, source = _LONG.unpack_from(self.pending, start)
-        length = length if destination & _HAS_DATA else 0
+        is_long = bool(destination & _HAS_DATA)
+        length = length if is_long else 0
+        lengths = _LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())
         possible = (
             destination & ~_HAS_DATA in self._destinations
             and source in self._sources
-            and length in LENGTHS.get(identifier, ())
-            and bool(length) == bool(destination & _HAS_DATA)
+            and length in lengths
+            and bool(length) == is_long
         )
         return length if possible else None
 
@@ -204,10 +199,9 @@ class Decoder:
 
 
 class StatusBits(IntFlag):
-    """State of a motor: the bits that a filter wheel needs; others are kept as they come.
+    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
 
-    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here. The
-    jogging bits of one controller were seen to stick: nothing here relies on them.
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
     """
 
     MOVING_FORWARD = 1 << 4
@@ -224,10 +218,9 @@ class StatusBits(IntFlag):
 
 @dataclass(frozen=True)
 class Record:
-    """Data of a message: numbers in the order of the record's fields.
+    """Data of a message from a `Decoder`: numbers in the order of the record's fields.
 
-    The message must be from a `Decoder`, which knows its lengths, and of an identifier of the
-    record. Some have more data, which are not read.
+    Data behind the last field are not read.
     """
 
     _FORMAT: ClassVar[struct.Struct]
@@ -272,20 +265,15 @@ class VelocityParameters(Record):
 
 @dataclass(frozen=True)
 class HomeParameters(Record):
-    """Search for the home switch.
-
-    `direction` is 1 forward, 2 reverse; `limit_switch` 1 the reverse one, 4 the forward one;
-    `offset` [count] is from the switch to the position 0. `velocity` is near 0 when some
-    controllers are switched on: homing then does nothing.
-    """
+    """Search for the home switch; with a `velocity` near 0, as after power-on, it does nothing."""
 
     _FORMAT = struct.Struct("<HHHii")
 
     channel: int
-    direction: int
-    limit_switch: int
+    direction: int  # 1 forward, 2 reverse
+    limit_switch: int  # 1 the reverse switch, 4 the forward one
     velocity: int
-    offset: int
+    offset: int  # from the switch to the position 0 [count]
 
 
 @dataclass(frozen=True)
@@ -305,23 +293,21 @@ class Status(Record):
 
 @dataclass(frozen=True)
 class Info(Record):
-    """Identity of a controller.
+    """Identity of a controller, in HW_GET_INFO.
 
-    `model` is such as ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say;
-    `firmware` is ``major.interim.minor``; `notes` are 60 bytes that only the maker understands.
     Versions of the hardware follow, which are not read, and are packed as those of a rack.
     """
 
     _FORMAT = struct.Struct("<I8sH4B60sHHH")
 
     serial_number: int
-    model: str
-    firmware: str
-    notes: bytes = bytes(60)
+    model: str  # ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say
+    firmware: str  # ``major.interim.minor``
+    notes: bytes = bytes(60)  # that only the maker understands
 
     @classmethod
     def parse(cls, message: Message) -> Self:
-        """Identity of HW_GET_INFO; bytes of the model that are not ASCII are spelled out."""
+        """Identity of a message; bytes of the model that are not ASCII are spelled out."""
         number, model, _, minor, interim, major, _, notes, *_ = cls._FORMAT.unpack(message.data)
         return cls(number, _text(model.rstrip(b"\0 ")), f"{major}.{interim}.{minor}", notes)
 

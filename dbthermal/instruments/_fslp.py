@@ -17,22 +17,14 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
-COMMAND_CHANNEL: Final = 0x00
-"""Channel of commands and their replies; a receiver discards the frames of all others."""
-
-REQUEST: Final = 0xFFFFFFFF
-"""Status of a request; that of a reply is 0 or an error code."""
-
-MAXIMUM_DATA: Final = 751
-"""Most bytes of data in a frame to send, as in FLIR/rawBoson."""
-
-MAXIMUM_FRAME: Final = 2048
-"""Most unescaped bytes of a received frame: the buffer of the vendor's own receiver."""
+COMMAND_CHANNEL: Final = 0x00  # of commands and replies; frames of all others are ignored
+REQUEST: Final = 0xFFFFFFFF  # status of a request; that of a reply is 0 or an error code
+MAXIMUM_DATA: Final = 751  # most bytes of data in a frame to send, as in FLIR/rawBoson
+MAXIMUM_FRAME: Final = 2048  # most unescaped bytes received: the buffer of the vendor's receiver
 
 _START, _END, _ESCAPE = b"\x8e", b"\xae", b"\x9e"
 _SPECIAL = _START + _END + _ESCAPE
-# An escaped byte is sent as the escape byte and the value less this.
-_SHIFT = 0x0D
+_SHIFT = 0x0D  # an escaped byte is sent as the escape byte and the value less this
 _ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
 _HEADER = struct.Struct(">BIII")
 _CHECKSUM = struct.Struct(">H")
@@ -42,7 +34,7 @@ _CHECKSUM_START = 0x1D0F
 
 @dataclass(frozen=True)
 class Frame:
-    """One undamaged frame."""
+    """An undamaged frame."""
 
     channel: int  # `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255
     sequence: int  # number of the request, echoed by its reply, unsigned, 32 bits
@@ -64,24 +56,21 @@ def encode(
     *,
     channel: int = COMMAND_CHANNEL,
 ) -> bytes:
-    """Bytes of a frame, 17 or more; header, data and checksum are all escaped.
+    """Bytes of a frame; header, data and checksum are all escaped.
 
-    Numbers are as in `Frame`: sequence, command and status in [0, 2^32), the channel in [0, 256),
-    and at most `MAXIMUM_DATA` bytes of data; TypeError or ValueError for any other.
+    TypeError or ValueError if a number is not whole or does not fit its field, see `Frame`, or
+    there are more than `MAXIMUM_DATA` bytes of data.
 
     Examples
     --------
     >>> encode(1, 0x00050002).hex(" ")  # serial number of a Boson
     '8e 00 00 00 00 01 00 05 00 02 ff ff ff ff 01 0b ae'
     """
-    for name, value, bits in (
-        ("channel", channel, 8),
-        ("sequence number", sequence, 32),
-        ("command", command, 32),
-        ("status", status, 32),
-    ):
-        if not 0 <= operator.index(value) < 1 << bits:
-            raise ValueError(f"Invalid {name} {value}. Must lie in 0 to {(1 << bits) - 1}.")
+    numbers = {"channel": channel, "sequence number": sequence, "command": command}
+    for name, value in {**numbers, "status": status}.items():
+        largest = 0xFF if name == "channel" else 0xFFFFFFFF
+        if not 0 <= operator.index(value) <= largest:
+            raise ValueError(f"Invalid {name} {value}. Must lie in 0 to {largest}.")
     if len(data) > MAXIMUM_DATA:
         raise ValueError(f"Invalid data of {len(data)} bytes. Must be at most {MAXIMUM_DATA}.")
     content = _HEADER.pack(channel, sequence, command, status) + data
@@ -91,9 +80,9 @@ def encode(
 
 
 def next_sequence(sequence: int) -> int:
-    """Sequence number that follows another, with no byte that would be escaped.
+    """Next larger sequence number without a byte that would be escaped; 0 after the largest.
 
-    The vendor's software avoids such numbers too. They increase: none returns within 32 bits.
+    The vendor's software avoids such numbers too.
     """
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
     for position, value in enumerate(following):
@@ -131,7 +120,7 @@ class Decoder:
 
     def feed(self, received: bytes) -> list[Frame]:
         """Take in any number of bytes; return the undamaged frames that they complete."""
-        found = []
+        frames = []
         for number, piece in enumerate(bytes(received).split(_START)):
             if number:  # a start byte came before it
                 self.damaged += self.is_open
@@ -141,9 +130,9 @@ class Decoder:
             self._content, end, _ = (self._content + piece).partition(_END)
             if end or len(self._content) > 2 * MAXIMUM_FRAME:  # each byte may be escaped
                 frame, self._content = _frame(self._content), None
-                found += [frame] if frame else []
+                frames += [frame] if frame else []
                 self.damaged += frame is None
-        return found
+        return frames
 
 
 def _frame(escaped: bytes) -> Frame | None:

@@ -2,8 +2,8 @@
 
 `FrameSource` gives frames with two clocks, a number, flags and metadata; `CameraControl`, which a
 camera may lack, sets its modes and reads its temperature and the state of its shutter. `KINDS`
-names the module of each kind of camera, which is imported when a session asks for it. A damaged
-frame is handed on with flags: to hide or mend it is not the driver's task.
+names the module of each kind of camera, which is imported when a session asks for it. A driver
+hands on a damaged frame with flags; it neither hides nor mends it.
 """
 
 import importlib
@@ -48,30 +48,27 @@ __all__ = [
     "Stream",
     "camera_kind",
     "next_shutter",
-    "over_v4l2",
 ]
 __dir__ = __all__.copy
 
 Counts = npt.NDArray[np.uint16]
 Identity = Mapping[str, str | bool]
 
-FRAME_TIMEOUT: Final = 1.0
-"""Longest wait for a frame by default [s]; a Boson gives 30 or 60 a second."""
-
-FPA_READING: Final = "fpa "
-"""Prefix of the name of a reading of the focal-plane array's temperature; the band follows."""
-
-FFC_READING: Final = "ffc "
-"""Prefix of the name of a reading of the `FfcStatus`; the band follows."""
+FRAME_TIMEOUT: Final = (
+    1.0  # longest wait for a frame by default [s]; a Boson gives 30 or 60 a second
+)
+# Beginnings of the names of two readings, which the band follows.
+FPA_READING: Final = "fpa "  # temperature of the focal-plane array [K]
+FFC_READING: Final = "ffc "  # `FfcStatus`
 
 KINDS: Final = MappingProxyType(
-    {"boson": "dbthermal.instruments.boson", "y16": "dbthermal.instruments.y16"}
+    {"boson": "dbthermal.instruments.boson", "y16": "dbthermal.instruments.v4l2"}
 )
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
 
 
 class FrameFlag(Flags):
-    """State of one frame; the driver sets the first three bits, the recorder the others."""
+    """State of one frame; the driver sets the first three bits, the recorder the rest."""
 
     DRIVER_ERROR = 1, "the driver reports damaged data"
     WRONG_SIZE = 2, "fewer or more bytes than a frame has: missing ones are 0"
@@ -85,8 +82,7 @@ class FrameFlag(Flags):
     IMAGE_REPEATED = 512, "no pixel differs from the frame before: frozen, or saturated"
 
 
-GOOD: Final = FrameFlag(0)
-"""No flag."""
+GOOD: Final = FrameFlag(0)  # no flag
 
 UNTIMED: Final = (
     FrameFlag.DRIVER_ERROR
@@ -96,11 +92,11 @@ UNTIMED: Final = (
     | FrameFlag.TIME_WRONG
     | FrameFlag.PADDED
 )
-"""A frame with one of these is recorded but is no measurement: it gets no exposure time. A repeated
-image keeps its time, for a closed aperture looks so, too."""
+"""Flags of a frame that is recorded but is no measurement: it gets no exposure time. A repeated
+image keeps its time, for a closed aperture looks the same."""
 
 DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
-"""A frame with one of these has wrong counts, and maybe wrong telemetry."""
+"""Flags of a frame with wrong counts, and maybe wrong telemetry."""
 
 
 class FfcStatus(IntEnum):
@@ -141,19 +137,19 @@ class SourceLostError(ConnectionError):
 
 @dataclass(frozen=True)
 class Metadata:
-    """Metadata that a camera gives with one frame, besides its image."""
+    """Metadata that a camera gives with a frame, besides its image."""
 
-    frame_counter: int = -1  # camera's own number of the frame, -1 if not known
+    frame_counter: int = -1  # camera's number of the frame, -1 if it gives none
     last_ffc_frame: int | None = None  # frame_counter at the last flat-field correction
     fpa_temperature: float = math.nan  # of the focal-plane array [K]
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame as it came: its counts are not written to again, a leap of the number is a loss."""
+    """A frame as it came: its counts are not written to again, a leap of the number is a loss."""
 
     counts: Counts  # raw signal (y, x) [count]
-    device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN if not known
+    device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN without a stamp
     host_time: float  # arrival, on the host's monotonic clock [s]
     sequence: int  # number that the driver gives each frame
     flags: FrameFlag = GOOD  # damage, and kind of its clock
@@ -176,7 +172,7 @@ class Stream:
 
 
 class FrameSource(Protocol):
-    """An open camera that gives frames, one after the other."""
+    """An open camera that gives a sequence of frames."""
 
     shape: tuple[int, int]  # rows and columns of the image, without telemetry [pixel]
     telemetry_rows: int  # that come with each frame, 0 for none
@@ -222,46 +218,32 @@ class CameraControl(Protocol):
         """Release the port; a second call does nothing."""
 
 
-OpenFrames = Callable[[str, Stream], AbstractContextManager[FrameSource]]
-OpenControl = Callable[[str, object | None], AbstractContextManager[CameraControl]]
-
-
 @dataclass(frozen=True)
 class CameraKind:
-    """One kind of camera: how to open frames and command port; see ``KIND`` of its module."""
+    """A kind of camera: how to open frames and command port; see ``KIND`` of its module."""
 
-    open_frames: OpenFrames
-    open_control: OpenControl | None = None
+    open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
+    open_control: Callable[[str, object | None], AbstractContextManager[CameraControl]] | None = (
+        None
+    )
     telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
-
-
-def over_v4l2(decode: Callable[[Counts], Metadata] | None = None) -> OpenFrames:
-    """Opening of frames by `v4l2.open_url`, which is imported then: it is Linux's alone."""
-
-    def open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
-        from dbthermal.instruments import v4l2  # noqa: PLC0415
-
-        return v4l2.open_url(url, stream, decode)
-
-    return open_frames
 
 
 def camera_kind(name: str) -> CameraKind:
     """Import the kind of camera of this name; ValueError if it is not one of `KINDS`."""
     if name not in KINDS:
-        raise ValueError(
-            f"Unknown kind of camera {texts.shown(name)}. Must be one of {sorted(KINDS)}."
-        )
+        rule = f"Must be one of {sorted(KINDS)}"
+        raise ValueError(f"Unknown kind of camera {texts.shown(name)}. {rule}.")
     kind: CameraKind = importlib.import_module(KINDS[name]).KIND
     return kind
 
 
 @dataclass(frozen=True)
 class Shutter:
-    """State of one camera's shutter after a frame; see `next_shutter`."""
+    """State of a camera's shutter after a frame; see `next_shutter`."""
 
     closed: bool = False  # True if the frame is flagged `FrameFlag.SHUTTER_CLOSED`
-    copies: int = 0  # frames in a row, up to this one, that repeat the image before
+    copies: int = 0  # frames in a row, up to this frame, that repeat the image before
     last_ffc_frame: int | None = None  # frame of the last correction, from telemetry
 
 
@@ -272,28 +254,28 @@ def next_shutter(
     last_ffc_frame: int | None = None,
     ffc_status: FfcStatus | None = None,
 ) -> Shutter:
-    """State of a camera's shutter after one more frame, from telemetry, serial line and image.
+    """State of a camera's shutter after the next frame, from telemetry, serial line and image.
 
     A camera freezes its image while the shutter is closed. A frame counts as closed if
 
-    - by its telemetry the offsets were renewed since the frame before (`last_ffc_frame`
-      changed), be it at the start or at the end of the correction: then one frame more is lost, but
-      no renewal is missed, even where the frozen frames were lost on the way; or
-    - it repeats the image (no pixel differs), and the frame before counted as closed, or by the
-      serial line a correction is imminent or in progress (a reading is older than its frame, so
-      that it does not count against an image that changes); or
-    - it is the third copy in a row or a later one, of a camera without telemetry: fewer are lost
-      frames. A serial line alone may miss an event: it is read once a second, and stalls meanwhile.
+    - its telemetry says that the offsets were renewed since the frame before, at the start or at
+      the end of the correction. This costs a frame more than needed, but finds every renewal, even
+      where the frozen frames were lost; or
+    - it repeats the image, and the frame before counted as closed, or the serial line says that a
+      correction is imminent or in progress. That reading is older than the frame, so it does not
+      count against an image that changes; or
+    - it is the third copy in a row or later, of a camera without telemetry; fewer copies are lost
+      frames. The serial line may miss an event: it is read once a second, and stalls meanwhile.
 
-    The flag marks an event, not always from its first copy: `dbthermal.correction.find_shutter`
-    makes one event with renewed offsets of every run of copies that holds or touches a flagged
-    frame. `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status`
-    without a reading of the serial line, or if it is too old.
+    The flag need not begin at the first copy: `dbthermal.correction.find_shutter` makes one event
+    with renewed offsets of every run of copies that holds or touches a flagged frame.
+    `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status` without
+    a reading of the serial line, or if it is too old.
     """
-    known = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
-    renewed = before.last_ffc_frame not in {None, known}
+    latest = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
+    renewed = before.last_ffc_frame not in {None, latest}
     copies = before.copies + 1 if repeated else 0
     announced = ffc_status in {FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS}
-    frozen = known is None and copies >= FEWEST_COPIES
+    frozen = latest is None and copies >= FEWEST_COPIES
     closed = renewed or (repeated and (before.closed or announced or frozen))
-    return Shutter(closed, copies, known)
+    return Shutter(closed, copies, latest)

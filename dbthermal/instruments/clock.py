@@ -1,21 +1,29 @@
-"""Clock of a rig: that of the computer, or emulated time that leaps from event to event.
+"""Clocks of a rig: the computer's, and emulated time that leaps from event to event.
 
-Drivers and recorder take the time, wait, and start their threads by a `Clock` alone. That of
-hardware is `SYSTEM`; `dbthermal.instruments.emulated.clock` has the one of emulated devices.
+Drivers and recorder take the time, wait, and start their threads by a `Clock` alone: `SYSTEM` for
+hardware, an `EmulatedClock` for emulated devices. On the latter a single thread runs at a time.
+When it waits, the next thread is the first in the order of waits whose condition holds or whose
+time has come; if there is none the clock leaps to the earliest end of a wait. So a program, and
+all that it writes, does not depend on the load of the machine, its cores, or the speed of its disk.
 """
 
+import math
 import queue
 import threading
 import time as system_time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final, TypeVar
 
-__all__ = ["SYSTEM", "Clock", "Task"]
+__all__ = ["START", "SYSTEM", "Clock", "EmulatedClock", "Task"]
 __dir__ = __all__.copy
 
 Item = TypeVar("Item")
+
+START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # at time 0 of every emulated clock
+_ROOM: Final = 1.0  # emulated wait for a place in a buffer whose reader has ended [s]
+_POLL: Final = 0.05  # between two looks at the waits, by the computer's clock [s]
 
 
 class Clock:
@@ -47,13 +55,13 @@ class Clock:
 
     @contextmanager
     def hold(self, lock: threading.Lock) -> Iterator[None]:
-        """Hold a lock while a block lasts; it may wait on this clock in it."""
+        """Hold a lock while a block lasts, in which the thread may wait on this clock."""
         with lock:
             yield
 
     @contextmanager
     def joined(self) -> Iterator[None]:
-        """Let this thread take part in the order of a clock that has one, while a block lasts."""
+        """Let this thread take part in the order of a clock that has an order."""
         yield
 
     def enter(self, entered: threading.Event) -> None:
@@ -96,3 +104,140 @@ class Task(threading.Thread):
         finally:
             self.ended.set()
             self._clock.leave()
+
+
+class _Wait:
+    """Wait of a thread until a condition holds, or until a time [s]."""
+
+    def __init__(self, condition: Callable[[], bool], end: float) -> None:
+        self.condition, self.end, self.thread = condition, end, threading.get_ident()
+        self.held = False  # True if the condition held before the end
+        self.over = threading.Event()
+
+
+class EmulatedClock(Clock):
+    """Clock of an emulated bench, which begins at time 0, on 1 January 2000.
+
+    Threads take part in its order if they are a `Task`, or inside `joined`. Any thread may wait on
+    it, but those outside the order run beside it, and what they do depends on the computer.
+    """
+
+    def __init__(self) -> None:
+        self._now = 0.0
+        self._lock = threading.Lock()
+        self._waits: list[_Wait] = []
+        self._members: set[int] = set()  # threads that take part in the order
+        self._running: set[int] = set()  # members that do not wait
+
+    def __call__(self) -> float:
+        """Time since the start [s]."""
+        return self._now
+
+    def utc(self) -> datetime:
+        """Emulated date and time of day."""
+        return START + timedelta(seconds=self._now)
+
+    def sleep(self, seconds: float) -> None:
+        """Let the other threads run until a time has passed [s]."""
+        self._wait(lambda: False, seconds)
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Let the other threads run until an event is set, at most `timeout` [s]."""
+        return self._wait(event.is_set, timeout)
+
+    def get(self, items: "queue.SimpleQueue[Item]", timeout: float) -> Item:
+        """Let the other threads run until a queue has an item; `queue.Empty` if it gets none."""
+        self._wait(lambda: not items.empty(), timeout)
+        return items.get_nowait()
+
+    def has_room(self, room: threading.Semaphore) -> bool:
+        """Wait for a place in a buffer: its reader is awaited in emulated time."""
+        return self._wait(lambda: room.acquire(blocking=False), _ROOM)
+
+    @contextmanager
+    def hold(self, lock: threading.Lock) -> Iterator[None]:
+        """Hold a lock while a block lasts; the other threads run until it is free."""
+        taken = threading.Event()  # the condition may be evaluated by another thread
+
+        def take() -> bool:
+            if lock.acquire(blocking=False):
+                taken.set()
+            return taken.is_set()
+
+        try:
+            self._wait(take)
+            yield
+        finally:
+            if taken.is_set():
+                lock.release()
+
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Take part in the order while a block lasts, as the thread that runs now."""
+        with self._lock:
+            outer = threading.get_ident() in self._members
+            self._members.add(threading.get_ident())
+            self._running.add(threading.get_ident())
+        try:
+            yield
+        finally:
+            if not outer:
+                self.leave()
+
+    def enter(self, entered: threading.Event) -> None:
+        """Take a place in the order behind all that wait, and wait for the turn."""
+        with self._lock:
+            self._members.add(threading.get_ident())
+            turn = _Wait(lambda: True, self._now)
+            self._waits.append(turn)
+        entered.set()
+        self._await(turn)
+
+    def leave(self) -> None:
+        """Leave the order: the next thread runs."""
+        with self._lock:
+            self._members.discard(threading.get_ident())
+            self._running.discard(threading.get_ident())
+            self._next()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float = math.inf) -> bool:
+        """Wait until a condition holds, at most `timeout` [s]; True if it does."""
+        turn = _Wait(condition, self._now + timeout)
+        try:
+            with self._lock:
+                self._waits.append(turn)
+                self._running.discard(turn.thread)
+                self._next()
+            self._await(turn)
+        except BaseException:  # an interrupt: this thread goes on
+            with self._lock:
+                self._waits = [wait for wait in self._waits if wait is not turn]
+                self._run(turn)
+            raise
+        return turn.held
+
+    def _await(self, turn: _Wait) -> None:
+        while not turn.over.wait(_POLL):
+            with self._lock:
+                self._next()
+
+    def _next(self) -> None:
+        """Let the next thread run, if none does."""
+        while self._waits and not self._running:
+            chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
+            if chosen is None:
+                chosen = min(self._waits, key=lambda wait: wait.end)
+                if math.isinf(chosen.end):
+                    return  # a thread outside the order has what all wait for
+                self._now = chosen.end
+            self._run(chosen)
+            self._waits.remove(chosen)
+
+    def _is_over(self, wait: _Wait) -> bool:
+        wait.held = wait.condition()
+        return wait.held or wait.end <= self._now
+
+    def _run(self, wait: _Wait) -> None:
+        if wait.thread in self._members:
+            self._running.add(wait.thread)
+        wait.over.set()

@@ -1,7 +1,7 @@
 """The devices of a session, opened together: cameras, their command ports, wheel, thermocouples.
 
 Opening sends nothing that changes a camera, and moves nothing. In an emulated session all emulators
-share one world, so that the wheel's position decides what the camera behind it sees; they are
+share a world, so that the wheel's position decides what the camera behind it sees; they are
 imported only then.
 """
 
@@ -28,7 +28,7 @@ from dbthermal.instruments.camera import (
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
-from dbthermal.instruments.session import Session
+from dbthermal.instruments.session import LOGGER, WHEEL, Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
@@ -36,7 +36,6 @@ __dir__ = __all__.copy
 
 SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
 FLUSH_TIMEOUT: Final = 2.0  # longest time in which the frames that a driver holds are read [s]
-WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
 
 
 class ReadingError(RuntimeError):
@@ -53,22 +52,22 @@ class Thermocouples:
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._scan: Scan | None = None
-        self._read: set[int] = set()
+        self._used: set[int] = set()  # channels whose value in the scan was given
 
     def read(self, channel: int) -> float:
-        """Temperature of one channel [K]; each reading of a channel is a measurement of its own.
+        """Temperature of a channel [K], never the same measurement twice.
 
         `ReadingError` if it is no temperature, or the logger fails.
         """
         with self.logger.clock.hold(self._lock):
             scan = self._scan
-            if scan is None or channel in self._read or self.logger.clock() - scan.time > SCAN_AGE:
+            if scan is None or channel in self._used or self.logger.clock() - scan.time > SCAN_AGE:
                 try:
                     self._scan = scan = self.logger.single()
                 except TC08Error as error:
                     raise ReadingError(f"No temperatures: {error}") from error
-                self._read.clear()
-            self._read.add(channel)
+                self._used.clear()
+            self._used.add(channel)
         if scan.flag[channel]:
             raise ReadingError(
                 f"No temperature of thermocouple '{self.names[channel]}' in channel {channel}: "
@@ -111,13 +110,14 @@ class Devices:
         return readings
 
     def identities(self) -> dict[str, Identity]:
-        """Names and numbers of cameras, by band, and other devices; each says ``is_simulated``.
+        """Names and numbers of cameras, by band, and of devices; each says ``is_simulated``.
 
         ValueError if frames and command port of a band are those of two cameras; RuntimeError or
         OSError if a device does not answer.
         """
         identities: dict[str, Identity] = {}
         for band, source in self.sources.items():
+            # The frames of a camera, and its command port.
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
             if band in self.cameras:
                 control = self.cameras[band].identity()
@@ -129,10 +129,11 @@ class Devices:
                     )
                 identity = {**identity, **control}
             identities[band] = identity
+        # The devices.
         if self.wheel is not None:
             identities[WHEEL] = self.wheel.identity()
         if self.thermocouples is not None:
-            identities["thermocouples"] = self.thermocouples.logger.identity()
+            identities[LOGGER] = self.thermocouples.logger.identity()
         return identities
 
     def prepare(self) -> None:
@@ -171,11 +172,9 @@ class Devices:
         def renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
             return {band if name == before else name: value for name, value in mapping.items()}
 
+        session = replace(self.session, cameras=renamed(self.session.cameras))
         return replace(
-            self,
-            session=replace(self.session, cameras=renamed(self.session.cameras)),
-            sources=renamed(self.sources),
-            cameras=renamed(self.cameras),
+            self, session=session, sources=renamed(self.sources), cameras=renamed(self.cameras)
         )
 
     def flush(self) -> None:
@@ -221,14 +220,15 @@ def open_devices(
     ...     devices.identities()["8-14"]["model"], devices.readings()["fpa 8-14"].read()  # K
     ('emulated Boson', 308.15)
     """
-    if session.simulated:
-        if world is None:
-            world = _emulated("world").emulated_world(session, waits=True)
-            if pictures is None:
-                pictures = _emulated("camera").blackbody_pictures(session, world)
-    elif world is not None or pictures:
+    # The bench of an emulated session.
+    if session.simulated and world is None:
+        world = _emulated("world").emulated_world(session, waits=True)
+        if pictures is None:
+            pictures = _emulated("camera").blackbody_pictures(session, world)
+    if not session.simulated and (world is not None or pictures):
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
+        # Frames and command ports of the cameras.
         sources: dict[str, FrameSource] = {}
         cameras: dict[str, CameraControl] = {}
         for band, camera in session.cameras.items():
@@ -238,14 +238,19 @@ def open_devices(
                 url = f"sim://{camera.kind}/{band}" if session.simulated else camera.control
                 cameras[band] = stack.enter_context(open_control(url, world))
         wheel = thermocouples = None
+        # The wheel.
         if session.filters:
             url = "sim://apt" if session.simulated else session.devices[WHEEL]
             opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
             wheel = stack.enter_context(opened)
+        # The thermocouples.
         if session.thermocouples:
-            url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
-            logger = stack.enter_context(TC08.from_url(url, world=world))
-            logger.set_channels(session.thermocouples)
+            if world is None:
+                logger = TC08.from_url(session.devices[LOGGER])
+            else:
+                unit = _emulated("tc08").EmulatedTC08(world.thermocouple_temperature, world.clock)
+                logger = TC08(unit).open()
+            stack.enter_context(logger).set_channels(session.thermocouples)
             thermocouples = Thermocouples(logger, session.thermocouples)
         yield Devices(session, sources, cameras, wheel, thermocouples, world)
 

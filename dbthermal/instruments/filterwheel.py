@@ -1,30 +1,37 @@
 """Filter wheel FW103 of Thorlabs on an APT stepper controller: six slots, named by their band.
 
-`FilterWheel` is the driver, `Settings` the properties of one wheel and its controller. An FW103 is
-a bare stepper stage, not to be confused with the FW102C and FW212C, which speak ASCII. It has no
+`FilterWheel` is the driver, `Settings` the properties of a wheel and its controller. An FW103 is a
+bare stepper stage, not to be confused with the FW102C and FW212C, which speak ASCII. It has no
 encoder: its position is a count of commanded steps. A controller that stops short of its target, or
 never starts, is an error here; steps lost under way are not detected until `FilterWheel.home`.
 
-A motion is over when two things agree: the controller reports its end or the moving bits are clear,
-and the wheel is where it should be. Neither is enough alone. Bits were seen to stick, the report of
-an earlier move may come late, and before a move starts the bits are clear too.
+A controller that is addressed wrongly says nothing, one that was just switched on may have speeds
+near 0 and a motor without current, and one that was sold under one name may give another. So the
+address is searched for, the model is checked, and each setting is read back.
+
+A motion is over when the controller reports its end or the moving bits are clear, and the wheel is
+where it should be. Neither is enough alone: bits were seen to stick, the report of an earlier move
+may come late, and before a move starts the bits are clear too.
+
+References
+----------
+pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentkit,
+``thorlabsapt.py`` (25600 counts for an FW103); thorlabs_apt_device 0.3.8, ``bsc.py`` (the same
+units, and addresses). Facts alone, no code.
 """
 
+import logging
+import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Final, Self
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._controller import (
-    Controller,
-    NoReplyError,
-    NotHomedError,
-    Settings,
-    StalledWheelError,
-    WheelError,
-    WheelTimeoutError,
-    WrongDeviceError,
-)
+from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
@@ -40,20 +47,243 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
+CHANNEL: Final = 1  # of the motor at its address
+BAUDRATE: Final = 115_200  # [bit/s]
+
+ADDRESSES: Final = ((apt.RACK, apt.BAY_1), (apt.UNIT, apt.UNIT))
+"""Where a controller is looked for, in order: address of its identity, and of its motor. A BSC20x
+is a rack and silently ignores messages to a unit."""
+
+REPLY_TIMEOUT: Final = 1.0  # [s]
+ATTEMPTS: Final = 2  # number of times that a request is sent before its reply counts as missing
+READ_SIZE: Final = 256  # largest number of bytes that are read at once
+MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
+ACCURACY: Final = 0.01  # largest relative difference of a speed that is read back
+
 TOLERANCE: Final = 0.1  # largest distance of the wheel from a slot [deg]
 HOME_TIMEOUT: Final = 60.0  # longest search for the home switch [s]
 MOVE_TIMEOUT: Final = 20.0  # longest move [s]
 START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
 STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
 POLL_INTERVAL: Final = 0.05  # between two status requests [s]
-BAUDRATE: Final = 115_200  # [bit/s]
-# State that is an error; it is uncertain if a wheel's controller sets these bits.
-FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
-# Bits of a wheel that moves. The jogging bits are left out: they were seen to stick.
-MOVING: Final = (
-    apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
-)
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
+
+# State that is an error; it is uncertain if a wheel's controller sets these bits.
+FAULTS: Final = StatusBits.POSITION_ERROR | StatusBits.OVERLOAD
+# Bits of a wheel that moves. The jogging bits are left out: they were seen to stick.
+MOVING: Final = StatusBits.MOVING_FORWARD | StatusBits.MOVING_REVERSE | StatusBits.HOMING
+
+_EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
+_NOTICES = (Id.HW_RESPONSE, Id.HW_RICHRESPONSE)
+_LOGGER = logging.getLogger(__name__)
+
+# Speeds are whole numbers of 32 bits to the controllers, which is 97 turns/s in the finer units;
+# slower than the lowest a turn would take longer than the wheel is waited for.
+Speed = Annotated[float, Field(strict=True, ge=0.1, le=90.0)]
+
+
+@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Settings:
+    """Properties of a wheel and its controller; ValueError if one is out of its range.
+
+    Which direction and switch a wheel needs is uncertain: None keeps what the controller has.
+    """
+
+    # Of the controller; any other is then refused.
+    serial_number: Annotated[int, Field(strict=True, ge=1, lt=2**32)] | None = None
+    # From the home position to slot 1 [deg]; differs by wheel: look.
+    home_offset: Annotated[float, Field(strict=True, gt=-360.0, lt=360.0)] = 0.0
+    home_direction: Literal[1, 2] | None = None  # 1 forward, 2 reverse
+    home_limit_switch: Literal[1, 4] | None = None  # 1 the reverse switch, 4 the forward one
+    velocity: Speed = 1.0  # [turn/s]
+    home_velocity: Speed = 0.2  # [turn/s]
+    acceleration: Annotated[float, Field(strict=True, ge=0.1, le=1e5)] = 1.0  # [turn/s^2]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Units of a controller."""
+
+    turn: int  # counts of one turn of the wheel
+    velocity: float  # device units of one count/s
+    acceleration: float  # device units of one count/s^2
+
+    def target(self, position: int, offset: float) -> int:
+        """Absolute place [count] of a slot, 1 to 6; `offset` [deg] is that of slot 1 after homing.
+
+        Each place is rounded by itself, so that errors never add up. ValueError for any other slot.
+        """
+        if position not in range(1, POSITIONS + 1):
+            raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
+        return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
+
+    def position(self, count: int, offset: float) -> int | None:
+        """Slot within `TOLERANCE` of a place [count] of any turn; None between two slots."""
+        sixths = (count / self.turn - offset / 360.0) * POSITIONS
+        nearest = round(sixths)
+        near = abs(sixths - nearest) * 360.0 / POSITIONS <= TOLERANCE
+        return nearest % POSITIONS + 1 if near else None
+
+    def degrees(self, counts: int) -> float:
+        """Angle [deg] of a number of counts."""
+        return counts / self.turn * 360.0
+
+
+# 200 full steps of 2048 microsteps, and of 128.
+BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
+BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
+# Beginnings of the model names that are accepted; some BSC201 call themselves SCC201.
+MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
+
+
+class WheelError(RuntimeError):
+    """The wheel or its controller does not do what it should."""
+
+
+class NoReplyError(WheelError, TimeoutError):
+    """The controller did not reply in time."""
+
+
+class WheelTimeoutError(WheelError, TimeoutError):
+    """The wheel moved, but did not arrive in time."""
+
+
+class WrongDeviceError(WheelError):
+    """Another device is at this address."""
+
+
+class StalledWheelError(WheelError):
+    """The wheel does not move, or stopped elsewhere."""
+
+
+class NotHomedError(WheelError):
+    """The controller does not know where the wheel is."""
+
+
+class _Line:
+    """Requests to a controller and its replies, with what it reports by itself.
+
+    APT has no sequence numbers, and a controller reports the end of a move at any time: the next
+    message is not always the reply. So messages are told apart by identifier, source and channel.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self.unit, self.motor = ADDRESSES[0]
+        self.decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
+        self._transport, self._clock = transport, transport.clock
+        # A recorder asks for the position in one thread while another turns the wheel.
+        self._lock = threading.Lock()
+        self._events: list[apt.Message] = []
+        self._notices: list[apt.Notice] = []
+
+    def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
+        """Send a message without a reply to the motor."""
+        message = apt.command(identifier, channel, value, data=data, destination=self.motor)
+        self._transport.write(message)
+
+    def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
+        """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
+        with self._clock.hold(self._lock):
+            self._collect()
+        self._events.clear()
+        self.check()
+        self.send(identifier, channel, data=data)
+
+    def greet(self) -> apt.Info | None:
+        """Identity of the controller at the address of the unit; None if it is silent."""
+        for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
+            self._transport.write(apt.command(identifier, destination=self.unit))
+        try:
+            reply = self._exchange(Id.HW_REQ_INFO, Id.HW_GET_INFO, self.unit, 0, attempts=1)
+        except NoReplyError:
+            return None
+        self._collect()
+        self._notices.clear()  # it need not know all messages of the greeting
+        return apt.Info.parse(reply)
+
+    def request(self, identifier: Id, reply: Id) -> apt.Message:
+        """Reply of the motor to a request; NoReplyError without a reply.
+
+        Only requests are repeated, never what moves the wheel. A late reply may be taken for that
+        of the repetition, and is older than it seems, but replies stay in order.
+        """
+        return self._exchange(identifier, reply, self.motor, CHANNEL, attempts=ATTEMPTS)
+
+    def has_reported(self, identifier: Id) -> bool:
+        """True if the motor reported this since the last start of a motion."""
+        return (identifier, self.motor) in {(event.id, event.source) for event in self._events}
+
+    def check(self) -> None:
+        """WheelError with the text of the errors that the controller reported by itself."""
+        if self._notices:
+            reported = self._reported()
+            self._notices.clear()
+            raise WheelError(f"The controller is not well.{reported}")
+
+    def _exchange(
+        self, identifier: Id, reply: Id, source: int, channel: int, attempts: int
+    ) -> apt.Message:
+        """Reply to a request; what came before the request is not its reply."""
+        request = apt.command(identifier, channel, destination=source)
+        # Ask, as often as needed.
+        with self._clock.hold(self._lock):
+            for _ in range(attempts):
+                self._collect()
+                self._transport.write(request)
+                if (message := self._wait(reply, source, channel)) is not None:
+                    return message
+                self.decoder.discard()  # half a message whose rest did not come in time
+        raise NoReplyError(
+            f"No answer {reply.name} from address 0x{source:02X} in {REPLY_TIMEOUT} s. "
+            f"The controller must be on and in no other program's use.{self._reported()}"
+        )
+
+    def _wait(self, reply: Id, source: int, channel: int) -> apt.Message | None:
+        """Read until the reply comes, of a channel unless 0; None if it does not in time."""
+        deadline = self._clock() + REPLY_TIMEOUT
+        while (remaining := deadline - self._clock()) > 0:
+            if not (received := self._transport.read(READ_SIZE, remaining)):
+                return None
+            for message in reversed(self._replies(received)):
+                data = message.data
+                about = int.from_bytes(data[:2], "little") if data else message.param1
+                if (message.id, message.source) == (reply, source) and channel in {0, about}:
+                    return message
+        return None
+
+    def _collect(self) -> None:
+        """Take in all bytes that have come so far."""
+        count = 0
+        while received := self._transport.read(READ_SIZE, 0.0):
+            self._replies(received)
+            count += len(received)
+            if count > MAXIMUM_UNSOLICITED:
+                rule = "Must be an APT controller"
+                raise WrongDeviceError(
+                    f"More than {MAXIMUM_UNSOLICITED} unsolicited bytes came. {rule}."
+                )
+
+    def _replies(self, received: bytes) -> list[apt.Message]:
+        """Messages that may be replies; events and notices are kept."""
+        replies = []
+        for message in self.decoder.feed(received):
+            if message.id in _EVENTS:
+                self._events.append(message)
+            elif message.id in _NOTICES:
+                notice = apt.Notice.parse(message)
+                _LOGGER.warning("Controller of the filter wheel: %s", notice)
+                self._notices.append(notice)
+            else:
+                replies.append(message)
+        return replies
+
+    def _reported(self) -> str:
+        """Sentences on the errors that the controller reported."""
+        return "".join(
+            f" It reported error {notice.code} of message 0x{notice.id:04X}: {notice.notes}."
+            for notice in self._notices
+        )
 
 
 class FilterWheel(Closing):
@@ -64,15 +294,13 @@ class FilterWheel(Closing):
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        filters: Mapping[int, str],
-        settings: Settings | None = None,
+        self, transport: Transport, filters: Mapping[int, str], settings: Settings | None = None
     ) -> None:
         self.filters, self.settings = filters, settings or Settings()
-        self._transport = transport
-        self._controller = Controller(transport, self.settings)
-        self._clock = transport.clock
+        self.is_simulated = transport.is_simulated
+        self._transport, self._clock = transport, transport.clock
+        self._line = _Line(transport)
+        self._info: apt.Info | None = None  # once it is connected
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
@@ -87,76 +315,86 @@ class FilterWheel(Closing):
         """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
         line = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
         wheel = cls(line, filters, settings)
-        try:
+        with ExitStack() as stack:
+            stack.enter_context(wheel)
             wheel.connect()
-        except BaseException:
-            wheel.close()
-            raise
+            stack.pop_all()
         return wheel
 
     def connect(self) -> apt.Info:
         """Find the controller, check its identity, set the speeds and enable the motor."""
-        info = self._controller.find()
-        self._controller.prepare()
-        return info
-
-    @property
-    def is_simulated(self) -> bool:
-        """True if an emulator is at the other end."""
-        return self._transport.is_simulated
+        for self._line.unit, self._line.motor in ADDRESSES:
+            if (info := self._line.greet()) is not None:
+                self._scale_of(info)
+                self._info = info
+                self._prepare()
+                return info
+        if dropped := self._line.decoder.dropped:
+            raise WrongDeviceError(
+                f"{dropped} bytes came that are no APT messages. Must be an APT controller."
+            )
+        tried = ", ".join(f"0x{unit:02X}" for unit, _ in ADDRESSES)
+        raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
 
     def identity(self) -> Identity:
         """Model (not always that on the label), numbers and addresses of the controller."""
-        controller, info = self._controller, self._controller.info
+        if self._info is None:
+            raise WheelError(
+                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
+            )
         return {
-            "model": info.model,
-            "serial_number": str(info.serial_number),
-            "firmware": info.firmware,
-            "addresses": f"0x{controller.unit:02X}, 0x{controller.motor:02X}",
+            "model": self._info.model,
+            "serial_number": str(self._info.serial_number),
+            "firmware": self._info.firmware,
+            "addresses": f"0x{self._line.unit:02X}, 0x{self._line.motor:02X}",
             "is_simulated": self.is_simulated,
         }
 
     def status(self) -> apt.Status:
         """Position [count] and state of the motor."""
-        return self._controller.status()
+        reply = self._line.request(Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE)
+        return apt.Status.parse(reply)
 
     def home(self) -> None:
-        """Search for the home switch, from which all places count.
+        """Search for the home switch, from which all places count; the speeds are set before.
 
-        The speeds are set before: where they are near 0, as in some controllers that were just
-        switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
-        the wheel does not start, stops before the switch, or takes too long, and was stopped.
+        StalledWheelError or WheelTimeoutError if the wheel does not start, stops before the switch,
+        or takes too long, and was stopped.
         """
-        self._controller.prepare()
+        self._prepare()
         self._require_rest()
         self._is_lost = True
-        self._controller.start_home()
-        # The counter may stand while a controller searches for the switch: no stall limit.
-        limits = HOME_TIMEOUT, HOME_TIMEOUT
-        self._follow(_Motion("Search for home", apt.Id.MOT_MOVE_HOMED, *limits), _is_home)
+        self._line.begin(Id.MOT_MOVE_HOME, CHANNEL)
+
+        def is_home(status: apt.Status) -> bool:
+            return status.bits & (StatusBits.HOMED | StatusBits.HOMING) == StatusBits.HOMED
+
+        # The counter may stand while a controller searches for the switch: no stall limit. The
+        # homed bit alone may be that of an earlier search: the wheel must have moved.
+        name, limits = "Search for home", (HOME_TIMEOUT, HOME_TIMEOUT)
+        self._follow(name, Id.MOT_MOVE_HOMED, limits, is_home, must_move=True)
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
         """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
 
-        ValueError if the slot is another; NotHomedError if the controller was not homed since it
+        ValueError if there is no such slot; NotHomedError if the controller was not homed since it
         was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
         stops elsewhere, or the controller reports a fault: it must be homed before the next move;
         WheelTimeoutError if it takes too long, and was stopped.
         """
-        scale = self._controller.scale
+        scale = self._scale
         target = scale.target(position, self.settings.home_offset)
         self._require_home(self._require_rest())
 
-        def has_arrived(motion: _Motion, status: apt.Status) -> bool:
-            distance = abs(scale.degrees(status.position - target))
-            return distance <= TOLERANCE and (motion.reported or motion.rests > 0)
+        self._line.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.Position(CHANNEL, target).pack())
 
-        name = f"Move to {scale.degrees(target):.2f} deg"
-        limits = MOVE_TIMEOUT, STALL_TIMEOUT
-        self._controller.start_move(target)
+        def has_arrived(status: apt.Status) -> bool:
+            return abs(scale.degrees(status.position - target)) <= TOLERANCE
+
+        name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
         try:
-            self._follow(_Motion(name, apt.Id.MOT_MOVE_COMPLETED, *limits), has_arrived)
+            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, has_arrived, must_move=False)
         except StalledWheelError:
             self._is_lost = True
             raise
@@ -172,11 +410,10 @@ class FilterWheel(Closing):
         """Slot in the beam, 1 to 6; WheelError between two slots, in a move, or if not homed."""
         status = self._require_rest()
         self._require_home(status)
-        scale = self._controller.scale
-        position = scale.position(status.position, TOLERANCE, self.settings.home_offset)
+        position = self._scale.position(status.position, self.settings.home_offset)
         if position is None:
             raise WheelError(
-                f"The wheel is between two slots, at {scale.degrees(status.position):.2f} deg. "
+                f"The wheel is between two slots, {self._place(status)}. "
                 f"Must be within {TOLERANCE} deg of one: move it."
             )
         return position
@@ -185,101 +422,157 @@ class FilterWheel(Closing):
         """Name of the filter in the beam; raises as `position`, and if this slot has no filter."""
         position = self.position()
         if position not in self.filters:
-            known = dict(self.filters)
-            raise WheelError(f"No filter in slot {position}. Filters are in {known}.")
+            raise WheelError(f"No filter in slot {position}. Filters are in {dict(self.filters)}.")
         return self.filters[position]
 
     def stop(self) -> None:
         """Stop the wheel by a ramp."""
-        self._controller.stop()
+        self._line.send(Id.MOT_MOVE_STOP, CHANNEL, apt.NO)
 
     def close(self) -> None:
         """Close the line; the wheel stays where it is. A second call does nothing."""
         self._transport.close()
 
+    def _identity(self) -> apt.Info:
+        """Identity of the controller; `WheelError` before `connect`."""
+        if self._info is None:
+            raise WheelError(
+                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
+            )
+        return self._info
+
+    @property
+    def _scale(self) -> Scale:
+        return self._scale_of(self._identity())
+
+    def _scale_of(self, info: apt.Info) -> Scale:
+        """Scale of a controller, if it is one that drives this wheel."""
+        expected = self.settings.serial_number
+        if expected is not None and info.serial_number != expected:
+            raise WrongDeviceError(f"Wrong controller {info.serial_number}. Must be {expected}.")
+        for beginning, scale in MODELS.items():
+            if info.model.startswith(beginning):
+                return scale
+        rule = f"Its model must begin with one of {sorted(MODELS)}"
+        raise WrongDeviceError(f"Wrong device '{info.model}', number {info.serial_number}. {rule}.")
+
+    def _prepare(self) -> None:
+        """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
+        settings, scale, request = self.settings, self._scale, self._line.request
+        units = scale.turn * scale.velocity  # of one turn/s
+        # The speeds of moves.
+        speeds = apt.VelocityParameters(
+            CHANNEL,
+            minimum=0,
+            acceleration=round(settings.acceleration * scale.turn * scale.acceleration),
+            maximum=round(settings.velocity * units),
+        )
+        self._line.send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
+        reply = request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
+        actual = apt.VelocityParameters.parse(reply)
+        _must_agree("velocity", actual.maximum, speeds.maximum)
+        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
+        # The speed of homing, and direction and switch where the settings have them.
+        before = self._home_parameters()
+        wanted = replace(
+            before,
+            direction=settings.home_direction or before.direction,
+            limit_switch=settings.home_limit_switch or before.limit_switch,
+            velocity=round(settings.home_velocity * units),
+        )
+        self._line.send(Id.MOT_SET_HOMEPARAMS, data=wanted.pack())
+        home = self._home_parameters()
+        _must_agree("home velocity", home.velocity, wanted.velocity)
+        if replace(home, velocity=wanted.velocity) != wanted:
+            raise WheelError(f"The controller has {home}. Must be {wanted}.")
+        # The motor's current.
+        self._line.send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
+        state = request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE).param2
+        if state not in {apt.YES, apt.NO}:
+            raise WheelError(f"Unknown state {state} of the motor. Must be 1 or 2.")
+        if state == apt.NO:
+            raise WheelError("The controller did not enable the motor. It must be connected.")
+        self._line.check()
+
+    def _home_parameters(self) -> apt.HomeParameters:
+        reply = self._line.request(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS)
+        return apt.HomeParameters.parse(reply)
+
     def _require_rest(self) -> apt.Status:
         """Status of a wheel that does not move."""
-        status = self._controller.status()
+        status = self.status()
         if status.bits & MOVING:
             raise WheelError("The wheel is still moving. Must be at rest: wait, or stop it.")
         return status
 
     def _require_home(self, status: apt.Status) -> None:
         """Raise unless the controller knows where the wheel is."""
-        if self._is_lost or not status.bits & apt.StatusBits.HOMED:
+        if self._is_lost or not status.bits & StatusBits.HOMED:
             raise NotHomedError(
                 "The wheel was not homed since it was switched on, or has lost steps since. "
                 "Must be homed."
             )
 
-    def _follow(self, motion: "_Motion", is_over: "Callable[[_Motion, apt.Status], bool]") -> None:
-        """Poll until a motion is over; stop the wheel if it takes too long."""
-        motion.began = motion.changed = self._clock()
-        controller, confirmed = self._controller, 0
+    def _place(self, status: apt.Status) -> str:
+        return f"at {self._scale.degrees(status.position):.2f} deg"
+
+    def _follow(
+        self,
+        name: str,
+        end: Id,
+        limits: tuple[float, float],
+        is_there: Callable[[apt.Status], bool],
+        *,
+        must_move: bool,
+    ) -> None:
+        """Poll until a motion is over; raise if it fails, with the wheel stopped if it moves.
+
+        `limits` are the longest motion, and the longest time at one place [s].
+        """
+        start = changed = self._clock()
+        moved, rests, confirmed, count = False, 0, 0, None
         while confirmed < CONFIRMATIONS:
-            status = controller.status()
-            controller.raise_notice()
+            status = self.status()
+            self._line.check()
             if faults := status.bits & FAULTS:
-                controller.stop()
+                self.stop()
                 raise StalledWheelError(
                     f"The controller reports {faults.name}, and the wheel was stopped. "
                     "Must be none."
                 )
-            motion.update(status, self._clock())
-            motion.reported = controller.has_reported(motion.end)
-            confirmed = confirmed + 1 if is_over(motion, status) else 0
-            if not confirmed:
-                self._check(motion, status)
+            # The course of the motion so far.
+            now, moving = self._clock(), bool(status.bits & MOVING)
+            moved |= moving or count not in {None, status.position}
+            if status.position != count:
+                count, changed = status.position, now
+            rests = 0 if moving else rests + 1
+            # Over, by its end and its place.
+            rested = rests > 0 and (moved or not must_move)
+            ended = rested or self._line.has_reported(end)
+            confirmed = confirmed + 1 if ended and is_there(status) else 0
+            # Failed: at rest elsewhere, too long under way, or standing still.
+            place = self._place(status)
+            if confirmed:
+                pass  # until it is confirmed as often as needed
+            elif rests >= CONFIRMATIONS and (moved or now - start > START_TIMEOUT):
+                action = "stopped" if moved else "did not start and is"
+                raise StalledWheelError(f"{name}: the wheel {action} {place}. Must arrive.")
+            elif now - start > limits[0]:
+                self.stop()
+                raise WheelTimeoutError(
+                    f"{name}: the wheel was still {place} after {limits[0]} s, and was "
+                    "stopped. Must arrive in this time."
+                )
+            elif now - changed > limits[1]:
+                self.stop()
+                raise StalledWheelError(
+                    f"{name}: the wheel stood {place} for {limits[1]} s while it should "
+                    "move, and was stopped. Must turn freely."
+                )
             self._clock.sleep(POLL_INTERVAL)
 
-    def _check(self, motion: "_Motion", status: apt.Status) -> None:
-        """Raise if the wheel rests where it should not, stands still, or takes too long."""
-        place = f"at {self._controller.scale.degrees(status.position):.2f} deg"
-        now = self._clock()
-        started = motion.moved or now - motion.began > START_TIMEOUT
-        if started and motion.rests >= CONFIRMATIONS:
-            action = "stopped" if motion.moved else "did not start and is"
-            raise StalledWheelError(f"{motion.name}: the wheel {action} {place}. Must arrive.")
-        if now - motion.began > motion.timeout:
-            self._controller.stop()
-            raise WheelTimeoutError(
-                f"{motion.name}: the wheel was still {place} after {motion.timeout} s, and was "
-                "stopped. Must arrive in this time."
-            )
-        if now - motion.changed > motion.stall:
-            self._controller.stop()
-            raise StalledWheelError(
-                f"{motion.name}: the wheel stood {place} for {motion.stall} s while it should "
-                "move, and was stopped. Must turn freely."
-            )
 
-
-@dataclass
-class _Motion:
-    """Name, end report and limits [s] of one motion, and its course so far, times in s."""
-
-    name: str
-    end: apt.Id
-    timeout: float
-    stall: float
-    began: float = 0.0
-    changed: float = 0.0
-    last: int | None = None
-    moved: bool = False
-    reported: bool = False
-    rests: int = 0
-
-    def update(self, status: apt.Status, time: float) -> None:
-        """Take in one status."""
-        moving = bool(status.bits & MOVING)
-        self.moved |= moving or (self.last is not None and status.position != self.last)
-        if status.position != self.last:
-            self.last, self.changed = status.position, time
-        self.rests = 0 if moving else self.rests + 1
-
-
-def _is_home(motion: _Motion, status: apt.Status) -> bool:
-    """True if the switch was found: the homed bit alone may be that of an earlier search."""
-    homed = status.bits & (apt.StatusBits.HOMED | apt.StatusBits.HOMING)
-    done = motion.reported or (motion.moved and motion.rests > 0)
-    return done and homed == apt.StatusBits.HOMED
+def _must_agree(name: str, actual: int, expected: int) -> None:
+    """Raise if a controller did not take a speed."""
+    if abs(actual - expected) > ACCURACY * expected:
+        raise WheelError(f"The controller has {name} {actual}. Must be {expected} [device units].")

@@ -2,8 +2,8 @@
 
 The bus is only listed, through pyusb, and Linux's sysfs is read: nothing is opened, set or reset,
 for the devices may be recording. A device's nodes are those below its USB device in sysfs, so that
-two equal cameras are told apart by their ports. A Boson's USB serial number may not always be the
-camera's own: ask the camera itself.
+equal cameras differ by their ports. A Boson's USB serial number may differ from the number that the
+camera gives itself.
 """
 
 import os
@@ -25,7 +25,7 @@ __dir__ = __all__.copy
 class Kind:
     """Type of device: its USB identity, and its families of nodes.
 
-    Each family has a word, the Linux module that makes it, and where sysfs lists its nodes.
+    A family of nodes has a name, the Linux module that makes it, and where sysfs lists its nodes.
     """
 
     name: str
@@ -60,7 +60,7 @@ class LibusbMissingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Device:
-    """One device that is plugged in.
+    """A device that is plugged in.
 
     `bus` is the number of its bus, `ports` the port of each hub on the way, the root's first,
     `serial` its USB serial number, empty if it is not known, `nodes` its files below ``/dev``.
@@ -99,15 +99,14 @@ def find(
         of_kind = [_device(kind, raw, sysfs, dev) for raw in _enumerate(backend, kind)]
         devices += sorted(of_kind, key=lambda device: (device.bus, device.ports))
     cameras = [device for device in devices if device.kind == BOSON]
-    warnings = [(*device.warnings, _bandwidth(device, cameras, frame_rate)) for device in devices]
     return [
-        replace(device, warnings=tuple(filter(None, texts)))
-        for device, texts in zip(devices, warnings, strict=True)
+        replace(device, warnings=(*device.warnings, *_bandwidth(device, cameras, frame_rate)))
+        for device in devices
     ]
 
 
 def describe(devices: Iterable[Device]) -> str:
-    """Text with a line for each device, its warnings below it, and one for each missing kind.
+    """Text with a line for each device, its warnings below it, and a line for each missing kind.
 
     Examples
     --------
@@ -115,10 +114,9 @@ def describe(devices: Iterable[Device]) -> str:
     >>> print(describe([camera]).splitlines()[0])
     FLIR Boson without serial number: 1-2.4, high speed, /dev/video0
     """
-    listed = list(devices)
-    lines = []
+    plugged, lines = list(devices), list[str]()
     for kind in KINDS:
-        of_kind = [device for device in listed if device.kind == kind]
+        of_kind = [device for device in plugged if device.kind == kind]
         for device in of_kind:
             nodes, serial = " ".join(device.nodes), device.serial or "without serial number"
             place = f"{device.path}, {device.speed} speed, {nodes or 'no nodes'}"
@@ -147,11 +145,13 @@ def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
 
 def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     """Device of the bus with its nodes and the warnings about their use."""
+    # The device, where Linux lists it.
     device = Device(kind, raw.bus, tuple(raw.port_numbers or ()), SPEEDS.get(raw.speed, "unknown"))
     folder = sysfs / "bus" / "usb" / "devices" / device.path
     if not folder.is_dir():
         warning = f"Its nodes and number are not known: there is no {folder}."
         return replace(device, warnings=(warning,))
+    # Its nodes, by families.
     number, nodes, warnings = folder / "serial", list[Path](), list[str]()
     for family, module, pattern in kind.families:
         names = sorted(
@@ -180,23 +180,23 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     )
 
 
-def _bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> str:
-    """Warning if a camera's video does not fit its bus, alone or with the others on it."""
+def _bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> Iterator[str]:
+    """Yield a warning if a camera's video does not fit its bus with the rest of the cameras."""
     rate = 16e-6 * PIXELS * frame_rate  # [Mbit/s]
     if device in cameras and device.speed in {"low", "full"}:
-        return (
+        yield (
             f"It runs at {device.speed} speed, and {frame_rate:g} frames/s take {rate:.1f} Mbit/s. "
             "Must be at high speed: use another port or cable."
         )
-    same = [camera for camera in cameras if (camera.bus, camera.speed) == (device.bus, "high")]
-    total, limit = rate * len(same), HIGH_SPEED_PAYLOAD / 1e6
-    if device not in same or total <= limit:
-        return ""
-    others = ", ".join(camera.path for camera in same if camera is not device) or "no other"
-    return (
-        f"It shares bus {device.bus} with {others}: {total:.1f} Mbit/s at {frame_rate:g} frames/s, "
-        f"of {limit:.1f} Mbit/s at most. Use ports of two controllers, or fewer frames/s."
-    )
+    on_bus = [camera for camera in cameras if (camera.bus, camera.speed) == (device.bus, "high")]
+    total, limit = rate * len(on_bus), HIGH_SPEED_PAYLOAD / 1e6
+    if device in on_bus and total > limit:
+        paths = [camera.path for camera in on_bus if camera is not device]
+        yield (
+            f"It shares bus {device.bus} with {', '.join(paths) or 'no other'}: {total:.1f} Mbit/s "
+            f"at {frame_rate:g} frames/s, of {limit:.1f} Mbit/s at most. Use ports of two "
+            "controllers, or fewer frames/s."
+        )
 
 
 def plugged_in(session: "Session") -> str:

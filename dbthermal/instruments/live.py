@@ -1,7 +1,7 @@
 """Live view of a recording: its pictures, its losses, and the state of its cameras.
 
-A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows one picture
-of each band, in place, in a notebook or nowhere::
+A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows a picture of
+each band, in place, in a notebook or nowhere::
 
     view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
     record(session, devices.sources, path, readings=devices.readings(), preview=view)
@@ -47,14 +47,14 @@ _LEAST_SHARE: Final = 0.01  # of pixels at either end of the range, from which a
 _COMPRESSION: Final = 1  # of zlib's 1 to 9
 _RANGE: Final = np.iinfo(np.uint16)
 _FILMS: Final = ("object", "background")
-_STEP: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
+_STRIDE: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
 _FFC_STATES: Final = {float(state): state.name.lower().replace("_", " ") for state in FfcStatus}
 _IN_PROGRESS: Final = _FFC_STATES[FfcStatus.IN_PROGRESS]
 
 
 @dataclass(frozen=True)
 class Status:
-    """Recording state of one band; numbers of its last frame are NaN before it."""
+    """Recording state of a band; numbers of its last frame are NaN before it."""
 
     band: str
     frame_rate: float  # over the last window, by the times of arrival [Hz]; 0 without any
@@ -92,7 +92,7 @@ class Status:
             (self.saturated > _LEAST_SHARE, _at(self.saturated, _RANGE.max, "saturated")),
             (self.lowest == self.highest, f"every pixel at {self.lowest:.0f}: nothing is seen"),
         ]
-        return "\n".join(line for is_so, line in warnings if is_so)
+        return "\n".join(line for holds, line in warnings if holds)
 
 
 def _at(share: float, counts: int, meaning: str) -> str:
@@ -105,18 +105,20 @@ class Watch:
     def __init__(self) -> None:
         self._last: Preview | None = None
         self._past: deque[tuple[float, dict[str, tuple[int, float]]]] = deque()
-        self._ffc_seen: dict[str, float] = {}
+        self._ffc_times: dict[str, float] = {}
 
     def note(self, preview: Preview) -> bool:
-        """Take the next preview; return True if it is the first one of a recording."""
+        """Take the next preview; return True if it is the first preview of a recording."""
         before, self._last = self._last, preview
-        if before is None or _is_other(before, preview):
+        if before is None or _is_new(before, preview):
             before = None
             self._past.clear()
-            self._ffc_seen.clear()
+            self._ffc_times.clear()
         for band in preview.totals:
-            if _ffc(band, preview) == _IN_PROGRESS or _corrected(band, before, preview):
-                self._ffc_seen[band] = preview.time
+            # The offsets were renewed between two previews, by the telemetry.
+            frames = {_metadata(band, shown).last_ffc_frame for shown in (before, preview)}
+            if _ffc(band, preview) == _IN_PROGRESS or (None not in frames and len(frames) > 1):
+                self._ffc_times[band] = preview.time
         marks = {
             band: (preview.totals[band]["frames"], frame.host_time)
             for band, frame in preview.frames.items()
@@ -137,7 +139,7 @@ class Watch:
                 self._rate(band),
                 fpa_temperature=_fpa_temperature(band, last),
                 ffc=_ffc(band, last),
-                ffc_age=last.time - self._ffc_seen.get(band, math.nan),
+                ffc_age=last.time - self._ffc_times.get(band, math.nan),
                 **{**_levels(last.frames.get(band)), **totals},
             )
             for band, totals in last.totals.items()
@@ -155,8 +157,8 @@ class Watch:
         return 0.0 if is_old else math.nan
 
 
-def _is_other(before: Preview, now: Preview) -> bool:
-    """True if a preview is of another recording than the one before it."""
+def _is_new(before: Preview, now: Preview) -> bool:
+    """True if a preview is of another recording than the preview before it."""
     return (
         tuple(before.totals) != tuple(now.totals)
         or now.time < before.time
@@ -176,12 +178,6 @@ def _metadata(band: str, preview: Preview | None) -> Metadata:
     return (frame and frame.metadata) or Metadata()
 
 
-def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
-    """True if the offsets were renewed between two previews, by the telemetry."""
-    earlier, later = (_metadata(band, shown).last_ffc_frame for shown in (before, now))
-    return None not in {earlier, later} and earlier != later
-
-
 def _ffc(band: str, preview: Preview) -> str:
     """State of the flat-field correction; a camera that corrects answers late, a flag does not."""
     frame = preview.frames.get(band)
@@ -196,7 +192,7 @@ def _levels(frame: Frame | None) -> dict[str, Any]:
     if frame is None:
         return {}
     counts = frame.counts
-    low, high = np.percentile(counts[::_STEP, ::_STEP], _PERCENTILES)
+    low, high = np.percentile(counts[::_STRIDE, ::_STRIDE], _PERCENTILES)
     return {
         "limits": (float(low), float(high)),
         "lowest": float(counts.min()),
@@ -235,7 +231,7 @@ class Separation:
         self._shown = dict.fromkeys(self._bands, -math.inf)
 
     def __call__(self, preview: Preview) -> xr.Dataset | None:
-        """Take the last frames; return the temperatures known by now, None before the first."""
+        """Take the last frames; return the temperatures by now, None before the first."""
         frames = [preview.frames[band] for band in self._bands if band in preview.frames]
         times = {band: frame.host_time for band, frame in preview.frames.items()}
         fresh = all(times.get(band, -math.inf) > shown for band, shown in self._shown.items())
@@ -288,7 +284,7 @@ class View:
         return self._watch.status()
 
     def __call__(self, preview: Preview) -> None:
-        """Take a preview; show it if the one shown last is old enough, or of another recording."""
+        """Take a preview; show it if the last picture is old enough, or of another recording."""
         if self._watch.note(preview):
             self._time = -math.inf
         if self._separation is not None:
@@ -303,22 +299,25 @@ class View:
 
         from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415
 
-        status, frames = self._watch.status(), preview.frames
+        statuses, frames = self._watch.status(), preview.frames
         bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
         if self._drawn is None or (self._drawn.bands, self._drawn.shape) != (bands, shape):
             self._drawn = LiveFigure(bands, shape, _FILMS if self._separation else ())
+        # A panel for each band, and for each temperature.
         panels = {}
-        for band, one in status.items():
-            image, (low, high) = frames[band].counts if band in frames else None, one.limits
+        for band, status in statuses.items():
+            image, (low, high) = frames[band].counts if band in frames else None, status.limits
             # Black and white are distinct even in a uniform picture.
             limits = (0.0, 1.0) if image is None else (low, max(high, low + 1.0))
-            panels[band] = Panel(image, limits, one.text, one.warning)
+            panels[band] = Panel(image, limits, status.text, status.warning)
         if self._separation:
             panels |= {name: _temperature(name, self._separated) for name in _FILMS}
         title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
         self._drawn.update(panels, title=title, foot=foot)
         if self._display is not None:
-            lines = [f"{band}: {one.text}\n{one.warning}" for band, one in status.items()]
+            lines = [
+                f"{band}: {status.text}\n{status.warning}" for band, status in statuses.items()
+            ]
             png, fast = io.BytesIO(), {"compress_level": _COMPRESSION}  # rather than small
             imsave(png, self._drawn.pixels(), format="png", pil_kwargs=fast)
             picture = Picture(png.getvalue(), "\n".join((title, *lines, foot)))
@@ -334,13 +333,13 @@ def _temperature(name: str, separated: xr.Dataset | None) -> "Panel":
         return Panel(None, (0.0, 1.0), "not known yet")
     image = separated[f"{name}_temperature"].values[-1] - zero_Celsius
     good = 100 * float((separated["status"] == 0).mean())
-    known = image[np.isfinite(image)]
-    low, high = np.percentile(known, _PERCENTILES) if known.size else (0.0, 1.0)
+    finite = image[np.isfinite(image)]
+    low, high = np.percentile(finite, _PERCENTILES) if finite.size else (0.0, 1.0)
     return Panel(image, (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag")
 
 
 def _foot(preview: Preview) -> str:
-    """Readings beside those of the shown bands: of thermocouples, of the blackbody."""
+    """Readings that are not of a shown band: of thermocouples, of the blackbody."""
     used = {prefix + band for prefix in (FPA_READING, FFC_READING) for band in preview.totals}
     return ", ".join(
         f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"

@@ -1,8 +1,8 @@
 """Procedures of the rig: wait for the blackbody, record a blackbody sweep, record a scene.
 
-Gain, offset and response are calibrated before a blackbody that goes through several temperatures,
-the emissivity bench with samples. At each temperature the wheel goes through its filters, and each
-of these is a recording of its own. `dbthermal.instruments.recording` opens the recordings.
+A blackbody at several temperatures calibrates gain, offset and response, and with samples beside it
+the emissivity bench. At each temperature the wheel goes through its filters, and there is a
+recording for each filter. `dbthermal.instruments.recording` opens the recordings.
 """
 
 import threading
@@ -15,11 +15,11 @@ import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import store
+from dbthermal.instruments import recording
 from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.recording import Limits, Preview, Summary, record
-from dbthermal.instruments.recording import _reader as reader
+from dbthermal.instruments.recording import Limits, Preview, Summary
 from dbthermal.instruments.session import BLACKBODY, Session
 
 __all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
@@ -31,17 +31,12 @@ STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperatur
 def ask_for_blackbody(name: str, temperature: float) -> None:
     """Ask the user to set the blackbody to a temperature, and wait for Enter.
 
+    RuntimeError if there is no keyboard, as under papermill.
+
     Parameters
     ----------
-    name : str
-        Name of the session, for the question.
-    temperature : float
-        Temperature [K].
-
-    Raises
-    ------
-    RuntimeError
-        If there is no keyboard, as under papermill.
+    name, temperature : str, float
+        Name of the session, for the question; temperature [K].
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
     question = (
@@ -57,44 +52,35 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
 
 
 def wait_stable(
-    session: Session,
-    temperature: float,
-    read: Callable[[], float],
-    *,
-    clock: Clock = SYSTEM,
+    session: Session, temperature: float, read: Callable[[], float], *, clock: Clock = SYSTEM
 ) -> float:
     """Wait until a temperature is stable near its set point, and return its mean [K].
 
     Within the session's `window` the readings must lie within its `stability` of one another, and
-    their mean within its `tolerance` of the set point.
+    their mean within its `tolerance` of the set point; TimeoutError after its `timeout`, ValueError
+    if it has no blackbody.
 
     Parameters
     ----------
-    session : Session
-        Session with a blackbody.
-    temperature : float
-        Set point [K].
-    read : callable
-        Reads the temperature [K].
-    clock : Clock
-        Clock of the device.
-
-    Raises
-    ------
-    TimeoutError, ValueError
-        After the session's `timeout`; if it has no blackbody.
+    session, temperature : Session, float
+        Session with a blackbody; set point [K].
+    read, clock : callable, Clock
+        Reads the temperature [K]; clock of the device.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
     steps, start = session.blackbody, clock()
     readings: deque[tuple[float, float]] = deque()
     while clock() - start <= steps.timeout:
+        # The next reading.
         readings.append((clock(), read()))
         values = np.array([value for _, value in readings])
+        # The rule of the session.
         whole = readings[-1][0] - readings[0][0] >= steps.window
         near = abs(values.mean() - temperature) <= steps.tolerance
         if whole and near and np.ptp(values) <= steps.stability:
             return float(values.mean())
+        # Readings before the window are dropped.
         while whole and readings[-1][0] - readings[0][0] >= steps.window:
             readings.popleft()
         clock.sleep(STABILITY_PERIOD)
@@ -115,9 +101,9 @@ def record_sweep(
     """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
-    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
-    interrupted goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on
-    in it. Call `Devices.prepare` before.
+    Complete recordings of this sweep that are in the folder are kept, so that an interrupted sweep
+    goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on in it. Call
+    `Devices.prepare` before.
 
     Parameters
     ----------
@@ -134,8 +120,7 @@ def record_sweep(
     Returns
     -------
     list of Summary
-        In the order of the session, by temperature, then filter, with those that were recorded
-        before.
+        In the order of the session, by temperature, then filter, with those that were kept.
 
     Raises
     ------
@@ -152,22 +137,24 @@ def record_sweep(
     Path(folder).mkdir(parents=True, exist_ok=True)
     held = store.HeldFolder(Path(folder))
     plan = [
-        (number, temperature, band, reader.step_path(folder, session.name, number, band))
+        (number, temperature, band, recording.step_path(folder, session.name, number, band))
         for number, temperature in enumerate(session.blackbody.temperatures)
         for band in session.swept or (None,)
     ]
     kept = [_kept(*step) for step in plan]
     summaries: list[Summary] = []
     resting: int | None = None
-    for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
-        if was is None and resting != number:
+    for (number, temperature, band, planned), summary in zip(plan, kept, strict=True):
+        # The blackbody, once for all filters of a temperature.
+        if summary is None and resting != number:
             set_temperature(temperature)
             wait_stable(session, temperature, readings[BLACKBODY].read, clock=devices.clock)
             devices.correct_offsets()
             resting = number
+        # The recording, which must have a reading of the blackbody.
         path = held.place() / planned.name
-        summaries.append(was or _record_step(devices, band, path, limits, preview))
-        reader.mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
+        summaries.append(summary or _record_step(devices, band, path, limits, preview))
+        recording.mean_reading(path if summary else summaries[-1].path, BLACKBODY)
     return summaries
 
 
@@ -196,9 +183,9 @@ def record_scene(
     >>> from dbthermal.instruments.session import Camera, Session
     >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
-    >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
     >>> with open_devices(session) as devices:
     ...     devices.prepare()
+    ...     folder, small = getfixture("tmp_path"), Limits(reserve=0)
     ...     summary = record_scene(devices, folder / "demo.zarr", limits=small)
     >>> summary.ended, summary.totals["8-14"]["lost"]
     ('duration', 0)
@@ -215,23 +202,26 @@ def record_scene(
 def _record(
     devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
 ) -> Summary:
-    """Record all sources and readings of open devices, with the options of `record`."""
+    """Record all sources and readings of open devices, with the options of `recording.record`."""
     session, sources, readings = devices.session, devices.sources, devices.readings()
-    return record(session, sources, path, readings=readings, identities=identities, **options)
+    return recording.record(
+        session, sources, path, readings=readings, identities=identities, **options
+    )
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
     """Summary of a recording of the sweep that exists already; None if it does not."""
     if not path.exists():
         return None
-    if not reader.is_complete(path):
+    if not recording.is_complete(path):
         rule = "Must be complete: move it away, and this step is recorded again"
         raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
-    was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
-    if was[number : number + 1] != [temperature]:
-        raise ValueError(f"Recording '{path}' of temperatures {was} K. Must be of {temperature} K.")
-    reader.require_filter(path, band)
+    steps = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
+    if steps[number : number + 1] != [temperature]:
+        rule = f"Must be of {temperature} K"
+        raise ValueError(f"Recording '{path}' of temperatures {steps} K. {rule}.")
+    recording.require_filter(path, band)
     return Summary(path, attrs["ended"], attrs["totals"])
 
 
@@ -249,5 +239,5 @@ def _record_step(
     summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
-    reader.require_filter(summary.path, band)
+    recording.require_filter(summary.path, band)
     return summary

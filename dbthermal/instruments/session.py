@@ -27,8 +27,8 @@ Every device has its address; one key, ``simulated``, puts emulated ones in the 
 
 Temperatures are in kelvin, times in seconds. An unknown or repeated key is an error, and so is a
 value that YAML 1.1 and 1.2 read differently, see `dbthermal.readers.read_yaml`. The camera whose
-band is one of the filters is behind the wheel. No address names a library: that of the thermocouple
-logger is the environment variable ``DBTHERMAL_USBTC08``.
+band is one of the filters is behind the wheel. No address names a library: the environment variable
+``DBTHERMAL_USBTC08`` names that of the thermocouple logger.
 """
 
 import errno
@@ -53,18 +53,15 @@ __dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
-_SCHEMES: Final = {"filter_wheel": "serial", "thermocouples": "tc08"}  # of their addresses
+WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
+LOGGER: Final = "thermocouples"  # name of the thermocouples' logger
+_SCHEMES: Final = {WHEEL: "serial", LOGGER: "tc08"}  # of their addresses
 BLACKBODY: Final = "blackbody"  # name of its thermocouple, and of its readings [K]
 
 
 def _by(check: Callable[[Any], object]) -> AfterValidator:
     """Validator of a value that a check lets pass."""
-
-    def checked(value: Any) -> Any:
-        check(value)
-        return value
-
-    return AfterValidator(checked)
+    return AfterValidator(lambda value: (check(value), value)[1])
 
 
 def _check_printable(text: str) -> None:
@@ -86,15 +83,13 @@ Port = Annotated[str, _by(partial(parse, schemes=("serial",)))]
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """One camera.
+    """A camera.
 
     Attributes
     ----------
-    video, control : str
+    video, control, kind : str
         Addresses of its frames, ``"v4l2:///dev/video0"``, and of its command port, if it has one,
-        ``"serial:///dev/ttyACM0"``.
-    kind : str
-        One of `dbthermal.instruments.camera.KINDS`.
+        ``"serial:///dev/ttyACM0"``; and its kind, of `dbthermal.instruments.camera.KINDS`.
     """
 
     video: Video
@@ -112,13 +107,11 @@ class Blackbody:
 
     Attributes
     ----------
-    temperatures : tuple of float
-        Set points [K].
-    stability, window : float
-        Largest range of the readings [K] in a window, and how long it is [s].
-    tolerance, timeout : float
-        Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
-        by half a kelvin or so each, and the recordings keep the reading. Longest wait for it [s].
+    temperatures, tolerance : tuple of float, float
+        Set points [K]; largest distance of the mean reading from a set point [K]: thermocouple and
+        logger are off by half a kelvin or so each, and the recordings keep the reading.
+    stability, window, timeout : float
+        Largest range of the readings [K] in a window, how long it is, and longest wait for it [s].
     """
 
     temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
@@ -182,13 +175,7 @@ class Session:
     blackbody: Blackbody | None = None
 
     def __post_init__(self) -> None:
-        self._check_protocol()
-        self._check_frames()
-        self._check_addresses()
-        self._check_thermocouples()
-        self._check_wheel()
-
-    def _check_protocol(self) -> None:
+        # The blackbody.
         if (self.protocol == "scene") != (self.blackbody is None):
             rule = "no blackbody" if self.protocol == "scene" else "a blackbody"
             raise ValueError(f"Invalid session of protocol '{self.protocol}'. Must have {rule}")
@@ -199,8 +186,10 @@ class Session:
             raise ValueError(f"Invalid thermocouples {dict(self.thermocouples)}. {rule}")
         if self.duration * self.frame_rate < 1:
             raise ValueError(f"Invalid duration {self.duration} s. Must be one frame at least")
+        self._check_cameras()
+        self._check_devices()
 
-    def _check_frames(self) -> None:
+    def _check_cameras(self) -> None:
         rows, columns = self.telemetry_rows, self.shape[1]
         for band, camera in self.cameras.items():
             allowed = camera_kind(camera.kind).telemetry_rows
@@ -208,26 +197,23 @@ class Session:
         if rows and rows * columns < telemetry.WORDS:
             rule = f"Must have {telemetry.WORDS // rows} columns for the telemetry"
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
-
-    def _check_addresses(self) -> None:
-        for name, address in self.devices.items():
-            parse(address, (_SCHEMES[name],))
         if not self.simulated:
             pairs = [(camera.video, camera.control) for camera in self.cameras.values()]
-            listed = [address for pair in pairs for address in pair if address is not None]
-            _check_unique("address", [*listed, *self.devices.values()])
+            addresses = [address for pair in pairs for address in pair if address is not None]
+            _check_unique("address", [*addresses, *self.devices.values()])
 
-    def _check_thermocouples(self) -> None:
-        # The readings of a recording have one name each: of the cameras and the wheel, too.
-        names = [*self.thermocouples.values(), "filter_wheel", "thermocouples"]
+    def _check_devices(self) -> None:
+        for name, address in self.devices.items():
+            parse(address, (_SCHEMES[name],))
+        # The names of the readings of a recording differ: of the cameras and the wheel, too.
+        names = [*self.thermocouples.values(), WHEEL, LOGGER]
         for band in dict.fromkeys((*self.bands, *self.filters.values())):
             names += [band, FPA_READING + band, FFC_READING + band]
         _check_unique("thermocouple", names)
-        self._require("thermocouples", self.thermocouples)
-
-    def _check_wheel(self) -> None:
         _check_unique("filter", self.filters.values())
-        self._require("filter_wheel", self.filters)
+        for device, entries in ((LOGGER, self.thermocouples), (WHEEL, self.filters)):
+            if entries and device not in self.devices:
+                raise ValueError(f"Missing device '{device}' of {dict(entries)}. Must be listed")
         behind = [band for band in self.bands if band in self.filters.values()]
         if self.filters and len(behind) != 1:
             raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
@@ -236,10 +222,6 @@ class Session:
         _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
             raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
-
-    def _require(self, device: DeviceName, entries: Mapping[int, str]) -> None:
-        if entries and device not in self.devices:
-            raise ValueError(f"Missing device '{device}' of {dict(entries)}. Must be listed")
 
     @property
     def bands(self) -> tuple[str, ...]:
@@ -260,6 +242,10 @@ class Session:
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
         """Read a session from a file, and from the file that it names as its ``rig``.
 
+        FileNotFoundError if a file does not exist. ValueError if it is not YAML, or a key is
+        missing, unknown, repeated or in both files, or a value is invalid: a line for each error,
+        with file, place and rule.
+
         Parameters
         ----------
         path : str or Path
@@ -267,14 +253,8 @@ class Session:
             in another file, whose name relative to this one is the key ``rig``.
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If a file does not exist; if it is not YAML, or a key is missing, unknown, repeated or
-            in both files, or a value is invalid: one line for each error, with file, place and
-            rule.
         """
+        # The file, and that of the rig.
         content, files = texts.read_yaml(path), dict[str, str]()  # file of each key of the rig's
         if "rig" in content:
             name = content.pop("rig")
@@ -290,20 +270,18 @@ class Session:
                 raise ValueError(f"{path}: Repeated key of session and rig '{key}'. {rule}.")
             files = dict.fromkeys(shared, str(rig))
             content = {**shared, **content}
+        # The changes.
         changed = {**content, **(changes or {})}
-        if changes and isinstance(both := content.get(BLACKBODY), dict) and BLACKBODY in changes:
-            changed[BLACKBODY] = {**both, **changes[BLACKBODY]}
-        return cls._checked(changed, files, str(path))
-
-    @classmethod
-    def _checked(cls, content: Any, files: Mapping[str, str], path: str) -> Self:
-        """Session of a YAML content; `files` has the file of each key that is not from `path`."""
+        if changes and isinstance(steps := content.get(BLACKBODY), dict) and BLACKBODY in changes:
+            changed[BLACKBODY] = {**steps, **changes[BLACKBODY]}
+        # The checks, whose errors name the file of the key.
         try:
-            session: Self = TypeAdapter(cls).validate_python(content)
+            session: Self = TypeAdapter(cls).validate_python(changed)
         except ValidationError as error:
-            places = [str(one["loc"][0]) if one["loc"] else "" for one in error.errors()]
-            pairs = zip(places, error.errors(), strict=True)
-            messages = [f"{files.get(key, path)}: {_message(one)}" for key, one in pairs]
+            messages = []
+            for details in error.errors():
+                key = str(details["loc"][0]) if details["loc"] else ""
+                messages.append(f"{files.get(key, path)}: {_message(details)}")
             raise ValueError("\n".join(messages)) from None
         return session
 
@@ -319,8 +297,11 @@ def _check_unique(name: str, values: Iterable[Any]) -> None:
 
 
 def _message(error: Any) -> str:
-    """One error of pydantic as a sentence: place, value and rule."""
-    place = ".".join(_named(str(part)) for part in error["loc"] if part != "[key]")
+    """Error of pydantic as a sentence: place, value and rule."""
+    keys = (str(key) for key in error["loc"] if key != "[key]")
+    place = ".".join(
+        key if key.isprintable() and len(key) <= texts.SHOWN else texts.shown(key) for key in keys
+    )
     if error["type"] == "missing":
         return f"Missing '{place}'. Must be set."
     if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
@@ -332,8 +313,3 @@ def _message(error: Any) -> str:
         return f"{place}: {rule}." if place else f"{rule}."
     rule = rule if rule.startswith("Must ") else f"Must {rule}"
     return f"Invalid {place} {texts.shown(error['input'])}. {rule}."
-
-
-def _named(key: str) -> str:
-    """Key as a message shows it, in one short line."""
-    return key if key.isprintable() and len(key) <= texts.SHOWN else texts.shown(key)

@@ -11,7 +11,6 @@ blackbody, and see whether the reading follows.
 
 import ctypes
 import ctypes.util
-import importlib
 import os
 from collections.abc import Collection, Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
@@ -30,11 +29,9 @@ from dbthermal.instruments.transport import Closing, parse
 __all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
+# A library bound by `load`, or an object with the same functions, such as the emulated one. Where C
+# takes a pointer to one value, an array of length one is passed, which suits either.
 Library = Any
-"""A library bound by `load`, or an object with the same functions, such as the emulated one.
-
-Where C takes a pointer to one value, an array of length one is passed, which both accept.
-"""
 
 ENVIRONMENT: Final = "DBTHERMAL_USBTC08"  # variable with the path of the library
 CHANNELS: Final = 9  # 0 is the cold junction, 1 to 8 are the sockets
@@ -43,6 +40,7 @@ KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
 OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
 POLL: Final = 0.05  # [s] between two progress requests
 
+# Meaning of the library's error numbers; 15 and 16 are often taken for one another.
 ERRORS: Final[Mapping[int, str]] = MappingProxyType(
     {
         0: "no error",
@@ -64,7 +62,6 @@ ERRORS: Final[Mapping[int, str]] = MappingProxyType(
         16: "the communication with the unit is lost",
     }
 )
-"""Meaning of the library's error numbers; 15 and 16 are often taken for one another."""
 
 
 class TC08Error(RuntimeError):
@@ -90,6 +87,7 @@ class UnitInfo(ctypes.Structure):
     )
 
 
+# Argument types of the functions that are used; each of them returns 16 bits.
 SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
     {
         "usb_tc08_open_unit_async": [],
@@ -101,7 +99,6 @@ SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
         "usb_tc08_close_unit": [c_int16],
     }
 )
-"""Argument types of the functions that are used; each of them returns 16 bits."""
 
 
 class Flag(IntFlag):
@@ -115,7 +112,7 @@ class Flag(IntFlag):
 
 @dataclass(frozen=True)
 class Scan:
-    """One reading of all nine channels, of which index 0 is the cold junction.
+    """A reading of all nine channels, of which index 0 is the cold junction.
 
     `time` is the middle of the scan on the host's clock [s], for the channels are converted one
     after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`.
@@ -130,6 +127,16 @@ class TC08(Closing):
     """A TC-08, for one thread at a time; opened by `from_url` or `open`.
 
     The `library` is from `load`, or an emulated one.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.emulated import tc08, world
+    >>> bench = world.World(blackbody_temperature=310.0)
+    >>> bench.thermocouples[1] = "blackbody"
+    >>> with TC08(tc08.EmulatedTC08(bench.thermocouple_temperature, bench.clock)).open() as logger:
+    ...     logger.set_channels([1])
+    ...     print(f"{logger.single().temperature[1]:.2f} K")
+    310.00 K
     """
 
     def __init__(self, library: Library) -> None:
@@ -139,30 +146,12 @@ class TC08(Closing):
         self._has_channels = False
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: Any = None) -> Self:
-        """Load the library and open the first free unit, at ``tc08:`` or ``sim://tc08`` in a world.
+    def from_url(cls, url: str = "tc08:") -> Self:
+        """Load the vendor's library and open the first free unit, at the address ``tc08:``.
 
         No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
-        another address, or the world is missing or given to a real unit; else the errors of `load`
-        and `open`.
-
-        Examples
-        --------
-        >>> from dbthermal.instruments.emulated.world import World
-        >>> bench = World(blackbody_temperature=310.0)
-        >>> bench.thermocouples[1] = "blackbody"
-        >>> with TC08.from_url("sim://tc08", world=bench) as logger:
-        ...     logger.set_channels([1])
-        ...     print(f"{logger.single().temperature[1]:.2f} K")
-        310.00 K
+        another address; else the errors of `load` and `open`.
         """
-        if (url == "sim://tc08") != (world is not None):
-            raise ValueError(
-                f"Invalid address '{url}'. Must be sim://tc08 with a world, and only then."
-            )
-        if world is not None:
-            module: Any = importlib.import_module("dbthermal.instruments.emulated.tc08")
-            return cls(module.EmulatedTC08(world.thermocouple_temperature, world.clock)).open()
         parse(url, ("tc08",))
         return cls(load()).open()
 
@@ -179,8 +168,10 @@ class TC08(Closing):
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
+        # The library opens a unit meanwhile.
         if not self._library.usb_tc08_open_unit_async():
             raise self._error("be opened")
+        # Wait until its firmware is there.
         handle, percent = (c_int16 * 1)(), (c_int16 * 1)()
         deadline = self.clock() + timeout
         while not (progress := self._library.usb_tc08_open_unit_progress(handle, percent)):
@@ -190,6 +181,7 @@ class TC08(Closing):
                     "firmware by then: pull it out and plug it in again."
                 )
             self.clock.sleep(POLL)
+        # The result.
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
@@ -224,11 +216,10 @@ class TC08(Closing):
         }
 
     def set_channels(self, channels: Collection[int]) -> None:
-        """Set the channels that have a thermocouple, of type T: 1 to 8.
+        """Set the channels that have a thermocouple, of type T, 1 to 8; the rest are switched off.
 
-        All other sockets are switched off; the cold junction is always read. ValueError if a
-        channel is another one, or none is given; TC08Error or RuntimeError if the library fails,
-        or the unit is not open.
+        The cold junction is always read. ValueError for another channel, or none; TC08Error or
+        RuntimeError if the library fails, or the unit is not open.
         """
         if not channels:
             raise ValueError("Invalid channels. Must be one at least.")
@@ -281,8 +272,8 @@ def flagged(
 def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
     """Load the vendor's library and declare the types of its functions.
 
-    Its `path`, else the variable `ENVIRONMENT`, names the file; else the system's own search must
-    find ``usbtc08`` (FileNotFoundError). OSError if it cannot be loaded, or lacks a function.
+    Its `path`, the variable `ENVIRONMENT`, or the system's search for ``usbtc08`` names the file
+    (FileNotFoundError without any). OSError if it cannot be loaded, or lacks a function.
     """
     name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:

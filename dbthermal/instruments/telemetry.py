@@ -1,11 +1,11 @@
 """Telemetry rows of a Boson: values that the camera writes beside the image.
 
 With telemetry on, the 640 x 512 image comes with two more rows on USB. The layout is **likely, not
-certain**: it is where public decoders that do not depend on one another agree (Elphel's
+certain**: public decoders that do not depend on one another agree on it (Elphel's
 ``Boson640Telemetry.java``, the Python class ``BosonWithTelemetry``, belivan/flir_stereo
-``flir_ros_sync.cpp``), and none of them is the vendor's. So are the orders: each 16-bit word is
-little-endian, and of a longer number the high word comes first. Therefore a recording keeps the
-rows as they came. The meaning of the status bits is not public: the shutter follows from
+``flir_ros_sync.cpp``), and none of them is the vendor's. The same holds for the orders: each 16-bit
+word is little-endian, and of a longer number the high word comes first. Therefore a recording keeps
+the rows as they came. The meaning of the status bits is not public: the shutter follows from
 `last_ffc_frame` and the serial line, see `camera.next_shutter`.
 """
 
@@ -22,11 +22,8 @@ from dbthermal.instruments.camera import Counts, Metadata
 __all__ = ["FIELDS", "ROWS", "WORDS", "Field", "decode", "encode", "metadata"]
 __dir__ = __all__.copy
 
-ROWS: Final = 2
-"""Rows of telemetry on USB: 514 rows of the frame are requested instead of 512."""
-
-WORDS: Final = 142
-"""Least number of words that hold all the fields."""
+ROWS: Final = 2  # of telemetry on USB: 514 rows of the frame are requested instead of 512
+WORDS: Final = 142  # least number of words that hold all the fields
 
 
 @dataclass(frozen=True)
@@ -73,11 +70,10 @@ def decode(rows: Counts) -> dict[str, float]:
     Any content is read as if it were telemetry: there is no checksum. TypeError or ValueError if
     the rows are not of uint16, or hold fewer than `WORDS` words.
     """
-    words = _checked(rows)
-    values: dict[str, float] = {}
+    words, values = _checked(rows), dict[str, float]()
     for name, field in FIELDS.items():
-        part = words[field.span].astype(">u2")
-        number = int.from_bytes(part.tobytes(), "big", signed=field.signed)
+        data = words[field.span].astype(">u2").tobytes()
+        number = int.from_bytes(data, "big", signed=field.signed)
         values[name] = number / field.steps + field.zero if field.steps else number
     return values
 
@@ -94,8 +90,7 @@ def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Count
 
     ValueError if these are too few, or a value does not fit its field.
     """
-    words = np.zeros(rows * columns, dtype=np.uint16)
-    _checked(words)
+    words = _checked(np.zeros(rows * columns, dtype=np.uint16))
     for name, value in values.items():
         field = FIELDS[name]
         number = round((value - field.zero) * field.steps) if field.steps else int(value)

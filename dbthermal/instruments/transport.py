@@ -1,8 +1,8 @@
 """Addresses of devices, and byte streams to those on a serial line.
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``sim://boson/wide`` an
-emulator that answers in memory; sessions and all drivers share the rules of `parse`. An address
-never names a program or a library: that of the TC-08 is told by an environment variable.
+emulator that answers in memory; `parse` has the rules of all addresses. An address never names a
+program or a library: that of the TC-08 is told by an environment variable.
 """
 
 import importlib
@@ -19,23 +19,14 @@ from dbthermal.instruments.clock import SYSTEM, Clock
 if TYPE_CHECKING:
     import serial
 
-__all__ = [
-    "EMULATORS",
-    "Address",
-    "Closing",
-    "SerialTransport",
-    "Transport",
-    "TransportError",
-    "open_serial",
-    "parse",
-]
+__all__ = ["SerialTransport", "Transport", "TransportError", "open_serial", "parse"]
 __dir__ = __all__.copy
 
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 
 EMULATORS: Final = MappingProxyType(
-    {"boson": "dbthermal.instruments.emulated.boson", "apt": "dbthermal.instruments.emulated.apt"}
+    {"boson": "dbthermal.instruments.emulated.camera", "apt": "dbthermal.instruments.emulated.apt"}
 )
 """Module of each emulator, imported when it is started: its ``start(name, world)`` returns a
 `Transport`."""
@@ -66,21 +57,21 @@ class Address(NamedTuple):
 def parse(url: str, schemes: tuple[str, ...]) -> Address:
     """Parts of an address of one of the schemes; ValueError names it and their forms."""
     scheme = url.partition(":")[0]
-    found = re.fullmatch(_RULES[scheme][1], url) if scheme in schemes else None
-    if found is None or len(url) > _LONGEST:
+    match = re.fullmatch(_RULES[scheme][1], url) if scheme in schemes else None
+    if match is None or len(url) > _LONGEST:
         forms = " or ".join(_RULES[name][0] for name in schemes)
         raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
-    return Address(scheme, **{name: text or "" for name, text in found.groupdict().items()})
+    return Address(scheme, **{name: text or "" for name, text in match.groupdict().items()})
 
 
 class Closing:
     """Context manager that closes at its end, without hiding an error inside it.
 
-    A failure to close is raised if there was no other error, and else added to it as a note.
+    A failure to close becomes a note of that error; it is raised only if there is none.
     """
 
     def close(self) -> None:
-        """Release what is held; a second time does nothing."""
+        """Release the device; a second call does nothing."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -105,7 +96,7 @@ class TransportError(OSError):
 
 
 class Transport(Protocol):
-    """A line to a device, as a driver needs it; a context manager in each implementation."""
+    """A line to a device; each method raises `TransportError` if the device is gone."""
 
     is_simulated: bool  # True if the device is emulated
 
@@ -114,16 +105,13 @@ class Transport(Protocol):
         """Clock of the device's times and time limits."""
 
     def write(self, data: bytes) -> None:
-        """Send all bytes; `TransportError` if the device is gone."""
+        """Send all bytes."""
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Wait until bytes came, or `timeout` [s] went by; `TransportError` if the device is gone.
-
-        Return at most `size` bytes and often fewer; none only if `timeout` went by.
-        """
+        """Wait for bytes: at most `size`, often fewer; none only if `timeout` [s] went by."""
 
     def close(self) -> None:
-        """Release the line; a second time does nothing. `TransportError` if it cannot."""
+        """Release the line; a second call does nothing."""
 
 
 class SerialTransport(Closing):
@@ -141,15 +129,15 @@ class SerialTransport(Closing):
             self._port.write(data)
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Wait until bytes came, or `timeout` [s] went by; see `Transport.read`."""
+        """Wait for bytes, at most `timeout` [s]; see `Transport.read`."""
         with self._named("read from"):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
-            more = min(size - 1, self._port.in_waiting) if first else 0
-            return first + (self._port.read(more) if more else b"")
+            waiting = min(size - 1, self._port.in_waiting) if first else 0
+            return first + (self._port.read(waiting) if waiting else b"")
 
     def pulse_rts(self) -> None:
-        """Take the line RTS down and up again; `TransportError` if the device is gone."""
+        """Take the line RTS down and up again."""
         with self._named("set RTS of"):
             self._port.rts = False
             self.clock.sleep(SETTLING)
@@ -176,22 +164,23 @@ def open_serial(
     """Open the line to a device by its address, for this program alone; nothing is sent.
 
     `baudrate` [bit/s] is the speed of the line. With `rtscts` its flow is controlled by RTS and
-    CTS, and RTS is taken down and up once. `world` is the emulated bench that a ``sim://`` device
-    is part of; by default one of its own. ValueError for another address, or a pseudo-terminal,
-    which would let an emulator pass for hardware; TransportError if the port cannot be opened.
+    CTS, and RTS is taken down and up once. `world` is the emulated bench of a ``sim://`` device, by
+    default a new bench. ValueError for another address, or a pseudo-terminal, which would let an
+    emulator pass for hardware; TransportError if the port cannot be opened.
     """
-    address = parse(url, ("serial", "sim"))
-    path = address.target
-    if address.scheme == "sim":
+    scheme, path, name = parse(url, ("serial", "sim"))
+    # An emulator.
+    if scheme == "sim":
         if path not in EMULATORS:
             rule = f"Must be one of {sorted(EMULATORS)} after sim://"
             raise ValueError(f"Invalid address '{url}'. {rule}.")
-        emulated: Transport = importlib.import_module(EMULATORS[path]).start(address.name, world)
+        emulated: Transport = importlib.import_module(EMULATORS[path]).start(name, world)
         return emulated
+    # A serial port.
     if Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
 
-    import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
+    import serial  # noqa: PLC0415 - an optional package, which cameras without a port do without
 
     try:
         port = serial.Serial(
@@ -200,6 +189,7 @@ def open_serial(
     except OSError as error:
         rule = "It must exist, be yours to use, and in no other program's use"
         raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
+    # Its flow control.
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:

@@ -1,13 +1,17 @@
-"""Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
+"""Raw 16-bit frames (Y16) of any camera on Linux, with the kernel's stamps, numbers and flags.
 
 A thin use of Video4Linux2, in ten calls; numbers, sizes and layouts are those of 64-bit Linux
 (``linux/videodev2.h``, https://docs.kernel.org/userspace-api/media/v4l). The kernel's stamp of a
 frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure; likely,
 unless that module is told to use the camera's clock, it is of the frame's first packet.
+
+`KIND` is a camera without command port or telemetry: nothing is known of it but its frames. The
+state of its shutter follows from frozen images, see `camera.next_shutter`, and it corrects its
+offsets when it decides to.
 """
 
 import errno
-import fcntl
+import importlib
 import mmap
 import os
 import select
@@ -23,6 +27,7 @@ from dbthermal.instruments.camera import (
     DAMAGED,
     FRAME_TIMEOUT,
     GOOD,
+    CameraKind,
     Counts,
     Frame,
     FrameFlag,
@@ -34,18 +39,14 @@ from dbthermal.instruments.camera import (
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
-if not sys.platform.startswith("linux"):
-    raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
-
-__all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
+__all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
 
+# Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control.
 Y16: Final = 0x20363159
-"""Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control."""
-
+# Frames that the kernel holds while no program reads, the most it can: half a second at 60 Hz, in
+# which a busy computer gets round to read again. Beyond, it drops frames.
 BUFFERS: Final = 32
-"""Frames that the kernel holds while no program reads, the most it can; beyond, it drops: half a
-second at 60 Hz, in which a busy computer gets round to read again."""
 
 QUERYCAP: Final = 0x80685600
 ENUM_FMT: Final = 0xC0405602
@@ -87,7 +88,9 @@ class Kernel:
 
     open: Callable[[str, int], int] = os.open
     close: Callable[[int], None] = os.close
-    ioctl: Callable[[int, int, bytearray], int] = fcntl.ioctl
+    ioctl: Callable[[int, int, bytearray], int] = field(
+        default_factory=lambda: importlib.import_module("fcntl").ioctl  # not on Windows
+    )
     map: Callable[[int, int, int], Any] = field(
         default=lambda file, length, offset: mmap.mmap(file, length, offset=offset)
     )
@@ -167,6 +170,7 @@ class Capture(Closing):
 
     def _agree(self, file: int) -> dict[str, str]:
         """Set format and rate; a driver sets the nearest that it can, which is an error here."""
+        # The node must give video in the format.
         captures, identity = _capability(file, self._kernel)
         offered = _formats(file, self._kernel) if captures else []
         if Y16 not in offered:
@@ -174,6 +178,7 @@ class Capture(Closing):
                 code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered
             ]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
+        # The format, with every row.
         rows, columns = self.stream.rows, self.shape[1]
         line = _BYTES * columns
         wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
@@ -185,6 +190,7 @@ class Capture(Closing):
                 f"Invalid format of '{self.path}': {agreed} (columns, rows, code, field, bytes of "
                 f"a row, bytes of a frame). Must be {wanted}: is the telemetry set as requested?"
             )
+        # The rate.
         rate = self.frame_rate
         argument = bytearray(PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(1000 * rate), 0, 0))
         self._kernel.ask(file, S_PARM, argument)
@@ -244,8 +250,17 @@ class Capture(Closing):
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
-    """Open the node of an address ``v4l2:///dev/video0``; ValueError if it is of another kind."""
-    return Capture(parse(url, ("v4l2",)).target, stream, decode=decode)
+    """Open the node of an address ``v4l2:///dev/video0``.
+
+    ValueError if the address is of another kind; OSError on another system than Linux.
+    """
+    node = parse(url, ("v4l2",)).target
+    if not sys.platform.startswith("linux"):
+        raise OSError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
+    return Capture(node, stream, decode=decode)
+
+
+KIND: Final = CameraKind(open_url)  # of a session's ``kind: y16``
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

@@ -97,8 +97,8 @@ class CheckedRecording:
         np.testing.assert_array_equal(kept["device_time"], [frame.device_time for frame in frames])
         flags = kept["frame_flags"].values
         np.testing.assert_array_equal(flags & SOURCE_FLAGS, [int(frame.flags) for frame in frames])
-        same = [np.array_equal(a.counts, b.counts) for a, b in pairwise(frames)]
-        np.testing.assert_array_equal(flags[1:] & int(FrameFlag.IMAGE_REPEATED) > 0, same)
+        repeats = [np.array_equal(a.counts, b.counts) for a, b in pairwise(frames)]
+        np.testing.assert_array_equal(flags[1:] & int(FrameFlag.IMAGE_REPEATED) > 0, repeats)
         self.check_times(kept, flags, self.cameras[band].faults)
         self.check_losses(band, frames, flags)
 
@@ -109,23 +109,23 @@ class CheckedRecording:
         np.testing.assert_array_equal(np.isfinite(stamps), timed)
         lies = np.isin(kept["sequence"].values, [*faults.repeated])
         still = FrameFlag.SHUTTER_CLOSED | FrameFlag.IMAGE_REPEATED
-        seen = timed & ((flags & int(still)) == 0) & ~lies
-        assert seen.any() or faults.clock_rate != 1
-        told = MILLI * (kept["counts"].values[seen] - PATTERN.astype(float))
-        since = stamps[seen] + kept.attrs["clock_origin"] - self.world.epoch
-        expected = np.broadcast_to(since[:, None, None], told.shape)
-        np.testing.assert_allclose(told, expected, rtol=0, atol=0.51 * MILLI)
+        view_mask = timed & ((flags & int(still)) == 0) & ~lies
+        assert view_mask.any() or faults.clock_rate != 1
+        statement = MILLI * (kept["counts"].values[view_mask] - PATTERN.astype(float))
+        since = stamps[view_mask] + kept.attrs["clock_origin"] - self.world.epoch
+        expected = np.broadcast_to(since[:, None, None], statement.shape)
+        np.testing.assert_allclose(statement, expected, rtol=0, atol=0.51 * MILLI)
 
     def check_losses(self, band: str, frames: list[Frame], flags: Any) -> None:
         """Check that lost and damaged frames and the shutter are in the log and in the totals."""
         leaps = np.diff([frame.sequence for frame in frames]) - 1
-        found, totals = self.noted(band), self.summary.totals[band]
-        assert [value for kind, value in found if kind == "frames_lost"] == list(leaps[leaps > 0])
+        entries, totals = self.noted(band), self.summary.totals[band]
+        assert [value for kind, value in entries if kind == "frames_lost"] == list(leaps[leaps > 0])
         assert (totals["lost"], totals["refused"]) == (leaps.sum(), 0)
-        told = flags[1:] & int(FrameFlag.FRAMES_LOST_BEFORE) > 0
-        np.testing.assert_array_equal(told, leaps > 0)
+        statement = flags[1:] & int(FrameFlag.FRAMES_LOST_BEFORE) > 0
+        np.testing.assert_array_equal(statement, leaps > 0)
         damaged = sum(bool(frame.flags & DAMAGED) for frame in frames)
         assert self.kinds(band).count("damaged") == totals["damaged"] == damaged
         closed = [bool(flag & int(FrameFlag.SHUTTER_CLOSED)) for flag in flags]
         changes = sum(before != after for before, after in pairwise([False, *closed]))
-        assert sum(kind.startswith("shutter") for kind, _ in found) == changes
+        assert sum(kind.startswith("shutter") for kind, _ in entries) == changes

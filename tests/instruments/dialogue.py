@@ -5,8 +5,7 @@ The idea is pymeasure's ``expected_protocol``.
 
 from collections.abc import Iterable, Sequence
 
-from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated.clock import EmulatedClock
+from dbthermal.instruments.clock import Clock, EmulatedClock
 from dbthermal.instruments.transport import Closing
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
@@ -59,8 +58,8 @@ class Dialogue(Closing):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Fail if something was not written or not read."""
         if kind is None:
-            rest = (self._answers, self._written, self._pairs)
-            assert not any(rest), f"Left unread, cut short and unwritten: {rest!r}."
+            leftover = (self._answers, self._written, self._pairs)
+            assert not any(leftover), f"Left unread, cut short and unwritten: {leftover!r}."
 
     def _answer(self) -> None:
         """Make the answer of the first pair ready to be read."""

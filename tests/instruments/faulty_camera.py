@@ -131,8 +131,8 @@ def two_cameras(
     world, sources = world or World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, 100 + number)
-        form, known = (band, {band: picture}, band, shape, rate, rows), faults or {}
-        sources[band] = kind(world, *form, faults=known.get(band, Faults()))
+        form, faults_by_band = (band, {band: picture}, band, shape, rate, rows), faults or {}
+        sources[band] = kind(world, *form, faults=faults_by_band.get(band, Faults()))
     return sources
 
 

@@ -80,11 +80,11 @@ def bench(session: Session, **settings: Any) -> World:
 def pictures(world: World) -> dict[str, Picture]:
     """Counts of the emulated bands: a level, ten times the blackbody's kelvin, and stripes."""
 
-    def seen(level: int, _: float) -> Counts:
+    def frame_counts(level: int, _: float) -> Counts:
         row = level + round(10 * world.blackbody_temperature) + np.arange(SHAPE[1]) % 2
         return np.broadcast_to(row, SHAPE).astype(np.uint16)
 
-    return {band: partial(seen, level) for band, level in LEVELS.items()}
+    return {band: partial(frame_counts, level) for band, level in LEVELS.items()}
 
 
 @contextmanager

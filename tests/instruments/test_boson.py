@@ -21,14 +21,13 @@ from dbthermal.instruments.boson import (
     BosonReplyError,
     BosonStatusError,
     BosonTimeoutError,
-    commands,
+    Reading,
+    Setting,
 )
-from dbthermal.instruments.boson.commands import Reading, Setting
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.clock import SYSTEM
-from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import FFC_DURATION, World
+from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.emulated.world import FFC_DURATION, Line, World
 from dbthermal.instruments.transport import TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
@@ -77,34 +76,34 @@ def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
 
 def test_commands_are_the_published_ones() -> None:
     """Readings, settings, states and errors have their published numbers, none of them twice."""
-    known = vars(commands).items()
-    readings = {name: value for name, value in known if isinstance(value, Reading)}
-    assert {name: (one.command, one.layout) for name, one in readings.items()} == READINGS
-    settings = {name: value for name, value in known if isinstance(value, Setting)}
+    entries = vars(boson).items()
+    readings = {name: value for name, value in entries if isinstance(value, Reading)}
+    assert {name: (entry.command, entry.layout) for name, entry in readings.items()} == READINGS
+    settings = {name: value for name, value in entries if isinstance(value, Setting)}
     for name, setting in settings.items():
         kind: Any = setting.kind
         members = [*kind]
         assert (setting.set_command, [member.name for member in members]) == SETTINGS[name]
         assert [member.value for member in members] == [*range(len(members))]
         assert (setting.reading.command, setting.reading.layout) == (setting.set_command + 1, ">i")
-    assert {*commands.SETTINGS} == {*settings.values()}
+    assert {*boson.SETTINGS} == {*settings.values()}
     assert settings.keys() == SETTINGS.keys()
-    assert commands.RUN_FFC == 0x00050007
+    assert boson.RUN_FFC == 0x00050007
     assert [(state.name, state.value) for state in FfcStatus] == [
         *zip(STATES, range(4), strict=True)
     ]
-    assert [*commands.STATUSES] == STATUSES
-    assert len({*commands.STATUSES.values()}) == len(STATUSES) - 9  # ten are of the flash memory
+    assert [*boson.STATUSES] == STATUSES
+    assert len({*boson.STATUSES.values()}) == len(STATUSES) - 9  # ten are of the flash memory
 
 
-@pytest.mark.parametrize("setting", commands.SETTINGS, ids=lambda setting: setting.name)
+@pytest.mark.parametrize("setting", boson.SETTINGS, ids=lambda setting: setting.name)
 def test_every_setting_is_kept(bench: BosonBench, setting: Setting[Any]) -> None:
     """Every value is read back as set, and so is each reading; another is refused unsent."""
     for value in setting.kind:
         bench.camera.set(setting, value)
         assert bench.camera.get(setting) == value
     bench.state.serial_number = 0x8E9EAE81  # its bytes need escapes
-    readings = [one for one in vars(commands).values() if isinstance(one, Reading)]
+    readings = [entry for entry in vars(boson).values() if isinstance(entry, Reading)]
     values = {reading.name: bench.camera.read(reading) for reading in readings}
     assert (values["serial number"], values["part number"]) == (0x8E9EAE81, "EMULATED-BOSON-640")
     assert values["FFC status"] is FfcStatus.NONE_PERFORMED
@@ -119,13 +118,13 @@ OTHERS = text(1, SERIAL) + SERIAL_REQUEST  # on another channel, and an echo
 DAMAGED = SERIAL_REPLY[:-2] + b"\x11\xae"
 # Dialogues that end in a value: reading, bytes, value. Other software reads FF85 as 6541.3 °C.
 TALKS: list[tuple[Reading[Any], list[Pair], float]] = [
-    (commands.SERIAL_NUMBER, [(SERIAL_REQUEST, SERIAL_REPLY)], 93588),
-    (commands.FPA_TEMPERATURE, [(request(0, FPA), PIECES)], 43.1 + 273.15),
-    (commands.FPA_TEMPERATURE, [(request(1, FPA), reply(1, FPA, b"\xff\x85"))], 260.85),
-    (commands.FPA_TEMPERATURE, [(request(1, FPA), None), (request(2, FPA), LATE)], 311.15),
-    (commands.SERIAL_NUMBER, [(SERIAL_REQUEST, OTHERS + SERIAL_REPLY)], 93588),
+    (boson.SERIAL_NUMBER, [(SERIAL_REQUEST, SERIAL_REPLY)], 93588),
+    (boson.FPA_TEMPERATURE, [(request(0, FPA), PIECES)], 43.1 + 273.15),
+    (boson.FPA_TEMPERATURE, [(request(1, FPA), reply(1, FPA, b"\xff\x85"))], 260.85),
+    (boson.FPA_TEMPERATURE, [(request(1, FPA), None), (request(2, FPA), LATE)], 311.15),
+    (boson.SERIAL_NUMBER, [(SERIAL_REQUEST, OTHERS + SERIAL_REPLY)], 93588),
     (
-        commands.SERIAL_NUMBER,
+        boson.SERIAL_NUMBER,
         [(SERIAL_REQUEST, DAMAGED), (request(2, SERIAL), reply(2, SERIAL, b"\0\0\0\7"))],
         7,
     ),
@@ -164,10 +163,10 @@ def test_readings_that_fail(
     reading: int, answer: bytes | list[Pair], error: type[BosonError], message: str
 ) -> None:
     """A mute camera is asked three times; other replies are errors with what is wrong."""
-    (known,) = (r for r in vars(commands).values() if getattr(r, "command", None) == reading)
+    (entries,) = (r for r in vars(boson).values() if getattr(r, "command", None) == reading)
     pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
     with Dialogue(pairs) as line, pytest.raises(error, match=message) as caught:
-        camera_of(line).read(known)
+        camera_of(line).read(entries)
     status = getattr(caught.value, "status", 0)
     assert f"0x{status:X}" in message or not status
 
@@ -183,7 +182,7 @@ def test_a_change_is_sent_once(answer: bytes | None, error: type[BosonError], me
     """A command that changes the camera is never sent twice, and answered without data."""
     line = Dialogue([(request(1, SET_GAIN, b"\x00\x00\x00\x01"), answer)])
     with line, pytest.raises(error, match=message):
-        camera_of(line).set(commands.GAIN_MODE, GainMode.LOW)
+        camera_of(line).set(boson.GAIN_MODE, GainMode.LOW)
 
 
 blobs = st.lists(st.binary(max_size=60), max_size=6)
@@ -194,7 +193,7 @@ def test_any_answer_is_a_value_or_a_documented_error(pieces: list[bytes]) -> Non
     """Any bytes give a number or a documented error; the emulator answers on after any bytes."""
     camera = camera_of(Dialogue([(SERIAL_REQUEST, pieces)]))
     with suppress(BosonError):
-        assert 0 <= camera.read(commands.SERIAL_NUMBER, repeats=0) < 2**32
+        assert 0 <= camera.read(boson.SERIAL_NUMBER, repeats=0) < 2**32
     bench = BosonBench()
     for piece in pieces:
         bench.exchange(piece)
@@ -249,15 +248,15 @@ def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
 
 def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
     """The camera still says that the last correction is complete: not that of this one."""
-    complete = (commands.FFC_STATUS.command, struct.pack(">i", FfcStatus.COMPLETE))
-    last = commands.LAST_FFC_FRAME.command
-    asked = [(last, struct.pack(">I", 700)), complete, (commands.RUN_FFC, b"")]
+    complete = (boson.FFC_STATUS.command, struct.pack(">i", FfcStatus.COMPLETE))
+    last = boson.LAST_FFC_FRAME.command
+    requests = [(last, struct.pack(">I", 700)), complete, (boson.RUN_FFC, b"")]
     for frame in (700, 700, 1234):
-        busy = (commands.FFC_IN_PROGRESS.command, b"\x00\x00")
-        asked += [busy, complete, (last, struct.pack(">I", frame))]
+        busy = (boson.FFC_IN_PROGRESS.command, b"\x00\x00")
+        requests += [busy, complete, (last, struct.pack(">I", frame))]
     pairs: list[Pair] = [
         (request(number, command), reply(number, command, data))
-        for number, (command, data) in enumerate(asked, start=1)
+        for number, (command, data) in enumerate(requests, start=1)
     ]
     with Dialogue(pairs) as line:
         assert camera_of(line).run_ffc() == 1234

@@ -132,8 +132,8 @@ def test_a_correction_and_the_cameras_own_number_are_kept(tmp_path: Path) -> Non
     """Renewed offsets are in the log, and the camera's counter is beside the driver's number."""
     frames = [shot(0, telemetry=rows(7, 40)), shot(1, telemetry=rows(90, 42))]
     frames += [shot(2, telemetry=rows(7, 0), flags=FrameFlag.WRONG_SIZE)]
-    other = [shot(0, telemetry=rows(7, 3))]
-    opened = stored(tmp_path / "a.zarr", frames, other, telemetry_rows=telemetry.ROWS)
+    second_band = [shot(0, telemetry=rows(7, 3))]
+    opened = stored(tmp_path / "a.zarr", frames, second_band, telemetry_rows=telemetry.ROWS)
     np.testing.assert_array_equal(opened["frame_counter"], [[40, 42, -1], [3, -1, -1]])
     np.testing.assert_array_equal(opened["sequence"][0], [0, 1, 2])
     assert ("correction", "8-14", 90) in [note[1:] for note in notes(tmp_path / "a.zarr")]
@@ -152,8 +152,8 @@ def test_the_store_explains_itself(tmp_path: Path) -> None:
     opened = stored(tmp_path / "a.zarr", telemetry_rows=telemetry.ROWS)
     attrs = opened["frame_flags"].attrs
     names = [name.upper() for name in attrs["flag_meanings"].split()]
-    found = {FrameFlag[name]: mask for name, mask in zip(names, attrs["flag_masks"], strict=True)}
-    assert found == {flag: int(flag) for flag in FrameFlag}
+    result = {FrameFlag[name]: mask for name, mask in zip(names, attrs["flag_masks"], strict=True)}
+    assert result == {flag: int(flag) for flag in FrameFlag}
     kinds = opened["log_kind"].attrs
     assert kinds["flag_meanings"].split() == list(opened.attrs["log_kinds"])
     assert kinds["flag_values"] == list(opened.attrs["log_kinds"].values())
@@ -208,8 +208,8 @@ def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
 def test_vectors(name: str, value: float, offset: int, expected: str) -> None:
     """The bytes in the buffer are those of the public decoders, both ways."""
     wanted = bytes.fromhex(expected)
-    found = telemetry.encode({name: value}, COLUMNS).astype("<u2").tobytes()
-    assert found[offset : offset + len(wanted)] == wanted
+    result = telemetry.encode({name: value}, COLUMNS).astype("<u2").tobytes()
+    assert result[offset : offset + len(wanted)] == wanted
     buffer = bytearray(2 * telemetry.WORDS)
     buffer[offset : offset + len(wanted)] = wanted
     decoded = telemetry.decode(np.frombuffer(bytes(buffer), dtype="<u2"))
@@ -221,10 +221,10 @@ def test_fields_come_back(fields: dict[str, float]) -> None:
     """Encoded fields are decoded unchanged, and give the metadata of a frame."""
     encoded = telemetry.encode(fields, COLUMNS)
     assert telemetry.decode(encoded) == pytest.approx(fields, rel=0, abs=1e-6)
-    found = telemetry.metadata(encoded)
-    assert found.frame_counter == fields["frame_counter"]
-    assert found.last_ffc_frame == fields["last_ffc_frame"]
-    assert found.fpa_temperature == pytest.approx(fields["fpa_temperature"], abs=1e-6)
+    result = telemetry.metadata(encoded)
+    assert result.frame_counter == fields["frame_counter"]
+    assert result.last_ffc_frame == fields["last_ffc_frame"]
+    assert result.fpa_temperature == pytest.approx(fields["fpa_temperature"], abs=1e-6)
 
 
 def test_wrong_telemetry_is_refused() -> None:
@@ -243,12 +243,12 @@ def closed(
     copies: str, last: Sequence[int | None] | None, status: Sequence[FfcStatus | None] | None
 ) -> str:
     """Frames that count as closed, x, of frames that repeat the image before, also x."""
-    state, found = Shutter(), ""
+    state, result = Shutter(), ""
     nothing = [None] * len(copies)
     for mark, frame, read in zip(copies, last or nothing, status or nothing, strict=True):
         state = next_shutter(state, repeated=mark == "x", last_ffc_frame=frame, ffc_status=read)
-        found += "x" if state.closed else "."
-    return found
+        result += "x" if state.closed else "."
+    return result
 
 
 IMMINENT, BUSY, DONE = FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS, FfcStatus.COMPLETE

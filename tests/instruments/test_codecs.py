@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments._apt import LENGTHS, Id, Message, command
+from dbthermal.instruments._apt import Id, Message, command
 from dbthermal.instruments._fslp import Frame
 
 # Requests quoted in the tests of PnPQ, many of them from the maker's documentation; that of 0018
@@ -34,9 +34,7 @@ INFO = "06 00 54 00 81 22 89 53 9A 05 49 4F 4E 30 30 31 20 00 2C 00 02 01 39 00"
 STATUS = "81 04 0E 00 81 22 01 00 01 00 00 00 00 00 00 00 07 00 00 00"
 LONG_STATUS = STATUS.replace("0E", "1C") + " 01 00" + " 00" * 12
 LONG_COMPLETED = "64 04 0E 00 81 50 01 00 68 AA A0 01 00 00 00 00 30 00 00 80"
-ENDS = [
-    first + rest for first in ("64 04", "66 04") for rest in (" 01 00 01 22", LONG_COMPLETED[5:])
-]
+ENDS = [first + end for first in ("64 04", "66 04") for end in (" 01 00 01 22", LONG_COMPLETED[5:])]
 LIMITS = apt.StatusBits(0b111)
 RECORDS: list[tuple[str, apt.Record]] = [
     (STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
@@ -53,8 +51,7 @@ MOD_REQ_CHANENABLESTATE 0211 0, MOD_GET_CHANENABLESTATE 0212 0, MOT_SET_VELPARAM
 MOT_REQ_VELPARAMS 0414 0, MOT_GET_VELPARAMS 0415 14, MOT_SET_HOMEPARAMS 0440 14,
 MOT_REQ_HOMEPARAMS 0441 0, MOT_GET_HOMEPARAMS 0442 14, MOT_MOVE_HOME 0443 0, MOT_MOVE_HOMED 0444 0,
 MOT_MOVE_ABSOLUTE 0453 0 6, MOT_MOVE_COMPLETED 0464 0 14, MOT_MOVE_STOP 0465 0,
-MOT_MOVE_STOPPED 0466 0 14, MOT_REQ_STATUSUPDATE 0480 0, MOT_GET_STATUSUPDATE 0481 14 28,
-MOT_GET_DCSTATUSUPDATE 0491 14
+MOT_MOVE_STOPPED 0466 0 14, MOT_REQ_STATUSUPDATE 0480 0, MOT_GET_STATUSUPDATE 0481 14 28
 """
 BITS = [4, 5, 6, 7, 8, 9, 10, 14, 24, 31]  # of `StatusBits`, in its order
 
@@ -108,7 +105,7 @@ def test_messages_have_the_published_bytes() -> None:
     assert decode(ENDS[0]) == Message(Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, 0x22)
     for line, record in RECORDS:
         assert type(record).parse(decode(line)) == record
-    entries = [f"{known.name} {known:04X} " + " ".join(map(str, LENGTHS[known])) for known in Id]
+    entries = [f"{sample.name} {sample:04X} " + " ".join(map(str, sample.lengths)) for sample in Id]
     assert entries == PUBLISHED.strip().replace(",\n", ", ").split(", ")
     assert [bit.bit_length() - 1 for bit in apt.StatusBits] == BITS
 
@@ -142,11 +139,11 @@ IDENTIFIERS: dict[type[apt.Record], Id] = {
     apt.Status: Id.MOT_GET_STATUSUPDATE,
     apt.Info: Id.HW_GET_INFO,
 }
-parts = st.lists(st.tuples(st.sampled_from([b"", b"\xff", b"\xfe\xfe\xff"]), records), max_size=6)
+noisy = st.lists(st.tuples(st.sampled_from([b"", b"\xff", b"\xfe\xfe\xff"]), records), max_size=6)
 places = st.lists(st.integers(0, 999), max_size=6)
 
 
-@given(parts, places)
+@given(noisy, places)
 def test_messages_come_back(noisy: list[tuple[bytes, apt.Record]], where: list[int]) -> None:
     """Records come back from any cutting, with noise before them, which is counted."""
     stream, sent = b"", [record for _, record in noisy]
@@ -179,11 +176,11 @@ def test_frames_come_back(sent: list[Frame], where: list[int], noise: bytes) -> 
     assert (decoder.damaged, decoder.is_open) == (0, False)
 
 
-known = st.sampled_from([bytes.fromhex(line) for line in (INFO, STATUS, LONG_COMPLETED)])
-cut_short = st.tuples(known, st.integers(0, 90)).map(lambda pair: pair[0][: pair[1]])
+sample = st.sampled_from([bytes.fromhex(line) for line in (INFO, STATUS, LONG_COMPLETED)])
+cut_short = st.tuples(sample, st.integers(0, 90)).map(lambda pair: pair[0][: pair[1]])
 
 
-@given(st.lists(st.one_of(blobs, known, cut_short), max_size=8).map(b"".join), places)
+@given(st.lists(st.one_of(blobs, sample, cut_short), max_size=8).map(b"".join), places)
 def test_any_bytes_are_accounted_for(stream: bytes, where: list[int]) -> None:
     """Of any bytes in any pieces each is in a message or frame, counted as damaged, or pending."""
     decoder, whole, framed = apt.Decoder(), apt.Decoder().feed(stream), fslp.Decoder()
@@ -191,8 +188,8 @@ def test_any_bytes_are_accounted_for(stream: bytes, where: list[int]) -> None:
     assert messages == whole
     read = sum(len(apt.encode(message)) for message in messages)
     assert read + decoder.dropped + len(decoder.pending) == len(stream)
-    found = [frame for piece in cut(stream, where) for frame in framed.feed(piece)]
-    assert stream.count(0x8E) == len(found) + framed.damaged + framed.is_open
+    results = [frame for piece in cut(stream, where) for frame in framed.feed(piece)]
+    assert stream.count(0x8E) == len(results) + framed.damaged + framed.is_open
     assert fslp.Decoder().feed(stream + REPLY)[-1] == SERIAL  # a start byte begins anew
     decoder.discard()
     assert decoder.pending == b""
@@ -204,7 +201,7 @@ def test_parsers_meet_arbitrary_data(content: bytes) -> None:
     """A parser returns its record of any data of each length that the decoder lets pass."""
     parsers: dict[type[apt.Record], Id] = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
     for parser, identifier in parsers.items():
-        for length in filter(None, LENGTHS[identifier]):
+        for length in filter(None, identifier.lengths):
             message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
             assert isinstance(parser.parse(message), parser)
 
@@ -250,6 +247,14 @@ def test_what_a_computer_hears(header: str, heard: int) -> None:
     decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert len(decoder.feed(bytes.fromhex(header))) == heard
     assert decoder.dropped == 1 - heard
+
+
+def test_an_unknown_message_is_skipped_whole() -> None:
+    """Data of a message that the driver does not know are not read as messages."""
+    stream = bytes.fromhex("fe 0e 06 00 81 22 44 04 01 00 01 22 fe 0e 01 00 01 22" + STATUS)
+    decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
+    identifiers = [message.id for message in decoder.feed(stream)]
+    assert (identifiers, decoder.dropped) == ([0xEFE, 0xEFE, Id.MOT_GET_STATUSUPDATE], 0)
 
 
 @pytest.mark.parametrize("size", [fslp.MAXIMUM_FRAME, fslp.MAXIMUM_FRAME + 1])

@@ -17,8 +17,8 @@ from device_benches import FILTERS
 from device_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 from faulty_camera import frames
 
-from dbthermal.instruments import inventory
-from dbthermal.instruments.boson import Boson, commands
+from dbthermal.instruments import boson, inventory
+from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import (
     FfcMode,
     FfcStatus,
@@ -57,8 +57,8 @@ def identity(device: Any) -> Mapping[str, object]:
     """Identity of a device, by name."""
     if isinstance(device, Boson | FilterWheel | TC08):
         return device.identity()
-    told: Mapping[str, object] = device.identity
-    return told
+    details: Mapping[str, object] = device.identity
+    return details
 
 
 def ask(device: Any) -> object:
@@ -74,12 +74,12 @@ def ask(device: Any) -> object:
 @opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
 def test_a_device_says_who_it_is(opened: Opened) -> None:
     """The identity is constant, names the device, and says if it is emulated."""
-    told = identity(opened.device)
-    assert dict(told) == dict(identity(opened.device))
-    names = [value for name, value in told.items() if name in NAMES]
+    details = identity(opened.device)
+    assert dict(details) == dict(identity(opened.device))
+    names = [value for name, value in details.items() if name in NAMES]
     assert names != []
     assert all(names)
-    assert opened.device.is_simulated is told.get("is_simulated", opened.is_simulated)
+    assert opened.device.is_simulated is details.get("is_simulated", opened.is_simulated)
     assert opened.device.is_simulated is opened.is_simulated
 
 
@@ -114,7 +114,7 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
     assert camera.identity()["serial_number"] == str(camera.serial_number())
     assert camera.serial_number() > 0
     assert 220 < camera.fpa_temperature() < 380
-    before = camera.read(commands.LAST_FFC_FRAME)
+    before = camera.read(boson.LAST_FFC_FRAME)
     camera._clock.sleep(0.05)
     assert camera.run_ffc() > before
     assert camera.ffc_status() is FfcStatus.COMPLETE
@@ -124,14 +124,14 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
 def test_a_camera_keeps_a_mode(opened: Opened) -> None:
     """The FFC mode is set and read back; an unknown mode raises a ValueError."""
     camera: Boson = opened.device
-    before = camera.get(commands.FFC_MODE)
-    camera.set(commands.FFC_MODE, FfcMode.MANUAL)
-    assert camera.get(commands.FFC_MODE) is FfcMode.MANUAL
+    before = camera.get(boson.FFC_MODE)
+    camera.set(boson.FFC_MODE, FfcMode.MANUAL)
+    assert camera.get(boson.FFC_MODE) is FfcMode.MANUAL
     wrong: Any = 4
     with pytest.raises(ValueError, match="Invalid FFC mode 4"):
-        camera.set(commands.FFC_MODE, wrong)
-    camera.set(commands.FFC_MODE, before)
-    assert camera.get(commands.FFC_MODE) is before
+        camera.set(boson.FFC_MODE, wrong)
+    camera.set(boson.FFC_MODE, before)
+    assert camera.get(boson.FFC_MODE) is before
 
 
 @opens(*WHEELS)
@@ -165,12 +165,12 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
 def test_frames_follow_one_another(opened: Opened) -> None:
     """Frames have the source's shape, numbers that rise by one, times that rise."""
     source: FrameSource = opened.device
-    found = list(frames(source, 10))
-    assert {frame.counts.shape for frame in found} == {source.shape}
-    assert {frame.counts.dtype for frame in found} == {np.dtype(np.uint16)}
-    assert np.all(np.diff([frame.sequence for frame in found]) == 1)
-    assert np.all(np.diff([frame.device_time for frame in found]) > 0)
-    assert {frame.telemetry is None for frame in found} == {source.telemetry_rows == 0}
+    results = list(frames(source, 10))
+    assert {frame.counts.shape for frame in results} == {source.shape}
+    assert {frame.counts.dtype for frame in results} == {np.dtype(np.uint16)}
+    assert np.all(np.diff([frame.sequence for frame in results]) == 1)
+    assert np.all(np.diff([frame.device_time for frame in results]) > 0)
+    assert {frame.telemetry is None for frame in results} == {source.telemetry_rows == 0}
     with pytest.raises(NoFrameError, match="No frame from"):  # silence is no loss
         source.read(0.0)
 
@@ -178,6 +178,6 @@ def test_frames_follow_one_another(opened: Opened) -> None:
 @pytest.mark.hardware
 def test_the_rig_is_found() -> None:
     """The inventory lists the whole rig without a warning."""
-    found = inventory.find()
-    assert [device.kind for device in found] == [inventory.BOSON, *inventory.KINDS]
-    assert [device.warnings for device in found] == [()] * 4
+    results = inventory.find()
+    assert [device.kind for device in results] == [inventory.BOSON, *inventory.KINDS]
+    assert [device.warnings for device in results] == [()] * 4

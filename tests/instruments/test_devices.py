@@ -6,8 +6,8 @@ import pytest
 from device_benches import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
-from dbthermal.instruments.boson import Boson, commands
-from dbthermal.instruments.boson.commands import Ir16Mode, Switch
+from dbthermal.instruments import boson
+from dbthermal.instruments.boson import Boson, Ir16Mode, Switch
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.devices import (
     Devices,
@@ -28,14 +28,14 @@ def devices() -> Iterator[Devices]:
 
 def test_every_device_says_what_it_is(devices: Devices) -> None:
     """Identities label all as emulated; opening neither sets a camera nor turns the wheel."""
-    found = devices.identities()
-    assert found["8-14"]["serial_number"] == "93588"
-    assert (found["9.5"]["serial_number"], found["9.5"]["device"]) == ("93589", "sim://boson/9.5")
-    assert found["9.5"]["software_revision"] == "0.0.0"
-    assert found["9.5"]["ffc_mode"] == "auto"
-    assert found["filter_wheel"]["model"] == "BSC201"
-    assert found["thermocouples"]["serial_number"] == "EMULATED"
-    assert all(identity["is_simulated"] is True for identity in found.values())
+    names = devices.identities()
+    assert names["8-14"]["serial_number"] == "93588"
+    assert (names["9.5"]["serial_number"], names["9.5"]["device"]) == ("93589", "sim://boson/9.5")
+    assert names["9.5"]["software_revision"] == "0.0.0"
+    assert names["9.5"]["ffc_mode"] == "auto"
+    assert names["filter_wheel"]["model"] == "BSC201"
+    assert names["thermocouples"]["serial_number"] == "EMULATED"
+    assert all(identity["is_simulated"] is True for identity in names.values())
     assert devices.cameras["9.5"].ffc_status() == FfcStatus.NONE_PERFORMED
     assert devices.wheel is not None
     with pytest.raises(NotHomedError):
@@ -47,7 +47,7 @@ def test_whole_rig_is_closed() -> None:
     with rig(from_yaml(TEXT)) as devices:
         assert devices.wheel is not None
         assert devices.thermocouples is not None
-    for ask in (devices.wheel.status, *(one.fpa_temperature for one in devices.cameras.values())):
+    for ask in (devices.wheel.status, *(port.fpa_temperature for port in devices.cameras.values())):
         with pytest.raises(TransportError, match="must stay connected and open"):
             ask()
     for source in devices.sources.values():
@@ -64,10 +64,10 @@ def test_readings_are_named(devices: Devices) -> None:
     devices.world.camera("9.5").fpa_temperature = 311.25
     devices.prepare()
     readings = devices.readings()
-    found = {name: reading.read() for name, reading in readings.items()}
+    names = {name: reading.read() for name, reading in readings.items()}
     expected = {"blackbody": 300.0, "plate": 330.0, "fpa 8-14": 308.15, "fpa 9.5": 311.25}
     expected |= {"ffc 8-14": 3.0, "ffc 9.5": 3.0, "filter_wheel": 1.0}
-    assert found == pytest.approx(expected, abs=1e-4)  # a thermocouple is of 32 bits
+    assert names == pytest.approx(expected, abs=1e-4)  # a thermocouple is of 32 bits
     units = {name: reading.units for name, reading in readings.items()}
     assert {name for name, unit in units.items() if unit == "1"} == {
         "ffc 8-14",
@@ -81,9 +81,9 @@ def test_prepared_for_a_measurement(devices: Devices) -> None:
     devices.prepare()
     for camera in devices.cameras.values():
         assert isinstance(camera, Boson)
-        assert camera.get(commands.IR16_MODE) == Ir16Mode.COUNTS_16
-        assert camera.get(commands.FFC_MODE) == FfcMode.MANUAL
-        assert camera.get(commands.TELEMETRY) == Switch.ON
+        assert camera.get(boson.IR16_MODE) == Ir16Mode.COUNTS_16
+        assert camera.get(boson.FFC_MODE) == FfcMode.MANUAL
+        assert camera.get(boson.TELEMETRY) == Switch.ON
         assert camera.ffc_status() == FfcStatus.COMPLETE
     assert devices.wheel is not None
     assert devices.world is not None
@@ -101,7 +101,7 @@ class Kept(dict[int, int]):
 def test_setting_that_is_not_taken_is_an_error() -> None:
     """A camera that acknowledges a setting but does not change raises an error."""
     bench = BosonBench()
-    bench.device.settings = Kept({**bench.device.settings, commands.IR16_MODE.set_command: 2})
+    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.set_command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
         Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
@@ -110,12 +110,12 @@ def test_setting_that_is_not_taken_is_an_error() -> None:
 def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
     """Turned to another filter, source, command port and identity of the camera bear its name."""
     devices.prepare()
-    here = devices.select("11")
-    assert list(here.sources) == list(here.cameras) == list(here.session.bands) == ["8-14", "11"]
-    assert here.sources["11"] is devices.sources["9.5"]
-    assert {"fpa 11", "ffc 11"} < here.readings().keys()
-    assert here.identities()["11"]["serial_number"] == "93589"
-    assert here.select("9.5").session.bands == ("8-14", "9.5")
+    swept = devices.select("11")
+    assert list(swept.sources) == list(swept.cameras) == list(swept.session.bands) == ["8-14", "11"]
+    assert swept.sources["11"] is devices.sources["9.5"]
+    assert {"fpa 11", "ffc 11"} < swept.readings().keys()
+    assert swept.identities()["11"]["serial_number"] == "93589"
+    assert swept.select("9.5").session.bands == ("8-14", "9.5")
     with pytest.raises(ValueError, match=r"Invalid band '8-14' of the wheel"):
         devices.select("8-14")
     with pytest.raises(ValueError, match="Invalid band '11' of a session without a wheel"):

@@ -38,11 +38,11 @@ def shown(source: EmulatedCamera, number: int = 1) -> list[int]:
 def test_wheel_changes_what_is_seen() -> None:
     """Behind the wheel the band is the filter's; between two filters the beam is closed."""
     behind = camera(band=None)
-    found = shown(behind)
+    counts = shown(behind)
     for position in (2, None, 3):
         behind.world.wheel_position = position
-        found += shown(behind)
-    assert found == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
+        counts += shown(behind)
+    assert counts == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
 
 
 def test_telemetry_says_what_the_camera_is_about() -> None:

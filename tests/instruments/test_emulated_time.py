@@ -12,9 +12,8 @@ import pytest
 from rig_session import bench, from_yaml, pictures, replaced, rig, scene_text
 
 from dbthermal.instruments import protocols
-from dbthermal.instruments.clock import SYSTEM, Task
+from dbthermal.instruments.clock import START, SYSTEM, EmulatedClock, Task
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.clock import START, EmulatedClock
 from dbthermal.instruments.recording import Limits, Preview, open_capture
 
 LIMITS, LIMIT = Limits(chunk=30, reserve=0, queue=3), 600.0
@@ -26,10 +25,10 @@ SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text(
 
 def recorded(folder: Path) -> dict[str, str]:
     """Record a sweep and a scene with a preview; names and checksums of all files."""
-    seen: list[float] = []
+    order: list[float] = []
 
     def show(preview: Preview) -> None:
-        seen.append(preview.time)
+        order.append(preview.time)
 
     with rig(SWEEP) as devices:
         devices.prepare()
@@ -48,7 +47,7 @@ def recorded(folder: Path) -> dict[str, str]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return {**files, "previews": str(seen)}
+    return {**files, "previews": str(order)}
 
 
 def spin() -> None:
@@ -134,7 +133,7 @@ def test_tasks_take_turns_in_the_order_of_their_times() -> None:
 
 def test_a_lock_and_an_interrupt_stop_no_other_thread() -> None:
     """A held lock is awaited in emulated time; a thread that left by an error blocks nobody."""
-    clock, lock, seen = EmulatedClock(), threading.Lock(), list[float]()
+    clock, lock, order = EmulatedClock(), threading.Lock(), list[float]()
 
     def hold() -> None:
         with clock.hold(lock):
@@ -150,6 +149,6 @@ def test_a_lock_and_an_interrupt_stop_no_other_thread() -> None:
     with pytest.raises(ZeroDivisionError):
         leave()
     with clock.hold(lock):
-        seen.append(clock())
+        order.append(clock())
     assert task.ended.wait(LIMIT)
-    assert seen == [2.0]
+    assert order == [2.0]

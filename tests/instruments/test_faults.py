@@ -50,7 +50,7 @@ def test_damaged_frames(name: str, tmp_path: Path) -> None:
     faults, flag, kind = DAMAGES[name]
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": faults}).record(0.5)
     flags = [FrameFlag(int(value)) for value in recorded.stored("9.5")["frame_flags"]]
-    assert any(flag in found for found in flags)
+    assert any(flag in entries for entries in flags)
     assert kind in recorded.kinds("9.5") or not kind
     assert recorded.noted("8-14") == []
     assert recorded.summary.ended == "duration"
@@ -203,10 +203,10 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> CheckedRecording:
 @pytest.mark.parametrize("name", TROUBLES)
 def test_what_is_recorded(name: str, troubled: CheckedRecording) -> None:
     """Valid readings are in the log, all others are noted as failed, and no frame is lost."""
-    sees, found = TROUBLES[name][1], troubled.noted(name)
+    sees, entries = TROUBLES[name][1], troubled.noted(name)
     if isinstance(sees, float) and not math.isnan(sees):
         kind, value = "reading", sees
     else:
         kind, value = "reading_failed", math.nan
-    assert troubled.kinds(name) == [kind] * len(found) != []
-    np.testing.assert_allclose([read for _, read in found], value, rtol=0, atol=0.05)
+    assert troubled.kinds(name) == [kind] * len(entries) != []
+    np.testing.assert_allclose([read for _, read in entries], value, rtol=0, atol=0.05)

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal.instruments.emulated.apt import EmulatedApt
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import Line, World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
@@ -122,8 +121,8 @@ def test_by_name_of_an_emulator() -> None:
             with pytest.raises(NotHomedError, match="Must be homed"):
                 attempt()
         with ThreadPoolExecutor(max_workers=4) as pool:
-            asked = [pool.submit(wheel.status) for _ in range(200)]
-            assert len({status.result().position for status in asked}) == 1
+            futures = [pool.submit(wheel.status) for _ in range(200)]
+            assert len({status.result().position for status in futures}) == 1
     with pytest.raises(ValueError, match="Invalid model 'X'"):
         EmulatedApt(world, model="X")
 
@@ -364,7 +363,7 @@ def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench.world.wheel_position == wheel.position() == 3
     with pytest.raises(StalledWheelError, match="did not start"):
         wheel.move_to(6)
-    monkeypatch.setattr("dbthermal.instruments._controller.REPLY_TIMEOUT", 1.5)
+    monkeypatch.setattr("dbthermal.instruments.filterwheel.REPLY_TIMEOUT", 1.5)
     patient.homed().move_to(6)
     assert patient.world.wheel_position == 6
 

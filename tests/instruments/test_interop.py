@@ -14,9 +14,8 @@ from contextlib import contextmanager
 import pytest
 from device_benches import FILTERS, WheelBench
 
-from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.emulated.world import Line, World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 
 RACK, CHANNEL = {"dest": 0x11}, {"dest": 0x21, "chan_ident": 1}
@@ -67,12 +66,12 @@ def test_both_speak_the_same_to_a_wheel() -> None:
     assert built == tap.sent
     unpacker = protocol.Unpacker()
     unpacker.feed(tap.answers)
-    found = {message.msg: message for message in unpacker}
-    where, info = found["mot_get_statusupdate"], found["hw_get_info"]
+    messages = {message.msg: message for message in unpacker}
+    where, info = messages["mot_get_statusupdate"], messages["hw_get_info"]
     assert (where.position, where.homed) == (-14_222, True)
     assert (info.serial_number, info.nchs) == (40_000_000, 1)
     assert list(info.firmware_version) == [1, 0, 0]
-    homes, speeds = found["mot_get_homeparams"], found["mot_get_velparams"]
+    homes, speeds = messages["mot_get_homeparams"], messages["mot_get_velparams"]
     assert (homes.home_velocity, homes.offset_distance) == (4_397_466, 0)
     assert (speeds.acceleration, speeds.max_velocity) == (4506, 21_987_328)
 

@@ -37,16 +37,16 @@ class EmulatedDevice:
 
 def boson(number: int = 1, **settings: Any) -> EmulatedDevice:
     """A camera with two video nodes and a serial one; `number`, from 1, is in all its names."""
-    own: dict[str, Any] = {"serial": f"EMULATED{number}", "ports": (number,)}
+    defaults: dict[str, Any] = {"serial": f"EMULATED{number}", "ports": (number,)}
     video = (f"video4linux/video{index}" for index in (2 * number - 2, 2 * number - 1))
-    own["nodes"] = (*video, f"tty/ttyACM{number - 1}")
-    return EmulatedDevice(0x09CB, 0x4007, **{**own, **settings})
+    defaults["nodes"] = (*video, f"tty/ttyACM{number - 1}")
+    return EmulatedDevice(0x09CB, 0x4007, **{**defaults, **settings})
 
 
 def apt(**settings: Any) -> EmulatedDevice:
     """An APT controller on its FTDI chip, at full speed."""
-    own: dict[str, Any] = {"ports": (3,), "speed": 2, "nodes": ("ttyUSB0",)}
-    return EmulatedDevice(0x0403, 0xFAF0, **{**own, **settings})
+    defaults: dict[str, Any] = {"ports": (3,), "speed": 2, "nodes": ("ttyUSB0",)}
+    return EmulatedDevice(0x0403, 0xFAF0, **{**defaults, **settings})
 
 
 def tc08(**settings: Any) -> EmulatedDevice:
@@ -111,10 +111,10 @@ def look(tmp_path: Path, *devices: EmulatedDevice, frame_rate: float = 30.0) -> 
 
 def test_whole_rig(tmp_path: Path) -> None:
     """Two cameras, the wheel's controller and the logger are listed without a warning."""
-    found = look(tmp_path, tc08(serial=""), apt(), boson(2, bus=2), boson(1))
-    assert {device.warnings for device in found} == {()}
+    devices = look(tmp_path, tc08(serial=""), apt(), boson(2, bus=2), boson(1))
+    assert {device.warnings for device in devices} == {()}
     assert [
-        line.replace(str(tmp_path / "dev"), "") for line in inventory.describe(found).splitlines()
+        line.replace(str(tmp_path / "dev"), "") for line in inventory.describe(devices).splitlines()
     ] == [
         "FLIR Boson EMULATED1: 1-1, high speed, /video0 /video1 /ttyACM0",
         "FLIR Boson EMULATED2: 2-2, high speed, /video2 /video3 /ttyACM1",
@@ -125,8 +125,8 @@ def test_whole_rig(tmp_path: Path) -> None:
 
 def test_nothing_plugged_in(tmp_path: Path) -> None:
     """A mouse and FLIR's other devices are not listed; missing devices and warnings are named."""
-    others = EmulatedDevice(0x046D, 0xC077), EmulatedDevice(0x09CB, 0x0100, bus=2)
-    assert look(tmp_path, *others) == []
+    strangers = EmulatedDevice(0x046D, 0xC077), EmulatedDevice(0x09CB, 0x0100, bus=2)
+    assert look(tmp_path, *strangers) == []
     assert inventory.describe([]).splitlines()[0] == (
         "FLIR Boson: not found (09cb:4007). Must be plugged in and switched on; "
         "'lsusb -d 09cb:4007' lists it then."
@@ -163,12 +163,12 @@ def test_rates_that_a_bus_cannot_carry(tmp_path: Path) -> None:
     rule = "It runs at full speed, and 60 frames/s take 314.6 Mbit/s. Must be at high speed"
     assert slow.warnings[0].startswith(rule)
     pair = boson(1, ports=(1, 1)), boson(2, ports=(1, 2))
-    found = look(tmp_path / "shared", *pair, frame_rate=60.0)
-    assert " and ".join(found[0].warnings) == (
+    devices = look(tmp_path / "shared", *pair, frame_rate=60.0)
+    assert " and ".join(devices[0].warnings) == (
         "It shares bus 1 with 1-1.2: 629.1 Mbit/s at 60 frames/s, of 426.0 Mbit/s at most. "
         "Use ports of two controllers, or fewer frames/s."
     )
-    assert "with 1-1.1" in found[1].warnings[0]
+    assert "with 1-1.1" in devices[1].warnings[0]
     fit = look(tmp_path / "fit", boson(1), boson(2), frame_rate=30.0)
     fit += look(tmp_path / "apart", boson(1), boson(2, bus=2), frame_rate=60.0)
     assert {device.warnings for device in fit} == {()}
@@ -189,8 +189,8 @@ def test_node_that_may_not_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_system_without_sysfs() -> None:
     """Without sysfs the devices are listed, and their nodes are reported as unknown."""
-    (found,) = inventory.find(EmulatedBackend(boson()), sysfs=Path("/nowhere"))
-    assert found.warnings[0].startswith("Its nodes and number are not known: there is no /nowhere")
+    (device,) = inventory.find(EmulatedBackend(boson()), sysfs=Path("/nowhere"))
+    assert device.warnings[0].startswith("Its nodes and number are not known: there is no /nowhere")
 
 
 def test_missing_libusb(monkeypatch: pytest.MonkeyPatch) -> None:

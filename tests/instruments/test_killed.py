@@ -31,7 +31,7 @@ def picture(time: float) -> Counts:
     return np.full(SHAPE, 1000 + round(RATE * time), dtype=np.uint16)
 
 
-def record_until_killed(folder: Path, part: float, pipe: Connection) -> None:
+def record_until_killed(folder: Path, share: float, pipe: Connection) -> None:
     """Record a whole recording, and one that is killed after a part of as many operations."""
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.0, reading_period=0.02)
     readings = {"plate": Reading(lambda: 300.0)}
@@ -50,16 +50,16 @@ def record_until_killed(folder: Path, part: float, pipe: Connection) -> None:
 
     run("first.zarr", 0.05)  # later ones import nothing
     operations = operations_of(lambda: run("whole.zarr"))
-    with before_operation(round(part * operations), lambda: os.kill(os.getpid(), signal.SIGKILL)):
+    with before_operation(round(share * operations), lambda: os.kill(os.getpid(), signal.SIGKILL)):
         run("killed.zarr")
 
 
-def killed(folder: Path, part: float) -> list[int]:
+def killed(folder: Path, share: float) -> list[int]:
     """Kill a recording after a part of it; frames that it had taken by then."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__, "dbthermal.store", "dbthermal.instruments.recording"])
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=record_until_killed, args=(folder, part, theirs))
+    process = context.Process(target=record_until_killed, args=(folder, share, theirs))
     process.start()
     theirs.close()
     taken = [0, 0]
@@ -93,12 +93,12 @@ def check_written(opened: xr.Dataset) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    "part",
+    "share",
     [*MOMENTS, *(pytest.param(p, marks=pytest.mark.slow) for p in np.linspace(0.1, 1, 19))],
 )
-def test_kill_costs_the_last_chunk(tmp_path: Path, part: float) -> None:
+def test_kill_costs_the_last_chunk(tmp_path: Path, share: float) -> None:
     """Killed at any moment, a recording opens and lacks less than a chunk of each band."""
-    taken, path = killed(tmp_path, part), tmp_path / "killed.zarr"
+    taken, path = killed(tmp_path, share), tmp_path / "killed.zarr"
     if not path.exists():  # it came before there was one
         assert taken == [0, 0]
         return
@@ -130,19 +130,19 @@ class Disk:
             self.kept.append(os.dup(file))  # so that the file's number is not given away
             self.contents[status.st_ino] = os.pread(file, status.st_size, 0)
 
-    def power_loss(self, left: Path, *, early: bool) -> None:
+    def power_loss(self, remains: Path, *, early: bool) -> None:
         """Write the durable state to a folder; with `early` also names that were not synced."""
         folders = [self.root, *(path for path in self.root.rglob("*") if path.is_dir())]
         now = {path.stat().st_ino: listed(path) for path in folders}
-        self._restore(left, self.root.stat().st_ino, now if early else self.names)
+        self._restore(remains, self.root.stat().st_ino, now if early else self.names)
 
-    def _restore(self, left: Path, number: int, names: dict[int, Names]) -> None:
-        left.mkdir()
-        for name, inside, is_folder in names.get(number, []):
+    def _restore(self, remains: Path, number: int, names: dict[int, Names]) -> None:
+        remains.mkdir()
+        for name, inode, is_folder in names.get(number, []):
             if is_folder:
-                self._restore(left / name, inside, names)
+                self._restore(remains / name, inode, names)
             else:
-                (left / name).write_bytes(self.contents.get(inside, b""))
+                (remains / name).write_bytes(self.contents.get(inode, b""))
 
 
 def listed(folder: Path | int) -> Names:
@@ -164,9 +164,9 @@ def test_power_loss_costs_the_last_chunk(
     committed, syncs, recorded = [0, 0], 0, list[CaptureFile]()
 
     def lose() -> None:
-        left = tmp_path / f"left-{syncs}"
-        disk.power_loss(left, early=early)
-        opened = store.open_dataset(left / "a.zarr")
+        remains = tmp_path / f"left-{syncs}"
+        disk.power_loss(remains, early=early)
+        opened = store.open_dataset(remains / "a.zarr")
         assert all(np.greater_equal(check_written(opened), committed))
         assert opened.sizes["log"] == opened.attrs["log_written"]
         np.testing.assert_array_equal(opened["log_value"], np.arange(opened.sizes["log"]))

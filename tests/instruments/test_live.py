@@ -47,8 +47,8 @@ def ffc(at: float = 0.0, shown: Frame | None = None, *, ffc: float, fpa: float =
 def status(*previews: Preview) -> live.Status:
     """Status of the band after the last of the previews."""
     watch = live.Watch()
-    for one in previews:
-        watch.note(one)
+    for item in previews:
+        watch.note(item)
     return watch.status()["9.5"]
 
 
@@ -72,21 +72,21 @@ class Recorder:
 
 def test_numbers_of_a_preview() -> None:
     """Totals are handed on, and the ramp's percentiles and ends are found."""
-    found = status(preview())
-    assert (found.frames, found.lost, found.refused, found.damaged) == (1, 2, 3, 4)
-    assert (found.lowest, found.highest, found.dead, found.saturated) == (5000, 5383, 0, 0)
+    result = status(preview())
+    assert (result.frames, result.lost, result.refused, result.damaged) == (1, 2, 3, 4)
+    assert (result.lowest, result.highest, result.dead, result.saturated) == (5000, 5383, 0, 0)
     expected = np.percentile(RAMP[::4, ::4], (1.0, 99.0))
-    np.testing.assert_allclose(found.limits, expected, rtol=0, atol=1e-9)
-    assert math.isnan(found.frame_rate)
+    np.testing.assert_allclose(result.limits, expected, rtol=0, atol=1e-9)
+    assert math.isnan(result.frame_rate)
 
 
 def test_frame_rate_is_that_of_the_last_seconds() -> None:
     """The frame rate is over the last seconds of arrival times, and 0 without a frame in them."""
     running = [preview(at) for at in np.arange(0.0, 10.1, 0.5)]
-    late = [replace(one, time=one.time + 0.4 * math.sin(one.time)) for one in running]
+    late = [replace(item, time=item.time + 0.4 * math.sin(item.time)) for item in running]
     stopped = [replace(running[-1], time=at) for at in (11.0, 12.0, 13.0)]
-    for seen in (running, late, running + stopped[:2]):
-        np.testing.assert_allclose(status(*seen).frame_rate, 60.0, rtol=0, atol=1e-9)
+    for sample in (running, late, running + stopped[:2]):
+        np.testing.assert_allclose(status(*sample).frame_rate, 60.0, rtol=0, atol=1e-9)
     slower = replace(running[-1].frames["9.5"], host_time=1012.0)
     half = replace(running[-1], time=12.0, frames={"9.5": slower})
     np.testing.assert_allclose(status(*running, half).frame_rate, 20.0, rtol=0, atol=1e-9)
@@ -97,12 +97,12 @@ def test_frame_rate_is_that_of_the_last_seconds() -> None:
 def test_another_recording_begins_anew() -> None:
     """A time that goes back, fewer frames or other bands are another recording."""
     watch = live.Watch()
-    first, other = preview(5.0), {"11": dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)}
+    first, reset = preview(5.0), {"11": dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)}
     assert watch.status() == {}
-    assert [watch.note(one) for one in (first, preview(6.0), preview(0.1))] == [True, False, True]
+    assert [watch.note(item) for item in (first, preview(6.0), preview(0.1))] == [True, False, True]
     assert math.isnan(watch.status()["9.5"].frame_rate)
     assert watch.note(replace(preview(0.0), time=7.0))
-    assert watch.note(Preview(8.0, {}, other, {}))
+    assert watch.note(Preview(8.0, {}, reset, {}))
     assert watch.status()["11"].warning == "no frame has come"
 
 
@@ -111,7 +111,7 @@ STATES = ("none performed", "imminent", "in progress", "complete")
 
 
 @pytest.mark.parametrize(
-    ("seen", "state"),
+    ("sample", "state"),
     [
         *((ffc(ffc=float(number)), name) for number, name in enumerate(STATES)),
         (ffc(ffc=math.nan), "no answer"),
@@ -122,30 +122,30 @@ STATES = ("none performed", "imminent", "in progress", "complete")
         (preview(), "unknown"),
     ],
 )
-def test_state_of_the_correction(seen: Preview, state: str) -> None:
+def test_state_of_the_correction(sample: Preview, state: str) -> None:
     """Known states have a name, unknown ones a number, failed readings "no answer"."""
-    assert status(seen).ffc == state
-    assert ("shutter closed: FFC" in status(seen).warning) is (state == "in progress")
+    assert status(sample).ffc == state
+    assert ("shutter closed: FFC" in status(sample).warning) is (state == "in progress")
 
 
 def test_time_since_the_last_correction() -> None:
     """The time counts from the last correction in the readings or in the telemetry."""
-    asked = (ffc(1.0, ffc=3.0), ffc(2.0, ffc=2.0), ffc(5.5, ffc=3.0))
-    assert math.isnan(status(asked[0]).ffc_age)
-    assert status(*asked).ffc_age == 3.5
-    told = [
+    replies = (ffc(1.0, ffc=3.0), ffc(2.0, ffc=2.0), ffc(5.5, ffc=3.0))
+    assert math.isnan(status(replies[0]).ffc_age)
+    assert status(*replies).ffc_age == 3.5
+    report = [
         preview(at, frame(metadata=Metadata(last_ffc_frame=number)))
         for at, number in ((1.0, 10), (2.0, 10), (3.0, 130), (7.0, 130))
     ]
-    assert math.isnan(status(*told[:2]).ffc_age)
-    assert status(*told).ffc_age == 4.0
+    assert math.isnan(status(*report[:2]).ffc_age)
+    assert status(*report).ffc_age == 4.0
 
 
 def test_camera_temperature() -> None:
     """The reading counts, without an answer the telemetry, but not that of a damaged frame."""
-    told = frame(metadata=Metadata(fpa_temperature=311.2))
-    assert status(ffc(shown=told, ffc=3.0, fpa=308.15)).fpa_temperature == 308.15
-    silent = status(ffc(shown=told, ffc=3.0, fpa=math.nan))
+    report = frame(metadata=Metadata(fpa_temperature=311.2))
+    assert status(ffc(shown=report, ffc=3.0, fpa=308.15)).fpa_temperature == 308.15
+    silent = status(ffc(shown=report, ffc=3.0, fpa=math.nan))
     np.testing.assert_allclose(silent.fpa_temperature, 311.2, rtol=0, atol=1e-9)
     damaged = frame(flags=FrameFlag.WRONG_SIZE)
     assert math.isnan(status(preview(shown=damaged)).fpa_temperature)
@@ -266,8 +266,8 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
         separation(shown)  # the same frames once more are left out
         assert stream.is_ready or "not known yet" in texts(view)
         closed = {
-            band: replace(one, host_time=100.01 + at, flags=FrameFlag.SHUTTER_CLOSED)
-            for band, one in frames.items()
+            band: replace(item, host_time=100.01 + at, flags=FrameFlag.SHUTTER_CLOSED)
+            for band, item in frames.items()
         }
         separation(replace(shown, frames=closed))
     assert stream.lost_frames == 0
@@ -289,8 +289,8 @@ def test_recording_without_a_notebook(tmp_path: Path) -> None:
     with rig(from_yaml(scene_text().replace("0.15", "1.5"))) as devices:
         devices.prepare()
         protocols.record_scene(devices, tmp_path / "a.zarr", limits=QUICK, preview=view)
-    for band, seen in view.status.items():
-        assert (seen.lowest, seen.highest) == (LEVELS[band] + 2962, LEVELS[band] + 2963)
-        np.testing.assert_allclose(seen.fpa_temperature, 308.15, rtol=0, atol=0.06)
-        assert (seen.ffc, seen.lost) == ("complete", 0)
+    for band, sample in view.status.items():
+        assert (sample.lowest, sample.highest) == (LEVELS[band] + 2962, LEVELS[band] + 2963)
+        np.testing.assert_allclose(sample.fpa_temperature, 308.15, rtol=0, atol=0.06)
+        assert (sample.ffc, sample.lost) == ("complete", 0)
     assert texts(view)[-1].startswith(f"blackbody 23.0 {DEGREE}, plate 56.9 {DEGREE}")

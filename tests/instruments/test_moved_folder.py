@@ -151,19 +151,19 @@ def test_without_a_part_it_ends(
 
 
 @pytest.mark.parametrize(
-    "part", ["counts/c/0/0", "counts/c", "exposure_time/c/0/1", "log_time/c/0"]
+    "piece", ["counts/c/0/0", "counts/c", "exposure_time/c/0/1", "log_time/c/0"]
 )
-def test_without_a_chunk_it_is_not_complete(tmp_path: Path, part: str) -> None:
+def test_without_a_chunk_it_is_not_complete(tmp_path: Path, piece: str) -> None:
     """Chunks that are deleted while it is written are missed by name, and never filled up."""
-    gone = (path := tmp_path / "a.zarr") / part
+    gone = (path := tmp_path / "a.zarr") / piece
 
     def lose(number: int) -> None:
         if number == 8:
             shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
 
-    with pytest.raises(FileNotFoundError, match=rf"{part}.*'"):
+    with pytest.raises(FileNotFoundError, match=rf"{piece}.*'"):
         write(path, lose)
-    with pytest.raises(ValueError, match=f"Missing file '{part}"):
+    with pytest.raises(ValueError, match=f"Missing file '{piece}"):
         store.open_dataset(path)
 
 
@@ -181,9 +181,9 @@ def test_a_recorder_follows_its_folder(tmp_path: Path, monkeypatch: pytest.Monke
     assert (summary.path, summary.ended) == (tmp_path / "c.zarr", "duration")
     opened = store.open_dataset(summary.path)
     for band, place in zip(BANDS, opened["sequence"].values, strict=True):
-        found = place[: summary.totals[band]["frames"]]
-        np.testing.assert_array_equal(np.diff(found), 1)
-        assert found.size > 30
+        numbers = place[: summary.totals[band]["frames"]]
+        np.testing.assert_array_equal(np.diff(numbers), 1)
+        assert numbers.size > 30
     assert list(tmp_path.glob("**/*.zarr")) == [summary.path]
 
 

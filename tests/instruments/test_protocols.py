@@ -25,8 +25,8 @@ from rig_session import (
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
 
@@ -95,17 +95,17 @@ def test_sweep(recorded: tuple[Path, list[Summary]]) -> None:
     identities = store.open_dataset(folder / names[3]).attrs["identities"]
     assert set(identities) == {"8-14", "11", "filter_wheel", "thermocouples"}
     assert identities["11"]["part_number"] == "EMULATED-BOSON-640"
-    found = {source: value for _, kind, source, value in notes(steps[3].path) if kind == "reading"}
-    assert (found["filter_wheel"], found["ffc 11"]) == (3, 3)
-    assert found["blackbody"] == pytest.approx(290.0, abs=1e-4)
+    result = {source: value for _, kind, source, value in notes(steps[3].path) if kind == "reading"}
+    assert (result["filter_wheel"], result["ffc 11"]) == (3, 3)
+    assert result["blackbody"] == pytest.approx(290.0, abs=1e-4)
 
 
 def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Summary]]) -> None:
     """Counts are of region and good frames, corrected, and temperatures are those read."""
     region = {"plate": (slice(0, 2), slice(0, 10))}
     series = recording.bench_series(recorded[0], "plate", region)["plate"]
-    seen = np.array([3000.5, 2900.5]) + np.array(list(LEVELS.values()))[:, None]
-    np.testing.assert_allclose(series["counts"], seen, rtol=0, atol=1e-9)  # [count]
+    means = np.array([3000.5, 2900.5]) + np.array(list(LEVELS.values()))[:, None]
+    np.testing.assert_allclose(series["counts"], means, rtol=0, atol=1e-9)  # [count]
     np.testing.assert_allclose(series["object_temperature"], [330.0] * 2, rtol=0, atol=1e-4)
     np.testing.assert_allclose(series["background_temperature"], [300.0, 290.0], rtol=0, atol=1e-4)
     coords = {"band": list(LEVELS)}
@@ -113,7 +113,7 @@ def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Summary]
     bad = (xr.DataArray(np.arange(SHAPE[1]) % 2, dims="x") == ones).transpose("band", "y", "x")
     correction = xr.Dataset({"gain": 0.5 * ones, "offset": 7 * ones, "bad": bad})
     corrected = recording.bench_series(recorded[0], "plate", region, correction)["plate"]
-    np.testing.assert_allclose(corrected["counts"], 0.5 * (seen - 0.5) + 7, rtol=0, atol=1e-2)
+    np.testing.assert_allclose(corrected["counts"], 0.5 * (means - 0.5) + 7, rtol=0, atol=1e-2)
     with pytest.raises(ValueError, match="No frame or no pixel of band '8-14'"):
         recording.bench_series(recorded[0], "plate", {"plate": (slice(9, 9), slice(0, 2))})
     with pytest.raises(ValueError, match="No reading of 'wall' in the recording"):
@@ -148,19 +148,19 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"Incomplete recording '.*plate_01_9\.5\.zarr'"):
             swept(devices, tmp_path, log)
         cut.rename(tmp_path / "cut.zarr")
-        was = {path: path.stat().st_mtime_ns for path in tmp_path.glob("plate_00_*/zarr.json")}
-        assert len(was) == 2
+        times = {path: path.stat().st_mtime_ns for path in tmp_path.glob("plate_00_*/zarr.json")}
+        assert len(times) == 2
         log.clear()
         steps = swept(devices, tmp_path, log)
         assert log == [290.0]
-        assert {path: path.stat().st_mtime_ns for path in was} == was
+        assert {path: path.stat().st_mtime_ns for path in times} == times
         assert (len(steps), steps[0].ended) == (4, "duration")
         assert steps[0].totals["8-14"]["frames"] > 8
         assert swept(devices, tmp_path, log) == steps
         # Offsets are corrected before the sweep, and at each temperature that is recorded.
         assert {camera.ffc_count for camera in world_of(devices).cameras.values()} == {4}
-    other = from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
-    with rig(other) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
+    new_plan = from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
+    with rig(new_plan) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
         swept(devices, tmp_path)
 
 
@@ -230,11 +230,11 @@ def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
     assert {"plate", "blackbody", "fpa 9.5"} <= {note[2] for note in notes(summary.path)}
 
 
-def rest(read: Callable[[float], float]) -> tuple[float, float]:
+def wait_for_rest(read: Callable[[float], float]) -> tuple[float, float]:
     """Mean that is found where 300 K are waited for, by a reading of the time, and the time."""
     clock = EmulatedClock()
-    found = protocols.wait_stable(from_yaml(TEXT), 300.0, lambda: read(clock()), clock=clock)
-    return found, clock()
+    result = protocols.wait_stable(from_yaml(TEXT), 300.0, lambda: read(clock()), clock=clock)
+    return result, clock()
 
 
 @pytest.mark.parametrize(
@@ -254,8 +254,8 @@ def rest(read: Callable[[float], float]) -> tuple[float, float]:
 )
 def test_rest_is_waited_for(read: Callable[[float], float], mean: float, time: float) -> None:
     """The wait ends with the mean of a stable window, and no later."""
-    found, ended = rest(read)
-    assert found == pytest.approx(mean, abs=1e-9)
+    result, ended = wait_for_rest(read)
+    assert result == pytest.approx(mean, abs=1e-9)
     assert ended == time
 
 
@@ -263,7 +263,7 @@ def test_rest_is_waited_for(read: Callable[[float], float], mean: float, time: f
 def test_no_rest_is_an_error(read: Callable[[float], float]) -> None:
     """A temperature that settles elsewhere or oscillates raises an error."""
     with pytest.raises(TimeoutError, match=r"No rest at 300\.0 K within 20 s"):
-        rest(read)
+        wait_for_rest(read)
 
 
 def test_a_short_recording_is_named(tmp_path: Path) -> None:
@@ -276,6 +276,6 @@ def test_a_short_recording_is_named(tmp_path: Path) -> None:
             path = tmp_path / name / f"{name}.zarr"
             protocols.record_scene(short, path, limits=QUICK)
     recording.require_whole(tmp_path / "whole")
-    told = r"short': 'short', band '9\.5': \d+ good frames of 50 promised\. Must have 95%"
-    with pytest.raises(ValueError, match=told):
+    message = r"short': 'short', band '9\.5': \d+ good frames of 50 promised\. Must have 95%"
+    with pytest.raises(ValueError, match=message):
         recording.require_whole(tmp_path / "short")

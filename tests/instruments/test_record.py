@@ -49,18 +49,18 @@ def bench(
 def test_recording_says_what_made_it(tmp_path: Path) -> None:
     """Identities, further ones beside them, the session and the versions are in the store."""
     camera: dict[str, str | bool] = {"software_revision": "1.2.3", "is_simulated": True}
-    known: dict[str, dict[str, str | bool]] = {"9.5": camera, "wheel": {"model": "a"}}
+    identities: dict[str, dict[str, str | bool]] = {"9.5": camera, "wheel": {"model": "a"}}
     path = tmp_path / "a.zarr"
-    record(session(), bench(rows=12), path, identities=known, limits=SMALL)
+    record(session(), bench(rows=12), path, identities=identities, limits=SMALL)
     opened = open_capture(path)
     assert opened.attrs["is_simulated"] is True
     assert opened.attrs["provenance"]["parameters"]["name"] == "test"
     assert (opened.attrs["complete"], opened.attrs["ended"]) == (True, "duration")
     np.testing.assert_allclose(opened["fpa_temperature"][0, 0], 308.2, rtol=0, atol=0.06)
-    found = opened.attrs["identities"]
+    entries = opened.attrs["identities"]
     source = {"device": "sim://boson/9.5", "model": "emulated Boson", "serial_number": "101"}
-    assert found["9.5"] == {**source, **camera}
-    assert (set(found), found["wheel"]) == ({*BANDS, "wheel"}, {"model": "a"})
+    assert entries["9.5"] == {**source, **camera}
+    assert (set(entries), entries["wheel"]) == ({*BANDS, "wheel"}, {"model": "a"})
 
 
 def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
@@ -91,9 +91,9 @@ def test_duration_begins_with_the_first_frame(
         return usage(folder)
 
     monkeypatch.setattr(shutil, "disk_usage", slowly)
-    one = Session("test", True, "scene", 2.0, {"8-14": Camera("v4l2:///dev/video0")}, rate, SHAPE)
+    plan = Session("test", True, "scene", 2.0, {"8-14": Camera("v4l2:///dev/video0")}, rate, SHAPE)
     limits = Limits(chunk=200, reserve=0, queue=200)
-    summary = record(one, {"8-14": source}, tmp_path / "a.zarr", limits=limits)
+    summary = record(plan, {"8-14": source}, tmp_path / "a.zarr", limits=limits)
     opened = open_capture(tmp_path / "a.zarr")
     times = opened["exposure_time"][0]
     assert abs(summary.totals["8-14"]["frames"] - 2.0 * rate) <= 1
@@ -145,9 +145,9 @@ def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
 
     readings = {"plate": Reading(read)}
     record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=SMALL)
-    found = [note[1:] for note in notes(tmp_path / "a.zarr")]
-    assert found[:2] == [("reading", "plate", 300.0), ("reading", "plate", 301.0)]
-    assert {kind for kind, _, _ in found[2:]} == {"reading_failed"}
+    entries = [note[1:] for note in notes(tmp_path / "a.zarr")]
+    assert entries[:2] == [("reading", "plate", 300.0), ("reading", "plate", 301.0)]
+    assert {kind for kind, _, _ in entries[2:]} == {"reading_failed"}
 
 
 def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:

@@ -49,14 +49,14 @@ def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run(tmp_path, ONE) == 0
     said = capsys.readouterr().out
     assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
-    for part in (
+    for phrase in (
         "filter_wheel: model BSC201",
         "Setting the emulated blackbody to 16.85 degC.",
         "11: ",
         "FPA 35.0 \N{DEGREE SIGN}C, FFC complete",
         f"{folder / 'plate_00_11.zarr'}: duration",
     ):
-        assert part in said
+        assert phrase in said
     movies = recording.open_sweep(folder, "plate", frames=8)
     levels = [LEVELS["8-14"] + 2900, LEVELS["11"] + 2900]
     np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], levels)
@@ -130,11 +130,11 @@ def test_interrupted(
 
 def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
-    asked, devices = list[str](), Devices(from_yaml(TEXT), {})
-    monkeypatch.setattr("builtins.input", asked.append)
+    questions, devices = list[str](), Devices(from_yaml(TEXT), {})
+    monkeypatch.setattr("builtins.input", questions.append)
     command._set_blackbody(devices, 300.0)
-    told = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
-    assert asked == [told]
+    text = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
+    assert questions == [text]
     for error in (EOFError, NotImplementedError):
         monkeypatch.setattr("builtins.input", Mock(side_effect=error))
         with pytest.raises(

@@ -15,7 +15,7 @@ from test_signals import LIMIT, written
 
 from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag
-from dbthermal.instruments.emulated.clock import EmulatedClock
+from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, notes, open_capture, record
 
@@ -47,9 +47,9 @@ def slow_disk(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
     """Writing a frame takes 0.03 s, three times as long as to take one."""
     frame = CaptureFile.frame
 
-    def slow(own: CaptureFile, band: str, shot: Frame, refused: int = 0) -> FrameFlag:
+    def slow(file: CaptureFile, band: str, shot: Frame, refused: int = 0) -> FrameFlag:
         world.clock.sleep(0.03)
-        return frame(own, band, shot, refused)
+        return frame(file, band, shot, refused)
 
     monkeypatch.setattr(CaptureFile, "frame", slow)
 
@@ -75,16 +75,16 @@ def test_slow_disk_refuses_frames_and_counts_them(
 
 def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
     """While something is drawn, frames are written."""
-    path, seen, sources = tmp_path / "a.zarr", list[int](), bench()
+    path, progress, sources = tmp_path / "a.zarr", list[int](), bench()
     clock = sources["9.5"].clock
 
     def draw(_: Preview) -> None:
-        while not (chunks := written(path) // CHUNK if not seen else 1) and clock() < 0.9:
+        while not (chunks := written(path) // CHUNK if not progress else 1) and clock() < 0.9:
             clock.sleep(0.1)
-        seen.append(chunks)
+        progress.append(chunks)
 
     record(session(1.0), sources, path, limits=SMALL, preview=draw)
-    assert seen[0] >= 1
+    assert progress[0] >= 1
 
 
 @pytest.mark.parametrize("drawing", [True, False])
@@ -110,8 +110,8 @@ def test_keyboard_interrupt_keeps_everything(
     opened = store.open_dataset(path)
     assert (opened.attrs["closed"], opened.attrs["ended"]) == (True, "interrupted")
     assert written(path) == len(came)
-    found = opened["sequence"].values
-    assert sorted(found[found >= 0]) == sorted(came)
+    numbers = opened["sequence"].values
+    assert sorted(numbers[numbers >= 0]) == sorted(came)
 
 
 def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
@@ -147,20 +147,20 @@ def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(FaultyCamera, "read", stampless)
     summary = record(session(2.2), bench(), tmp_path / "a.zarr", limits=SMALL)
     frames = slice(0, summary.totals["9.5"]["frames"])
-    one = store.open_dataset(tmp_path / "a.zarr").sel(band="9.5").isel(time=frames)
-    assert one.sizes["time"] > 5
-    assert (one["frame_flags"] & int(FrameFlag.TIME_WRONG)).all()
-    assert np.isnan(one["exposure_time"]).all()
+    band_data = store.open_dataset(tmp_path / "a.zarr").sel(band="9.5").isel(time=frames)
+    assert band_data.sizes["time"] > 5
+    assert (band_data["frame_flags"] & int(FrameFlag.TIME_WRONG)).all()
+    assert np.isnan(band_data["exposure_time"]).all()
 
 
 def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted again while it waits for the writer, it returns; the writer ends its work."""
     path, free, close = tmp_path / "a.zarr", threading.Event(), CaptureFile.close
 
-    def interrupted_close(own: CaptureFile, *, complete: bool, ended: str) -> None:
+    def interrupted_close(file: CaptureFile, *, complete: bool, ended: str) -> None:
         interrupt()
         assert free.wait(LIMIT)
-        close(own, complete=complete, ended=ended)
+        close(file, complete=complete, ended=ended)
 
     monkeypatch.setattr(CaptureFile, "close", interrupted_close)
     with pytest.raises(KeyboardInterrupt):

@@ -35,8 +35,8 @@ def test_session_is_read(tmp_path: Path) -> None:
     assert real.blackbody is not None
     assert real.blackbody.temperatures == (300.0, 290.0, 310.0)
     assert (session.filtered, session.swept) == ("9.5", ("9.5", "11"))
-    alone = from_yaml(replaced((SWEEP, "")))
-    assert (alone.filtered, alone.swept) == ("9.5", ("9.5",))
+    plain = from_yaml(replaced((SWEEP, "")))
+    assert (plain.filtered, plain.swept) == ("9.5", ("9.5",))
     none = from_yaml(replaced((SWEEP, ""), (FILTERS, "")))
     assert (none.filtered, none.swept) == (None, ())
 
@@ -114,13 +114,13 @@ def test_two_of_a_thing() -> None:
 
 def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
     """Shared keys come from the rig's file; a key in both files raises a ValueError."""
-    own, shared = ["name: plate", "rig: rig.yaml"], list[str]()
+    lines, shared = ["name: plate", "rig: rig.yaml"], list[str]()
     for line in TEXT.splitlines():
         of_session = line.startswith(("simulated", "protocol", "duration", "blackbody", "sweep"))
-        (own if of_session else shared).append(line)
+        (lines if of_session else shared).append(line)
     shared.remove("name: plate")
     path, rig = tmp_path / "a.yaml", tmp_path / "rig.yaml"
-    path.write_text("\n".join(own), encoding="utf-8")
+    path.write_text("\n".join(lines), encoding="utf-8")
     rig.write_text("\n".join(shared), encoding="utf-8")
     assert Session.load(path) == from_yaml(TEXT)
     wrong = [line.replace("telemetry_rows: 2", "telemetry_rows: 1") for line in shared]
@@ -181,8 +181,8 @@ def sessions() -> list[dict[Any, Any]]:
     rig = yaml.safe_load(paths.session("rig").read_text(encoding="utf-8"))
     contents = [yaml.safe_load(TEXT)]
     for name in ("scene", "response", "emissivity_bench", "y16"):
-        own = yaml.safe_load(paths.session(name).read_text(encoding="utf-8"))
-        contents.append({**rig, **own} if own.pop("rig", None) else own)
+        lines = yaml.safe_load(paths.session(name).read_text(encoding="utf-8"))
+        contents.append({**rig, **lines} if lines.pop("rig", None) else lines)
     return contents
 
 
@@ -206,19 +206,19 @@ def mutant(rng: random.Random, original: dict[Any, Any]) -> dict[Any, Any]:
     """Content of a session of which one value is deleted, added or changed."""
     content = deepcopy(original)
     place = rng.choice([*places(content)])
-    inside, key = value_at(content, place[:-1]), place[-1]
+    parent, key = value_at(content, place[:-1]), place[-1]
     deed = rng.choice(["delete", "value", "value", "other", "rename", "add"])
     if deed == "delete":
-        del inside[key]
+        del parent[key]
     elif deed == "value":
-        inside[key] = rng.choice(VALUES)
+        parent[key] = rng.choice(VALUES)
     elif deed == "other":
-        inside[key] = deepcopy(value_at(original, rng.choice([*places(original)])))
-    elif isinstance(inside, list):
-        inside.append(rng.choice(VALUES))
+        parent[key] = deepcopy(value_at(original, rng.choice([*places(original)])))
+    elif isinstance(parent, list):
+        parent.append(rng.choice(VALUES))
     else:
-        value = inside.pop(key) if deed == "rename" else rng.choice(VALUES)
-        inside[rng.choice(NAMES)] = value
+        value = parent.pop(key) if deed == "rename" else rng.choice(VALUES)
+        parent[rng.choice(NAMES)] = value
     return content
 
 

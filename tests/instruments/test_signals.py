@@ -20,8 +20,7 @@ from test_capture_file import CaptureFile
 from test_record import SMALL, bench, session
 
 from dbthermal import store
-from dbthermal.instruments.recording import Preview, record
-from dbthermal.instruments.signals import SignalExit, raised_signals
+from dbthermal.instruments.recording import Preview, SignalExit, raised_signals, record
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 SCENE = scene_text().replace('3: "11"', "3: 10.6")
@@ -107,15 +106,15 @@ def test_a_script_ends_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     """Called by a script, a recording is closed, whatever comes meanwhile, and the script ends."""
-    before, sources, close = [signal.getsignal(one) for one in ENDING], bench(), CaptureFile.close
+    before, sources, close = [*map(signal.getsignal, ENDING)], bench(), CaptureFile.close
     main = threading.main_thread().ident
     assert main is not None
 
-    def hit(own: CaptureFile, *, complete: bool, ended: str) -> None:
+    def hit(file: CaptureFile, *, complete: bool, ended: str) -> None:
         for another in (*ENDING, *ENDING):
             signal.pthread_kill(main, another)
             sources["9.5"].clock.sleep(1.0)  # which lets the main thread look
-        close(own, complete=complete, ended=ended)
+        close(file, complete=complete, ended=ended)
 
     def end(_: Preview) -> None:
         signal.raise_signal(number)
@@ -124,7 +123,7 @@ def test_a_script_ends_whole(
     with pytest.raises(SignalExit) as raised:
         record(session(60.0), sources, tmp_path / "a.zarr", limits=SMALL, preview=end)
     assert raised.value.code == 128 + number
-    assert [signal.getsignal(one) for one in ENDING] == before
+    assert [*map(signal.getsignal, ENDING)] == before
     attrs = store.open_dataset(tmp_path / "a.zarr").attrs
     assert (attrs["closed"], attrs["ended"]) == (True, number.name)
 
@@ -134,16 +133,16 @@ def test_what_the_program_handles_is_left_alone() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with raised_signals():
         signal.raise_signal(signal.SIGHUP)
-    found = []
+    results = []
 
     def look() -> None:
         with raised_signals():
-            found.append(signal.getsignal(signal.SIGTERM))
+            results.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=look)
     thread.start()
     thread.join()
-    assert found == [signal.SIG_DFL]
+    assert results == [signal.SIG_DFL]
 
 
 @pytest.mark.parametrize("every", [250, pytest.param(40, marks=pytest.mark.slow)])
@@ -172,4 +171,4 @@ def test_signals_at_any_moment(tmp_path: Path, every: int) -> None:
         assert opened.attrs.get("ended", ended) in {ended, "duration"}
         for place, count in enumerate(frames):
             np.testing.assert_array_equal(np.diff(opened["sequence"][place, :count]), 1)
-    assert all(".zarr-" in left.name for left in tmp_path.glob(".*"))  # hidden, and of no store
+    assert all(".zarr-" in file.name for file in tmp_path.glob(".*"))  # hidden, and of no store

@@ -9,7 +9,7 @@ import xarray as xr
 from test_v4l2 import BYTES, GOOD, Driver
 
 from dbthermal import correction
-from dbthermal.instruments import v4l2, y16
+from dbthermal.instruments import v4l2
 from dbthermal.instruments.camera import FrameFlag, Stream
 from dbthermal.instruments.clock import Task
 from dbthermal.instruments.devices import open_devices
@@ -31,12 +31,12 @@ def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch
     """All rows of a frame are image, and the identity comes from the kernel alone."""
     kernel = Driver(answers=[(BYTES, GOOD, 1000, 7)]).kernel()
     monkeypatch.setattr(v4l2, "Kernel", lambda: kernel)
-    with y16.KIND.open_frames("v4l2:///dev/video0", Stream((6, 8))) as source:
+    with v4l2.KIND.open_frames("v4l2:///dev/video0", Stream((6, 8))) as source:
         frame = source.read()
     assert (frame.counts.shape, frame.telemetry, frame.metadata) == ((6, 8), None, None)
     assert (frame.sequence, {*source.identity}) == (7, {"device", "model", "bus", "driver"})
     with pytest.raises(ValueError, match=r"Invalid address 'serial:///dev/ttyACM0'\. Must"):
-        y16.KIND.open_frames("serial:///dev/ttyACM0", Stream())
+        v4l2.KIND.open_frames("serial:///dev/ttyACM0", Stream())
 
 
 def test_it_has_neither_telemetry_nor_command_port() -> None:

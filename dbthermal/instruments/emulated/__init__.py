@@ -1,7 +1,7 @@
-"""Emulated devices: the other end of the real drivers' lines, for ``sim://`` addresses.
+"""Emulated devices: what is at the other end of the drivers' lines, for ``sim://`` addresses.
 
-Begin with `world`, the one bench that all of them share: `boson`, `apt` and `tc08` answer as the
-devices do, byte for byte where the protocol is public, over a `line`; `camera` gives the
-frames, of pictures that a program hands it, or of a blackbody. All say that they are
-emulated. They were built from public descriptions; real devices may do more than these say.
+Begin with `world`, the bench that all of them share. `camera` and `apt` answer as the devices do,
+byte for byte where the protocol is public, and `tc08` as the vendor's library does; `camera` gives
+frames, too. All say that they are emulated. They were built from public descriptions; real devices
+may do more than these say.
 """

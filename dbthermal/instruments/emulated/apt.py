@@ -4,8 +4,7 @@ It answers below the real driver, byte for byte, with the quirks that users repo
 speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly,
 reports of moves at any time, another model than on the label. Its counter of commanded steps agrees
 with the wheel only once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
-AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in
-`dbthermal.instruments._apt`.
+AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
 """
 
 import math
@@ -15,8 +14,7 @@ from typing import Final, NamedTuple
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.emulated.line import Line
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import Device, Line, World
 
 SERIAL_NUMBER: Final = 40_000_000
 NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
@@ -74,12 +72,11 @@ class Drive:
         return self.acceleration * ramp**2 / 2 + self.velocity * (time - ramp)
 
 
-class EmulatedApt:
-    """A controller and a wheel, on the world's clock; a `Device` of `emulated.line`.
+class EmulatedApt(Device):
+    """A controller that turns the world's wheel, whose slot 1 is `slot_offset` [deg] from home.
 
-    It turns the world's wheel, whose slot 1 is `slot_offset` [deg] from the home switch. `position`
-    counts the commanded steps, `wheel` is the place of the wheel from its home switch [count];
-    `plugged` is set to False to pull out the cable.
+    `position` counts the commanded steps, `wheel` is the place of the wheel from its home switch
+    [count].
     """
 
     def __init__(
@@ -92,7 +89,7 @@ class EmulatedApt:
     ) -> None:
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
-        self.plugged = True
+        super().__init__()
         self.info = apt.Info(serial_number, model, "1.0.0", NOTES)
         self.model = MODELS[model]
         self.unit = apt.RACK if self.model.is_rack else apt.UNIT
@@ -106,7 +103,6 @@ class EmulatedApt:
         self._speeds = apt.VelocityParameters(1, 0, 0, 0)
         self._home = apt.HomeParameters(1, 2, 1, 0, 0)
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
-        self._replies: list[bytes] = []
 
     def receive(self, data: bytes) -> None:
         """Take in bytes from the driver."""
@@ -116,15 +112,14 @@ class EmulatedApt:
                 self.obey(message)
 
     def poll(self) -> list[bytes]:
-        """Messages that are due to be sent now, each in a write of its own."""
+        """Messages that are due to be sent now."""
         self._advance()
-        replies, self._replies = self._replies, []
-        return replies
+        return super().poll()
 
     def next_due(self) -> float:
-        """Time until something may be due [s]; infinite if nothing will unless bytes come."""
+        """Time until a message or the end of a motion is due [s]."""
         if self._replies or self._drive is None:
-            return 0.0 if self._replies else math.inf
+            return super().next_due()
         return max(0.0, self._drive.start + self._drive.duration - self.world.clock())
 
     def obey(self, message: apt.Message) -> None:

@@ -1,32 +1,41 @@
-"""Emulated cameras: frames of a `World`, of pictures that are handed in, for each band one.
+"""Emulated cameras of a `World`: their frames, and the command port of a Boson.
 
-A picture is a function of the scene's time that gives counts, noise and response included. The
-camera adds a frame rate, a clock, buffers that overflow if no program reads, a shutter that freezes
-the image, and telemetry. It never flags its shutter: as with a real camera, that follows from
-telemetry, serial line and frozen image, see `camera.next_shutter`.
+A picture is a function of the scene's time that gives the counts of a band, noise and response
+included. The camera adds a frame rate, a clock, buffers that overflow if no program reads, a
+shutter that freezes the image, and telemetry. It never flags its shutter: as with a real camera,
+that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
+
+The command port answers every command of `boson` after the public descriptions, refuses as a camera
+would, and runs the shutter on command only. The duration of a correction and the settings at
+power-on, which the descriptions leave open, are choices made here.
 """
 
 import math
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from scipy.constants import zero_Celsius
 
 from dbthermal import response as responses
 from dbthermal import simulation
 from dbthermal.bands import FILTERS
-from dbthermal.instruments import telemetry
+from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments import boson, telemetry
 from dbthermal.instruments.camera import (
     FRAME_TIMEOUT,
     GOOD,
     Counts,
+    FfcMode,
+    FfcStatus,
     Frame,
     NoFrameError,
     SourceLostError,
 )
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, Device, Line, World
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 
@@ -34,6 +43,7 @@ Picture = Callable[[float], Counts]
 NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
 BUFFERS: Final = 32  # frames that are held while no program reads, as by the V4L2 driver
 CLOSED: Final = 10_000  # of every pixel where no filter is in the beam [count]
+FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 
 MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
@@ -41,12 +51,17 @@ MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
 """Kind of camera, as in ``sim://boson/wide``, to its model, and the time between the flat-field
 corrections that it starts by itself [s]."""
 
+# Statuses of `boson.STATUSES` with which it refuses.
+_STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
+# Number of the states of each setting, which are numbered from 0.
+_CHOICES = {setting.set_command: len(setting.kind.__members__) for setting in boson.SETTINGS}
+
 
 @dataclass
 class EmulatedCamera(Closing):
     """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
-    Through a filter of its own, or, where `band` is None, the one in the beam of the wheel.
+    It looks through the filter of its `band`, or, where that is None, through the wheel's.
     """
 
     world: World
@@ -153,14 +168,17 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
     """
+    # Bands with a filter that is known.
     names = dict.fromkeys((*session.bands, *session.filters.values()))
     bands = tuple(name for name in names if name in FILTERS)
     if not bands:
         return {}
+    # The cameras, with noise and a fixed pattern.
     rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
     detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
     response = rig.response()
 
+    # A picture of the blackbody in each band.
     def of_band(number: int, band: str) -> Picture:
         curve, pattern = responses.curve(response, band), detector.sel(band=band)
         noise = float(response["noise"].sel(band=band))
@@ -173,3 +191,92 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
         return picture
 
     return {band: of_band(number, band) for number, band in enumerate(bands)}
+
+
+class EmulatedBoson(Device):
+    """The command port of a camera of a world; KeyError if there is no camera of this name."""
+
+    def __init__(self, world: World, name: str) -> None:
+        super().__init__()
+        self.camera = world.camera(name)
+        # At power-on, by the identifier that sets them; not those of a real camera.
+        self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
+        self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
+        self._world = world
+        self._name = name
+        self._decoder = fslp.Decoder()
+
+    def is_plugged(self) -> bool:
+        """False once the camera was pulled out."""
+        return self.camera.plugged
+
+    def receive(self, data: bytes) -> None:
+        """Take in bytes; frames of channels that have no commands are ignored."""
+        for frame in self._decoder.feed(data):
+            if frame.channel == fslp.COMMAND_CHANNEL:
+                self.request(frame)
+
+    def request(self, frame: fslp.Frame) -> None:
+        """Take in one request, and answer at once."""
+        self._replies.append(self.reply(frame))
+
+    def reply(self, request: fslp.Frame) -> bytes:
+        """Bytes of the reply to a request."""
+        with self._world.lock:
+            if not self.camera.has_frames:
+                self.camera.frame_count = math.floor(self._world.time * FRAME_RATE)
+            status, data = self.answer(request)
+        return fslp.encode(request.sequence, request.command, data, status)
+
+    def answer(self, request: fslp.Frame) -> tuple[int, bytes]:
+        """Status and data of the reply to a request."""
+        command, data, readings = request.command, request.data, self._readings()
+        if request.status != fslp.REQUEST:
+            return _STATUS, b""
+        if command not in {boson.RUN_FFC, *self.settings, *readings}:
+            return _UNKNOWN, b""
+        size = 4 if command in self.settings else 0
+        if len(data) != size:
+            return (_FEW if len(data) < size else _MANY), b""
+        if command == boson.RUN_FFC:
+            self._world.start_ffc(self._name)
+        elif command in self.settings:
+            (value,) = struct.unpack(">i", data)
+            if value not in range(_CHOICES[command]):
+                return _RANGE, b""
+            self.settings[command] = value
+        return 0, readings.get(command, b"")
+
+    def _readings(self) -> dict[int, bytes]:
+        """Data of every reading and setting, by the identifier that reads it."""
+        # The state of the shutter.
+        camera, status = self.camera, FfcStatus.NONE_PERFORMED
+        if self._world.ffc_in_progress(self._name):
+            status = FfcStatus.IN_PROGRESS
+        elif camera.ffc_count:
+            status = FfcStatus.COMPLETE
+        # What each command reads.
+        values: dict[boson.Reading[Any], tuple[int | bytes, ...]] = {
+            boson.SERIAL_NUMBER: (camera.serial_number,),
+            boson.PART_NUMBER: (b"EMULATED-BOSON-640",),
+            boson.SENSOR_SERIAL_NUMBER: (camera.serial_number,),
+            boson.SOFTWARE_REVISION: (0, 0, 0),
+            boson.FPA_TEMPERATURE: (round(10 * (camera.fpa_temperature - zero_Celsius)),),
+            boson.FFC_IN_PROGRESS: (status == FfcStatus.IN_PROGRESS,),
+            boson.FFC_STATUS: (status,),
+            boson.LAST_FFC_FRAME: (camera.last_ffc_frame,),
+        }
+        for setting in boson.SETTINGS:
+            values[setting.reading] = (self.settings[setting.set_command],)
+        return {key.command: struct.pack(key.layout, *value) for key, value in values.items()}
+
+
+def start(name: str, world: World | None) -> Line:
+    """Line to the command port of a camera of a world; without a world, to that of a new camera.
+
+    KeyError if the world has no camera of this name.
+    """
+    if world is None:
+        world = World()
+        world.add_camera(name, SERIAL_NUMBERS)
+    return Line(EmulatedBoson(world, name), world.clock)

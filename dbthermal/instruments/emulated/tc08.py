@@ -10,7 +10,6 @@ from collections.abc import Callable, MutableSequence
 from typing import Any, Final
 
 from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated.clock import EmulatedClock
 from dbthermal.instruments.emulated.world import ROOM
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
@@ -25,18 +24,18 @@ class EmulatedTC08:
     """The library and one unit, with type-T thermocouples whatever letter they are set to.
 
     `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; a reading is
-    converted on its `clock`.
+    converted on its `clock`. As in the vendor's library, functions return 0 if they fail.
     """
 
     is_simulated: Final = True
 
-    def __init__(self, temperature: Callable[[int], float], clock: Clock | None = None) -> None:
-        self._temperature, self.clock = temperature, clock or EmulatedClock()
+    def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
+        self._temperature, self.clock = temperature, clock
         self._is_open, self._error = False, 0
         self._kinds: dict[int, str] = {}
 
     def usb_tc08_open_unit_async(self) -> int:
-        """Begin to open the unit: 1, or 0 if it fails."""
+        """Begin to open the unit."""
         return 1
 
     def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
@@ -46,7 +45,7 @@ class EmulatedTC08:
         return 1
 
     def usb_tc08_close_unit(self, handle: int) -> int:
-        """Close the unit: 1, or 0 if it fails."""
+        """Close the unit."""
         if not self._accepts(handle):
             return 0
         self._is_open, self._kinds = False, {}
@@ -57,7 +56,7 @@ class EmulatedTC08:
         return self._error if handle in {0, _HANDLE} else -1
 
     def usb_tc08_get_unit_info(self, handle: int, info: Numbers) -> int:
-        """Write the identity, which says that it is emulated: 1, or 0 if it fails."""
+        """Write the identity, which says that it is emulated."""
         if not self._accepts(handle):
             return 0
         if info[0].size != 40:
@@ -67,7 +66,7 @@ class EmulatedTC08:
         return 1
 
     def usb_tc08_set_channel(self, handle: int, channel: int, kind: int) -> int:
-        """Set a channel to a letter; C belongs to channel 0 alone: 1, or 0 if it fails."""
+        """Set a channel to a letter; C is for channel 0 alone, a space switches it off."""
         if not self._accepts(handle):
             return 0
         letters = "C " if channel == 0 else "BEJKNRST "
@@ -81,7 +80,7 @@ class EmulatedTC08:
     def usb_tc08_get_single(
         self, handle: int, values: Numbers, overflow: Numbers, units: int
     ) -> int:
-        """Convert all channels once [K], NaN for those that are off: 1, or 0 if it fails."""
+        """Convert all channels once [K], NaN for those that are off."""
         if not self._accepts(handle):
             return 0
         if units != KELVIN or not self._kinds:
@@ -102,13 +101,13 @@ class EmulatedTC08:
         return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
 
     def _accepts(self, handle: int) -> bool:
-        """True if the unit is open, and the handle is its own."""
+        """True if the unit is open, and the handle is that of the unit."""
         accepted = self._is_open and handle == _HANDLE
         if not accepted:
             self._error = 3
         return accepted
 
     def _fail(self, error: int) -> int:
-        """Note an error; 0, which most functions return then."""
+        """Note an error, and return the 0 of a failed function."""
         self._error = error
         return 0

@@ -1,10 +1,10 @@
-"""The shared state of the emulated bench: one world that all emulators read and write.
+"""The emulated bench: a world that all emulators read and write, and the lines to its devices.
 
 The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
-camera's emulator starts a flat-field correction, and the frame source freezes; a program sets
+camera's emulator starts a flat-field correction, and its frames freeze; a program sets
 `World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
-Temperatures are in kelvin, times in seconds since the world began, on its clock;
-events in the scene have a time of their own, so that a recording can begin with it.
+Temperatures are in kelvin, times in seconds since the world began, on its clock; the scene has a
+time of its own, so that a recording can begin with it.
 """
 
 import math
@@ -13,42 +13,43 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated.clock import EmulatedClock
+from dbthermal.instruments.clock import Clock, EmulatedClock
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.transport import Closing, TransportError
 
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 FFC_DURATION: Final = 0.5  # of a flat-field correction [s]; the real one is not documented publicly
 PHASE: Final = 0.382  # by which each camera of a session is exposed after the one before [frame]
-SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the others follow
+SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the next follow
+TICK: Final = 0.01  # shortest wait until a device is asked again if it has something to say [s]
 
 
 @dataclass
 class CameraState:
-    """State of one emulated camera; plain attributes, read and set by emulators."""
+    """State of an emulated camera; plain attributes, read and set by emulators."""
 
     serial_number: int
     fpa_temperature: float = FPA  # of its focal-plane array [K]
     plugged: bool = True  # False once it was pulled out
-    phase: float = 0.0  # of its frames against those of other cameras [frame]
+    phase: float = 0.0  # of its frames against those of the first camera [frame]
     has_frames: bool = False  # True if an emulated frame source counts its frames
     frame_count: int = 0  # frames since its sensor started
     ffc_count: int = 0  # flat-field corrections started
-    ffc_until: float = -math.inf  # end of the last one [s]
+    ffc_until: float = -math.inf  # end of the last correction [s]
     last_ffc_frame: int = 0  # frame_count at its start, 0 before the first
     last_ffc_temperature: float = FPA  # fpa_temperature at its start [K]
 
 
 class World:
-    """One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
+    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
 
     Its clock is an `EmulatedClock`, or `dbthermal.instruments.clock.SYSTEM` for real time.
     `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
-    the beam, None while the wheel turns, between two. `scene` has temperatures [K] by name
-    at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
+    the beam, None while the wheel turns or is between two slots. `scene` has temperatures [K] by
+    name at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
     `thermocouples` has the place of each channel, 1 to 8: a name in the scene, ``"blackbody"``,
-    ``"room"`` or ``"open"``. Single attributes may be read and set from any thread. To change
+    ``"room"`` or ``"open"``. Single attributes may be read and set from any thread; to change
     several together, hold `lock`.
     """
 
@@ -98,7 +99,7 @@ class World:
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
-        """Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
+        """Temperature of the tip of a thermocouple [K]; NaN if it is open or missing.
 
         KeyError if its place is not in the scene.
         """
@@ -154,3 +155,75 @@ def emulated_world(session: Session, **settings: Any) -> World:
     world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
     world.furnish(session)
     return world
+
+
+class Device:
+    """An emulated device at the end of a line: it takes bytes, and gives replies when polled."""
+
+    def __init__(self) -> None:
+        self.plugged = True  # set to False to pull out the cable
+        self._replies: list[bytes] = []
+
+    def is_plugged(self) -> bool:
+        """False once it was pulled out."""
+        return self.plugged
+
+    def receive(self, data: bytes) -> None:
+        """Take in bytes from the driver."""
+        raise NotImplementedError
+
+    def poll(self) -> list[bytes]:
+        """Give the replies that are due, each piece to be read by itself."""
+        replies, self._replies = self._replies, []
+        return replies
+
+    def next_due(self) -> float:
+        """Time until something may be due [s]; infinite if it waits for bytes."""
+        return 0.0 if self._replies else math.inf
+
+
+class Line(Closing):
+    """A `transport.Transport` to an emulated device, on its clock; for any number of threads.
+
+    Bytes that a driver does not read are kept. `TransportError` once the device is pulled out.
+    """
+
+    is_simulated = True
+
+    def __init__(self, device: Device, clock: Clock) -> None:
+        self._device, self.clock = device, clock
+        self._lock = threading.Lock()
+        self._pieces: list[bytes] = []
+        self._closed = False
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the device; see `Transport.write`."""
+        with self._lock:
+            self._check()
+            self._device.receive(data)
+
+    def read(self, size: int, timeout: float) -> bytes:
+        """Give one piece of the device's output; see `Transport.read`."""
+        deadline = self.clock() + timeout
+        while True:
+            with self._lock:
+                self._check()
+                self._pieces += self._device.poll()
+                if self._pieces:
+                    piece = self._pieces.pop(0)
+                    if piece[size:]:
+                        self._pieces.insert(0, piece[size:])
+                    return piece[:size]
+                pause = max(self._device.next_due(), TICK)
+            remaining = deadline - self.clock()
+            if remaining <= 0:
+                return b""
+            self.clock.sleep(min(remaining, pause))
+
+    def close(self) -> None:
+        """End; a second call does nothing."""
+        self._closed = True
+
+    def _check(self) -> None:
+        if self._closed or not self._device.is_plugged():
+            raise TransportError("Lost the emulated device. It must stay connected and open.")

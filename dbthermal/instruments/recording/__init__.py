@@ -2,31 +2,418 @@
 
 `record` writes the frames of all cameras and the readings beside them; `open_capture` opens a
 recording as stage `capture`, `notes` its log, `overview` a folder of recordings, and `open_sweep`
-and `bench_series` those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
+and `bench_series` those of a blackbody: a recording for each temperature and filter, which says
+which session it is of. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
-from dbthermal.instruments.recording._reader import (
-    bench_series,
-    notes,
-    open_capture,
-    open_sweep,
-    overview,
-    require_whole,
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import schema, store
+from dbthermal.alignment import exposure_times, fill_times
+from dbthermal.correction import correct
+from dbthermal.instruments.camera import UNTIMED, FrameFlag
+from dbthermal.instruments.recording._recorder import (
+    Limits,
+    Preview,
+    Reading,
+    SignalExit,
+    Summary,
+    raised_signals,
+    record,
 )
-from dbthermal.instruments.recording._recorder import record
-from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
+from dbthermal.instruments.session import BLACKBODY
 
 __all__ = [
     "Limits",
     "Preview",
     "Reading",
+    "SignalExit",
     "Summary",
     "bench_series",
     "notes",
     "open_capture",
     "open_sweep",
     "overview",
+    "raised_signals",
     "record",
     "require_whole",
 ]
 __dir__ = __all__.copy
+
+Region = tuple[slice, slice]
+
+_WHOLE: Final = 0.95  # share of the promised frames with which a recording is whole [1]
+
+
+def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
+    """Open a recording as stage `capture`, also one that was cut short or is being written.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``, from `record`.
+    fitted : bool
+        True for a camera that stamps frames by its own clock: its exposure times then come from a
+        line through both clocks, :math:`h = a + b d` with the device's time d and the host's h, by
+        least squares. They are late by the mean time that a frame takes to the host.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], read when used; `exposure_time` (band, time) [s], NaN
+        for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
+        ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
+        any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
+        b of each band.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If the folder does not exist; if a band has fewer than two frames with a time, or a file is
+        not as it was written, see `dbthermal.store.open_dataset`.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments import devices, protocols, recording, session
+    >>> camera = session.Camera("v4l2:///dev/video0")
+    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
+    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
+    >>> with devices.open_devices(plan) as rig:
+    ...     summary = protocols.record_scene(rig, path, limits=limits)
+    >>> recording.open_capture(path)["counts"].dims
+    ('band', 'time', 'y', 'x')
+    """
+    recording = store.open_dataset(path)
+    opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
+    if fitted:
+        opened = _fitted(opened)
+    # Exposure times are checked against a coordinate, which is made of them.
+    numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
+    time = fill_times(exposure_times(numbered)[0])
+    seconds = {**schema.COORDINATES["time"].attrs, "long_name": "time since the start"}
+    return schema.check(numbered.assign_coords(time=("time", time, seconds)), "capture")
+
+
+def _fitted(recording: xr.Dataset) -> xr.Dataset:
+    """Put exposure times of good frames on the host's clock by a line through both."""
+    unusable = recording["frame_flags"].values & int(UNTIMED)
+    device, host = recording["device_time"].values, recording["host_time"].values
+    stamps, rates = np.full(device.shape, np.nan), []
+    for place, band in enumerate(recording["band"].values):
+        good = (unusable[place] == 0) & np.isfinite(device[place])
+        if np.count_nonzero(good) < 2:
+            raise ValueError(f"Invalid band '{band}' without two good frames. Must have two.")
+        line = np.polynomial.Polynomial.fit(device[place, good], host[place, good], 1)
+        stamps[place, good] = line(device[place, good])
+        rates.append(float(line.deriv()(0.0)))
+    times = ("band", "time"), stamps, recording["exposure_time"].attrs
+    return recording.assign(exposure_time=times).assign_attrs(clock_rates=rates)
+
+
+def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
+    """Log of a recording: time [s], kind, source and value of each note, in the order of writing.
+
+    Kinds are ``"reading"``, ``"frames_lost"``, ``"shutter_closed"`` and more; the attributes of the
+    store explain their values.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr`` of the recording; FileNotFoundError if it does not exist.
+    """
+    recording = store.open_dataset(path)
+    kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}
+    sources = recording.attrs["log_sources"]
+    columns = (recording[f"log_{name}"].values for name in ("time", "kind", "source", "value"))
+    return [
+        (float(time), kinds[int(kind)], sources[int(source)], float(value))
+        for time, kind, source, value in zip(*columns, strict=True)
+    ]
+
+
+def overview(folder: str | Path) -> xr.Dataset:
+    """Table of the recordings in a folder: frames, losses, rate and completeness of each band.
+
+    Parameters
+    ----------
+    folder : str or Path
+        With recordings (ValueError without any); all else in it is ignored.
+
+    Returns
+    -------
+    Dataset
+        One row for each recording and band: `frames`, of which `damaged`; `good` ones, which are
+        whole, have a time and show the view, of those `promised` by duration and nominal rate;
+        `lost` by camera or driver, and `refused` by a full queue; `frame_rate` by the stamps [Hz],
+        NaN without two; `complete`, whether the recording went to its planned end. Coordinates
+        `recording` and `band`.
+    """
+    rows = [
+        {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}
+        for path in sorted(Path(folder).glob("*.zarr"))
+        if "frames_written" in (opened := store.open_dataset(path)).attrs
+        for band, totals in opened.attrs["totals"].items()
+    ]
+    if not rows:
+        raise ValueError(f"Invalid folder '{folder}' without recordings. Must have one.")
+    table = xr.Dataset({name: ("row", [row[name] for row in rows]) for name in rows[0]})
+    return table.set_coords(["recording", "band"])
+
+
+def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
+    written = slice(0, recording.attrs["frames_written"][band])
+    frames = recording[["device_time", "frame_flags"]].sel(band=band).isel(time=written)
+    stamps, flags = frames["device_time"].values, frames["frame_flags"].values
+    usable = ((flags & int(UNTIMED)) == 0) & np.isfinite(stamps)
+    steps = np.diff(stamps[usable])
+    session = recording.attrs["provenance"]["parameters"]
+    return {
+        "good": np.count_nonzero(usable & ((flags & int(FrameFlag.SHUTTER_CLOSED)) == 0)),
+        "promised": round(session["duration"] * session["frame_rate"]),
+        "frame_rate": 1.0 / float(np.median(steps)) if steps.size else np.nan,
+        "complete": bool(recording.attrs["complete"]),
+    }
+
+
+def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
+    """Raise unless every recording of a folder has its frames in every band.
+
+    ValueError names each recording and band that did not go to its planned end, or has too few good
+    frames, with the good and the promised frames.
+
+    Parameters
+    ----------
+    folder, share : str or Path, float
+        With recordings, see `overview`; good frames of those promised that a band must have [1].
+    """
+    table = overview(folder)
+    short = table.isel(row=~table["complete"] | (table["good"] < share * table["promised"]))
+    if cases := [
+        f"'{row['recording']}', band '{row['band']}': {row['good']} good frames of "
+        f"{row['promised']} promised" + ("" if row["complete"] else ", cut short")
+        for row in short.to_dataframe().to_dict("records")
+    ]:
+        rule = f"Must have {share:.0%} of them: move these away, and record them again"
+        raise ValueError(f"Invalid recordings in '{folder}': {'; '.join(cases)}. {rule}.")
+
+
+def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
+    """Join the recordings of a blackbody sweep into one dataset.
+
+    Parameters
+    ----------
+    folder, name, frames : str or Path, str, int
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session; frames to take of
+        each recording: the first ones of each band that are whole and show the blackbody.
+
+    Returns
+    -------
+    Dataset
+        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count]. The
+        bands are those of all filters, and that of the camera without filters, which is taken from
+        the recordings through the first filter. `temperature` is the mean of the blackbody's
+        readings during the recordings of a step [K].
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no recording of such a session; if a recording is missing or incomplete, has
+        fewer good frames in a band, or no reading of the blackbody, or those of a step differ by
+        more than the session's stability.
+    """
+    # The movie and the mean temperature of each step.
+    steps, stability, shared = _sweep(folder, name)
+    temperatures, movies = [], []
+    for paths in steps:
+        temperatures.append(_agreed(paths, BLACKBODY, stability))
+        movies.append(_movie(paths, frames))
+    # In the order of the temperatures.
+    order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
+    axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
+    counts = xr.concat([movies[place] for place in order], "temperature")
+    counts = counts.transpose("band", "temperature", "frame", "y", "x")
+    joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
+    return schema.check(joined.assign_attrs(shared), "blackbody_movies")
+
+
+def bench_series(
+    folder: str | Path,
+    name: str,
+    region: Mapping[str, Region],
+    correction: xr.Dataset | None = None,
+) -> dict[str, xr.Dataset]:
+    """Mean counts and temperatures of an emissivity bench, a measurement for each step.
+
+    Parameters
+    ----------
+    folder, name : str or Path, str
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session.
+    region : mapping
+        Material to its rows and columns. The thermocouple named like it is the object's.
+    correction : Dataset, optional
+        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected,
+        and pixels that are bad or saturated are left out.
+
+    Returns
+    -------
+    dict
+        Material to its series, stage `contact` of `schema`: `counts` (band, measurement), mean over
+        the region and the good frames [count]; `object_temperature` and `background_temperature`
+        (measurement), means of the readings during the recordings [K]. FileNotFoundError or
+        ValueError as for `open_sweep`; or if a region has no pixel or a band no good frame.
+    """
+    # Means of each step, by material.
+    steps, stability, shared = _sweep(folder, name)
+    series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
+    for paths in steps:
+        background = _agreed(paths, BLACKBODY, stability)
+        captures = dict(_bands(paths))
+        for material, place in region.items():
+            means = [_mean(captures[band], band, place, correction) for band in captures]
+            values = {
+                "counts": ("band", means),
+                "object_temperature": _agreed(paths, material, stability),
+                "background_temperature": background,
+            }
+            series[material].append(xr.Dataset(values, {"band": list(captures)}))
+    # All steps of a material together.
+    joined = {}
+    for material, measurements in series.items():
+        dataset = xr.concat(measurements, "measurement").transpose("band", "measurement")
+        for variable, described in schema.STAGES["contact"].items():
+            dataset[variable].attrs = described.attrs
+        dataset.attrs = {**shared, "material": material}
+        joined[material] = schema.check(dataset, "contact")
+    return joined
+
+
+def step_path(folder: str | Path, name: str, number: int, band: str | None) -> Path:
+    """Path of a recording of a sweep: ``<name>_<number>_<band>.zarr``, without a wheel no band."""
+    behind = "" if band is None else f"_{band}"
+    return Path(folder) / f"{name}_{number:02d}{behind}.zarr"
+
+
+def require_filter(path: str | Path, band: str | None) -> None:
+    """ValueError unless the filter of a band stayed in the beam throughout a recording."""
+    if band is None:
+        return
+    filters = store.open_dataset(path).attrs["provenance"]["parameters"]["filters"]
+    slots = {value for _, _, source, value in notes(path) if source == "filter_wheel"}
+    if {filters.get(f"{slot:.0f}") for slot in slots} != {band}:
+        raise ValueError(
+            f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'. "
+            f"Must be that of filter '{band}' throughout: move it away, and record it again."
+        )
+
+
+def is_complete(path: str | Path) -> bool:
+    """True if a recording exists and went to its planned end."""
+    try:
+        return bool(store.open_dataset(path).attrs.get("complete", False))
+    except FileNotFoundError:
+        return False
+
+
+def mean_reading(path: str | Path, source: str) -> float:
+    """Mean of an instrument's readings during a recording, in its unit, without failed ones.
+
+    FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
+    """
+    values = [note[3] for note in notes(path) if note[1:3] == ("reading", source)]
+    if not values:
+        raise ValueError(f"No reading of '{source}' in the recording '{path}'. Must have one.")
+    return float(np.mean(values))
+
+
+def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict[str, Any]]:
+    """Recordings of each temperature, one for each filter, stability [K] and origin of a sweep."""
+    # The session, from the first recording that is of it.
+    for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
+        attrs = store.open_dataset(path).attrs
+        session = attrs["provenance"]["parameters"]
+        if session["name"] == name and (blackbody := session["blackbody"]) is not None:
+            break
+    else:
+        raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
+    # Its recordings, each of which must be whole.
+    behind = [band for band in session["cameras"] if band in session["filters"].values()]
+    bands, steps = session["sweep"] or behind or [None], []
+    for number in range(len(blackbody["temperatures"])):
+        steps.append([step_path(folder, name, number, band) for band in bands])
+        for path, band in zip(steps[-1], bands, strict=True):
+            if not is_complete(path):
+                state = "Incomplete" if path.exists() else "Missing"
+                rule = "Must be recorded to its end"
+                raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
+            require_filter(path, band)
+    return steps, blackbody["stability"], {key: attrs[key] for key in ("is_simulated", "origin")}
+
+
+def _agreed(paths: list[Path], source: str, stability: float) -> float:
+    """Mean of a reading over the recordings of a step; ValueError if they differ."""
+    means = [mean_reading(path, source) for path in paths]
+    if np.ptp(means) > stability:
+        raise ValueError(
+            f"Invalid readings {means} K of '{source}' in the recordings "
+            f"{[path.name for path in paths]}. Must agree within {stability} K: move them "
+            "away, and this step is recorded again."
+        )
+    return float(np.mean(means))
+
+
+def _bands(paths: list[Path]) -> Iterator[tuple[str, xr.Dataset]]:
+    """Each band with the first recording that has it."""
+    yielded: set[str] = set()
+    for path in paths:
+        capture = open_capture(path).assign_attrs(path=str(path))
+        for band in map(str, capture["band"].values):
+            if band not in yielded:
+                yielded.add(band)
+                yield band, capture
+
+
+def _good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
+    """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
+    frames = capture.sel(band=band)
+    has_view = (frames["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) == 0
+    return np.flatnonzero(np.isfinite(frames["exposure_time"].values) & has_view)
+
+
+def _movie(paths: list[Path], frames: int) -> xr.DataArray:
+    """Counts (band, frame, y, x) of a step."""
+    films = []
+    for band, capture in _bands(paths):
+        good = _good_frames(capture, band)
+        if good.size < frames:
+            raise ValueError(
+                f"Invalid recording '{capture.attrs['path']}' with {good.size} good frames in band "
+                f"'{band}'. Must have {frames}."
+            )
+        # Read in one piece, up to the last frame that is needed.
+        counts = capture["counts"].sel(band=band).isel(time=slice(0, int(good[frames - 1]) + 1))
+        films.append(counts.load().isel(time=good[:frames]).drop_vars("time").rename(time="frame"))
+    return xr.concat(films, dim="band")
+
+
+def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset | None) -> float:
+    """Mean counts of a region in the good frames of a band."""
+    place = {"y": region[0], "x": region[1]}
+    good = _good_frames(capture, band)
+    cropped = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
+    source = f"of band '{band}' in '{capture.attrs['path']}'"
+    if cropped["counts"].size == 0:
+        raise ValueError(f"No frame or no pixel {source}. Must have one.")
+    counts = cropped["counts"]
+    if correction is not None:
+        corrected = correct(cropped, correction.isel(place))
+        counts = corrected["counts"].where(corrected["status"] == 0)
+    mean = float(counts.astype(np.float64).mean())
+    if not np.isfinite(mean):
+        raise ValueError(f"No good pixel {source}. Must have one.")
+    return mean

@@ -1,10 +1,10 @@
 """The capture file: a recording while it grows, frame by frame and note by note.
 
-Each frame is compared with the one before: a number that leaps is a loss, one that does not rise a
-repetition, a stamp that does not rise, or cannot be, is no time, and an image without a changed
-pixel was not taken anew. Nothing is left out: a damaged frame is written with its flags, and only
-its exposure time is NaN. Losses, shutter events and readings of other instruments go into the log.
-The store explains its contents in words, for a reader may have no more than the store.
+Each frame is compared with the frame before: a number that leaps is a loss, a number that does not
+rise a repetition; a stamp that does not rise, or cannot be, is no time; and an image without a
+changed pixel was not taken anew. A damaged frame is written with its flags, and only its exposure
+time is NaN. Losses, shutter events and readings of instruments go into the log. The store explains
+its contents in words, for a reader may have no more than the store.
 """
 
 import math
@@ -49,7 +49,7 @@ _FILLS: Final = MappingProxyType(
 
 
 class Note(IntEnum):
-    """Kinds of notes in the log, each with the meaning of its value."""
+    """Kinds of notes in the log, each with the meaning of the note's value."""
 
     meaning: str
 
@@ -82,7 +82,7 @@ def _of_log(dtype: str, long_name: str, units: str = "1") -> Variable:
 
 
 def _coded(variable: Variable, codes: type[FrameFlag] | type[Note]) -> Variable:
-    """Variable with CF attributes of its codes, and a sentence for each."""
+    """Variable with CF attributes of its codes, and a sentence for each code."""
     sentences = {str(code.name).lower(): code.meaning for code in codes}
     attrs = {
         "flag_masks" if codes is FrameFlag else "flag_values": [int(code) for code in codes],
@@ -151,6 +151,10 @@ TELEMETRY: Final = MappingProxyType(
 for all rates, so that the recorder draws no conclusion."""
 
 
+def _totals() -> dict[str, int]:
+    return dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
+
+
 @dataclass
 class _Band:
     """Recording state of one band."""
@@ -162,18 +166,16 @@ class _Band:
     device_time: float = -math.inf
     shutter: Shutter = field(default_factory=Shutter)
     ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
-    counts: dict[str, int] = field(
-        default_factory=lambda: dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
-    )
+    totals: dict[str, int] = field(default_factory=_totals)
 
 
 class CaptureFile:
     """A new recording at `path` that takes frames and notes in the order in which they come.
 
-    `readings` has the unit of each further instrument, `origin` is the host's clock at time 0 [s],
-    and `chunk` is the number of frames that are written together. FileExistsError if `path` exists;
+    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], and
+    `chunk` is the number of frames that are written together. FileExistsError if `path` exists;
     ValueError if the sources differ in shape or telemetry. After a failed write `broken` is True:
-    what was written before is valid, and nothing more may be handed over.
+    what was written before is valid, and nothing more may be written.
     """
 
     def __init__(
@@ -186,18 +188,21 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
+        # The variables, of one size.
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
             raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
         (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
+        # The state of the recording.
         self._origin, self._chunk = origin, chunk
         self._clock = next(iter(sources.values())).clock
         self._start: dict[str, Any] = {}  # attributes of `begin`
         self._names = [*sources, *readings, _RECORDER]
-        self._notes: list[tuple[float, ...]] = []
+        self._notes: list[tuple[float, ...]] = []  # rows of the log that are not written yet
         self.broken = False
+        # The store, explained by its attributes.
         self.recording = store.Recording(
             path,
             self._variables,
@@ -220,7 +225,7 @@ class CaptureFile:
     @property
     def totals(self) -> dict[str, dict[str, int]]:
         """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
-        return {band: dict(state.counts) for band, state in self._bands.items()}
+        return {band: dict(state.totals) for band, state in self._bands.items()}
 
     def begin(self, origin: float, started: str) -> None:
         """Let the recording begin at a time on the host's clock [s], `started` in UTC."""
@@ -232,11 +237,13 @@ class CaptureFile:
         `refused` is the number of frames of this band that came before it and were not taken.
         """
         state = self._bands[band]
+        # Flags, from the frame before and from the shutter.
         flags = frame.flags | self._compared(band, frame, refused)
         flags |= self._watch_shutter(band, frame, flags)
         if flags & DAMAGED:
-            state.counts["damaged"] += 1
+            state.totals["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
+        # Values of the frame, into the chunk.
         timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,
@@ -254,7 +261,7 @@ class CaptureFile:
         for name, value in values.items():
             state.block[name][state.filled] = value
         state.filled += 1
-        state.counts["frames"] += 1
+        state.totals["frames"] += 1
         if state.filled == self._chunk:
             self._write(band)
         return flags
@@ -275,7 +282,7 @@ class CaptureFile:
     def refused(self, band: str, number: int, time: float) -> None:
         """Count frames of a band that came and were not taken, and note it."""
         if number:
-            self._bands[band].counts["refused"] += number
+            self._bands[band].totals["refused"] += number
             self.note(Note.FRAMES_REFUSED, band, time, number)
 
     def close(self, *, complete: bool, ended: str) -> None:
@@ -297,7 +304,7 @@ class CaptureFile:
             flags |= FrameFlag.SEQUENCE_STANDS
             self.note(Note.SEQUENCE_STANDS, band, frame.host_time, step)
         elif lost > 0:
-            state.counts["lost"] += lost
+            state.totals["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
         flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
         if state.image is not None and np.array_equal(frame.counts, state.image):

@@ -1,6 +1,6 @@
 """The recorder: the frames of all cameras and the readings beside them, into one capture file.
 
-A thread for each camera fetches its frames, one more reads the other instruments, so that none
+A thread for each camera fetches its frames, a further thread reads the instruments, so that none
 waits for another: a camera that corrects its offsets answers late, and that costs no frame. A queue
 of bounded length leads to the thread that writes. If the disk is too slow the queue fills, frames
 are refused, and the log has their number and time. The caller's thread shows the preview; whatever
@@ -12,11 +12,14 @@ import math
 import os
 import queue
 import shutil
+import signal
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from types import FrameType
+from typing import Any, Final
 
 from dbthermal import store
 from dbthermal.instruments.camera import (
@@ -27,17 +30,146 @@ from dbthermal.instruments.camera import (
     SourceLostError,
 )
 from dbthermal.instruments.clock import Clock, Task
-from dbthermal.instruments.recording._capture_file import CaptureFile, Note
-from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
+from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.signals import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
+Totals = Mapping[str, Mapping[str, int]]
 
 _SHOW_POLL: Final = 0.01  # least wait between two looks for a preview [s]
 _WRITE_POLL: Final = 0.05  # how long the writer waits for a frame [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
 _BYTES: Final = 2  # of a pixel
+_STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
+_ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """An instrument that is read beside the frames.
+
+    Attributes
+    ----------
+    read, units : callable, str
+        Reads a value, in this unit, and may take its time. Its OSError, RuntimeError and ValueError
+        are noted as a failed reading; any other error ends the recording.
+    """
+
+    read: Callable[[], float]
+    units: str = "K"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Sizes and waiting times of a recording.
+
+    Attributes
+    ----------
+    chunk, queue : int
+        Frames of a chunk, the most that a kill may cost, and of each band held until written.
+    reserve : int
+        Space that must stay free [byte].
+    silence, reading_period, patience, preview_period : float
+        Wait for a frame before it is noted that none came, time from reading to reading, wait at
+        the end for a device that hangs, and least time from preview to preview [s].
+    """
+
+    chunk: int = CHUNK
+    queue: int = 120
+    reserve: int = 10**9
+    silence: float = 1.0
+    reading_period: float = 1.0
+    patience: float = 10.0
+    preview_period: float = 0.2
+
+
+@dataclass(frozen=True)
+class Preview:
+    """State of a recording while it goes on.
+
+    Attributes
+    ----------
+    time : float
+        Time since the start [s].
+    frames, totals : mapping
+        By band, its last frame and its numbers of ``frames``, ``lost``, ``refused``, ``damaged``.
+    readings, units : mapping
+        Last value of each reading, NaN if it failed, and its unit, else kelvin.
+    """
+
+    time: float
+    frames: Mapping[str, Frame]
+    totals: Totals
+    readings: Mapping[str, float]
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Result of a recording.
+
+    Attributes
+    ----------
+    path, totals : Path, mapping
+        Folder of the recording, wherever it lies now; as in `Preview`.
+    ended : str
+        ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is lost),
+        or ``"no frames"`` if a band had none.
+    """
+
+    path: Path
+    ended: str
+    totals: Totals
+
+
+class SignalExit(SystemExit):
+    """End of the program by a signal, with the exit status of a shell: 128 and its number.
+
+    Parameters
+    ----------
+    number : int
+        Of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(_STATUS + number)
+        self.status, self.name = _STATUS + number, signal.Signals(number).name
+
+
+@contextmanager
+def raised_signals() -> Iterator[None]:
+    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
+
+    A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
+    first signal is raised, those after it are ignored: what is being closed must be left to end. A
+    signal that the program handles by itself or ignores, as under ``nohup``, stays so.
+    """
+    previous: dict[int, Any] = {}
+    raised: list[int] = []
+    late: list[int] = []  # came while the handlers were put back
+    closing = False
+
+    def end(number: int, _: FrameType | None) -> None:
+        if closing:
+            late.append(number)
+        elif not raised:
+            raised.append(number)
+            raise SignalExit(number)
+
+    try:
+        # Only signals that would end the program, and only in the main thread, which gets them.
+        if threading.current_thread() is threading.main_thread():
+            for number in _ENDING:
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    previous[number] = signal.signal(number, end)
+        yield
+    finally:
+        closing = True
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        if not raised:
+            for number in late:
+                signal.raise_signal(number)
 
 
 def record(
@@ -59,14 +191,12 @@ def record(
 
     Parameters
     ----------
-    session : Session
-        Bands, format, duration.
-    sources : mapping
-        Band to an open source, in the session's order; they stay open.
+    session, sources : Session, mapping
+        Bands, format, duration; band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
     readings, identities : mapping, optional
-        Name to another instrument; name or band to model and numbers, beside those of the sources.
+        Name to an instrument; name or band to model and numbers, beside those of the sources.
     limits, preview, stop : optional
         `Limits`; a function called now and then with a `Preview` in the caller's thread, which may
         take its time; and an event whose setting ends the recording.
@@ -91,9 +221,11 @@ def record(
     _check(session, sources)
     clock = next(iter(sources.values())).clock
     with raised_signals(), clock.joined():
+        # The file.
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
         start = clock()  # to make the file may have taken a while
         file.begin(start, _utc(clock))
+        # The threads: the writer starts the rest, this one shows the preview.
         end, stop = start + session.duration, stop or threading.Event()
         run = _Run(file, sources, readings, limits, clock, start, end, stop)
         # No daemon: it ends its work whatever becomes of this thread.
@@ -115,6 +247,7 @@ def record(
 
 
 def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
+    """Raise unless the sources are those of the session, on one clock."""
     if tuple(sources) != session.bands:
         raise ValueError(
             f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
@@ -141,18 +274,20 @@ def _new_file(
     limits: Limits,
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
+    # Room on the disk.
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
     _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
     clock = next(iter(sources.values())).clock
-    known = {band: source.identity for band, source in sources.items()}
+    # What the recording says of its devices.
+    devices = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
         "origin": "simulated, emulated rig" if session.simulated else "measured",
         "identities": {
-            name: {**known.get(name, {}), **identities.get(name, {})}
-            for name in {**known, **identities}
+            name: {**devices.get(name, {}), **identities.get(name, {})}
+            for name in {**devices, **identities}
         },
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
         "started": _utc(clock),
@@ -170,7 +305,7 @@ def _utc(clock: Clock) -> str:
 
 @dataclass(eq=False)
 class _Run:
-    """One recording: the threads that fetch, read and write, and their shared state."""
+    """A recording: the threads that fetch, read and write, and their shared state."""
 
     file: CaptureFile
     sources: Mapping[str, FrameSource]
@@ -186,7 +321,7 @@ class _Run:
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
         # For the preview, after each frame is written: totals, last frames, last readings.
-        self.totals: dict[str, dict[str, int]] = {}
+        self.totals: Totals = {}
         self.last_frames: dict[str, Frame] = {}
         self.last_readings: dict[str, float] = {}
         # (band, frame, number refused before it); at most `limits.queue` frames of each band.
@@ -206,18 +341,20 @@ class _Run:
         return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
 
     def fetch(self, band: str, source: FrameSource) -> None:
-        """Put the frames of one source into the queue, until the end.
+        """Put the frames of a source into the queue, until the end.
 
         Without room a frame is refused; the next accepted one carries the number of refused ones.
         """
         refused = 0
         try:
             while self.is_going():
+                # The next frame.
                 try:
                     frame = source.read(self.limits.silence)
                 except NoFrameError:
                     self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
                     continue
+                # Into the queue, if there is room.
                 if self.clock.has_room(self._room[band]):
                     self._frames.put((band, frame, refused))
                     refused = 0
@@ -232,7 +369,7 @@ class _Run:
             self._refused_last[band] = refused
 
     def read(self) -> None:
-        """Read all other instruments, one after the other, until the end."""
+        """Read the instruments in turn, until the end."""
         try:
             while self.readings and self.is_going():
                 for name, reading in self.readings.items():
@@ -279,14 +416,7 @@ class _Run:
             self._join(thread)
         try:
             if not self.file.broken:
-                while not self._frames.empty():
-                    self._take(*self._frames.get_nowait())
-                self._take_notes()
-                for band, number in self._refused_last.items():
-                    self.file.refused(band, number, self.clock())
-                self.ended = self._reason()
-                is_complete = self.ended in {"duration", "stopped"}
-                self.file.close(complete=is_complete, ended=self.ended)
+                self._finish()
         except BaseException as error:  # noqa: BLE001 - as above
             self._fail(error)
         finally:
@@ -306,11 +436,21 @@ class _Run:
             if number % self.limits.chunk == 0:
                 _check_space(self.file.recording.root, self.limits.reserve)
 
+    def _finish(self) -> None:
+        """Write what is left in the queues, and close the file."""
+        while not self._frames.empty():
+            self._take(*self._frames.get_nowait())
+        self._take_notes()
+        for band, number in self._refused_last.items():
+            self.file.refused(band, number, self.clock())
+        self.ended = self._reason()
+        self.file.close(complete=self.ended in {"duration", "stopped"}, ended=self.ended)
+
     def _take(self, band: str, frame: Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
-        has_own_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
+        has_device_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
         early = frame.device_time < self.start and frame.host_time < self.start + _HELD
-        if band not in self.last_frames and early and not has_own_clock:
+        if band not in self.last_frames and early and not has_device_clock:
             return
         flags = self.file.frame(band, frame, refused)
         self.last_frames[band] = replace(frame, flags=flags)
@@ -336,7 +476,7 @@ class _Run:
         return "stopped" if self.stop.is_set() else "duration"
 
     def _join(self, thread: Task) -> None:
-        """Wait for a thread; one that hangs in its device must not keep what was recorded."""
+        """Wait for a thread; if it hangs in its device it must not keep what was recorded."""
         if thread.ident is None:
             return
         if not self.clock.wait(thread.ended, self.limits.patience):

@@ -1,20 +1,30 @@
-"""FLIR Boson: driver of the camera's command port; `KIND` opens it for a session.
+"""FLIR Boson: driver of the camera's command port, and the commands that it sends.
 
-A camera that is busy answers late, after its driver gave up; read naively, every later command then
-gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
-sequence number of its own, and frames that do not carry it are discarded. Connecting
-sends and resets nothing, and nothing is ever written to the camera's flash memory.
+A busy camera answers late, after its driver gave up; without sequence numbers every later command
+then gets the reply of the command before (openmv/openmv, pull request 3265). Here each request has
+a new number, and frames without it are discarded. Connecting sends and resets nothing, and nothing
+is ever written to the camera's flash memory. `KIND` opens camera and command port for a session.
+
+References
+----------
+Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/include`` (commit
+cbbb877). Facts alone, none of the vendor's text or code.
 """
 
+import struct
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final
+from functools import partial
+from types import MappingProxyType
+from typing import Any, Final, Generic, TypeVar
+
+from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import EnumT, Reading, Setting, T
-from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, Identity, over_v4l2
+from dbthermal.instruments import telemetry, v4l2
+from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 __all__ = [
@@ -24,7 +34,6 @@ __all__ = [
     "BosonReplyError",
     "BosonStatusError",
     "BosonTimeoutError",
-    "commands",
 ]
 __dir__ = __all__.copy
 
@@ -35,6 +44,130 @@ FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
 POLL: Final = 0.05  # time between two questions while waiting [s]
 MAXIMUM_RECEIVED: Final = 65536  # most bytes to search for one reply: some lines talk without end
 _READ_SIZE: Final = 4096
+
+T = TypeVar("T")
+EnumT = TypeVar("EnumT", bound=IntEnum)
+
+
+class Switch(IntEnum):
+    """State of a function that is either off or on."""
+
+    OFF = 0
+    ON = 1
+
+
+class Ir16Mode(IntEnum):
+    """Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
+
+    COUNTS_16 = 0
+    COUNTS_14 = 1
+    TLINEAR = 2
+
+
+class TelemetryLocation(IntEnum):
+    """Place of the telemetry rows: before the image or after it."""
+
+    TOP = 0
+    BOTTOM = 1
+
+
+@dataclass(frozen=True)
+class Reading(Generic[T]):
+    """A value that is read from the camera."""
+
+    name: str  # for messages
+    command: int  # identifier
+    layout: str  # data of the reply, as in `struct`, big-endian
+    convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
+
+    def value(self, data: bytes) -> T:
+        """Value of the data of a reply; ValueError if they are of another size or meaning."""
+        size = struct.calcsize(self.layout)
+        if len(data) != size:
+            raise ValueError(f"Invalid {self.name} of {len(data)} bytes. Must have {size}.")
+        return self.convert(*struct.unpack(self.layout, data))
+
+
+@dataclass(frozen=True)
+class Setting(Generic[EnumT]):
+    """A mode that is set by one command, as a 32-bit number, and read by the next identifier."""
+
+    name: str
+    set_command: int
+    kind: type[EnumT]
+
+    @property
+    def reading(self) -> Reading[EnumT]:
+        """Command that reads the mode back."""
+        return Reading(self.name, self.set_command + 1, ">i", self.kind)
+
+    def data(self, value: EnumT) -> bytes:
+        """Data of the command that sets it; ValueError if the value is not of its enumeration."""
+        if value not in {*self.kind}:
+            choices = ", ".join(f"{member.value} ({member.name})" for member in self.kind)
+            raise ValueError(f"Invalid {self.name} {value}. Must be one of {choices}.")
+        return struct.pack(">i", value)
+
+
+def _text(raw: bytes) -> str:
+    """Text up to its padding of zeros."""
+    return raw.split(b"\0", 1)[0].decode("ascii")
+
+
+def _kelvin(tenths: int) -> float:
+    """Temperature [K] of signed tenths of a degree Celsius."""
+    return float(tenths / 10.0 + zero_Celsius)
+
+
+SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
+PART_NUMBER: Final = Reading("part number", 0x00050004, ">20s", _text)
+SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
+SOFTWARE_REVISION: Final = Reading(
+    "software revision", 0x00050022, ">III", lambda *numbers: ".".join(map(str, numbers))
+)
+FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvin)
+FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
+FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
+LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
+
+FFC_MODE: Final = Setting("FFC mode", 0x00050012, FfcMode)
+GAIN_MODE: Final = Setting("gain mode", 0x00050014, GainMode)
+IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
+TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
+TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
+
+_MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
+SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
+RUN_FFC: Final = 0x00050007  # command that starts a flat-field correction
+
+# Meaning of each status of a refusal.
+STATUSES: Final = MappingProxyType(
+    {
+        0x161: "bad command identifier",
+        0x162: "bad status of the request",
+        0x17D: "too few bytes of data",
+        0x17E: "too many bytes of data",
+        0x17F: "buffer overflow",
+        0x180: "the camera's function failed",
+        0x181: "invalid input of the camera's function",
+        0x1B0: "feature not enabled",
+        0x201: "error",
+        0x202: "not ready",
+        0x203: "value out of range",
+        0x204: "bad checksum",
+        0x205: "bad pointer",
+        0x206: "wrong size of the data",
+        0x207: "undefined function",
+        0x208: "illegal address",
+        0x20B: "deprecated function",
+        0x26D: "communication timeout",
+        0x26E: "communication read error",
+        0x26F: "communication count error",
+        0x281: "configuration error",
+        0x283: "camera busy",
+        **dict.fromkeys(range(0x6A4, 0x6AE), "flash error"),
+    }
+)
 
 
 class BosonError(RuntimeError):
@@ -50,7 +183,7 @@ class BosonReplyError(BosonError):
 
 
 class BosonStatusError(BosonError):
-    """The camera refused; `status` is a key of `commands.STATUSES`."""
+    """The camera refused; `status` is a key of `STATUSES`."""
 
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
@@ -58,7 +191,7 @@ class BosonStatusError(BosonError):
 
 
 class Boson(Closing):
-    """One camera's command port, a `camera.CameraControl`; for any number of threads.
+    """A camera's command port, a `camera.CameraControl`; for any number of threads.
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
@@ -78,7 +211,7 @@ class Boson(Closing):
         timeout: float = REPLY_TIMEOUT,
         first_sequence: int | None = None,
     ) -> None:
-        # From the time of day: replies to a program that ended are not taken for this one's.
+        # From the time of day, so that a reply to a program that ended is not taken for a new one.
         moment = int(1e6 * transport.clock.utc().timestamp())
         first = moment if first_sequence is None else first_sequence
         self.is_simulated = transport.is_simulated
@@ -100,7 +233,7 @@ class Boson(Closing):
             self._transport.close()
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
-        """Value of one of the readings of `commands`, in the unit that its name says."""
+        """Value of a `Reading`, in the unit that its name says."""
         reply = self._exchange(reading.name, reading.command, repeats=repeats)
         try:
             return reading.value(reply)
@@ -108,47 +241,46 @@ class Boson(Closing):
             raise BosonReplyError(f"Invalid reply to '{reading.name}': {error}") from error
 
     def get(self, setting: Setting[EnumT]) -> EnumT:
-        """State of one of `commands.SETTINGS`."""
+        """State of one of `SETTINGS`."""
         return self.read(setting.reading)
 
     def set(self, setting: Setting[EnumT], value: EnumT) -> None:
-        """Set one of `commands.SETTINGS` until power-off; a wrong value is a ValueError."""
+        """Set one of `SETTINGS` until power-off; a wrong value is a ValueError."""
         self._tell(f"set {setting.name}", setting.set_command, setting.data(value))
 
     def serial_number(self) -> int:
         """Serial number of the camera."""
-        return self.read(commands.SERIAL_NUMBER)
+        return self.read(SERIAL_NUMBER)
 
     def identity(self) -> Identity:
         """Numbers, versions and modes of the camera, and ``is_simulated``."""
         return {
             "serial_number": str(self.serial_number()),
-            "sensor_serial_number": str(self.read(commands.SENSOR_SERIAL_NUMBER)),
-            "part_number": self.read(commands.PART_NUMBER),
-            "software_revision": self.read(commands.SOFTWARE_REVISION),
-            "gain_mode": self.get(commands.GAIN_MODE).name.lower(),
-            "ffc_mode": self.get(commands.FFC_MODE).name.lower(),
+            "sensor_serial_number": str(self.read(SENSOR_SERIAL_NUMBER)),
+            "part_number": self.read(PART_NUMBER),
+            "software_revision": self.read(SOFTWARE_REVISION),
+            "gain_mode": self.get(GAIN_MODE).name.lower(),
+            "ffc_mode": self.get(FFC_MODE).name.lower(),
             "is_simulated": self.is_simulated,
         }
 
     def fpa_temperature(self) -> float:
         """Temperature of the focal-plane array [K], in steps of 0.1 K."""
-        return self.read(commands.FPA_TEMPERATURE)
+        return self.read(FPA_TEMPERATURE)
 
     def ffc_status(self) -> FfcStatus:
         """State of the flat-field correction."""
-        return self.read(commands.FFC_STATUS)
+        return self.read(FFC_STATUS)
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
         settings: list[tuple[Setting[Any], IntEnum]] = [
-            (commands.IR16_MODE, commands.Ir16Mode.COUNTS_16),
-            (commands.FFC_MODE, FfcMode.MANUAL),
-            (commands.TELEMETRY, commands.Switch(bool(telemetry_rows))),
+            (IR16_MODE, Ir16Mode.COUNTS_16),
+            (FFC_MODE, FfcMode.MANUAL),
+            (TELEMETRY, Switch(bool(telemetry_rows))),
         ]
         if telemetry_rows:
-            below = commands.TelemetryLocation.BOTTOM
-            settings.append((commands.TELEMETRY_LOCATION, below))
+            settings.append((TELEMETRY_LOCATION, TelemetryLocation.BOTTOM))
         for setting, value in settings:
             self.set(setting, value)
             state = self.get(setting)
@@ -161,20 +293,20 @@ class Boson(Closing):
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
         """Run a flat-field correction, wait until it is complete, return its frame number.
 
-        At its start the camera still says "complete" of the one before: another status has to be
-        seen, or another frame number of the last correction. While the shutter is closed the camera
-        may not answer; `BosonTimeoutError` after `timeout` [s].
+        At its start the status is still "complete", of the correction before: it must change, or
+        the frame number of the last correction must. While the shutter is closed the camera may
+        not answer; `BosonTimeoutError` after `timeout` [s].
         """
-        before = self.read(commands.LAST_FFC_FRAME)
+        before = self.read(LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE
-        self._tell("run FFC", commands.RUN_FFC)
+        self._tell("run FFC", RUN_FFC)
         deadline = self._clock() + timeout
         while True:
             try:
-                busy = bool(self.read(commands.FFC_IN_PROGRESS, repeats=0))
-                if busy or self.read(commands.FFC_STATUS, repeats=0) != FfcStatus.COMPLETE:
+                busy = bool(self.read(FFC_IN_PROGRESS, repeats=0))
+                if busy or self.read(FFC_STATUS, repeats=0) != FfcStatus.COMPLETE:
                     changed = True
-                elif (last := self.read(commands.LAST_FFC_FRAME, repeats=0)) != before or changed:
+                elif (last := self.read(LAST_FFC_FRAME, repeats=0)) != before or changed:
                     return last
             except BosonTimeoutError:
                 pass  # no reply while the shutter is closed: requested again until the time limit
@@ -184,30 +316,32 @@ class Boson(Closing):
 
     def _tell(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
-        reply = self._exchange(name, command, data)
-        if reply:
+        if reply := self._exchange(name, command, data):
             raise BosonReplyError(
                 f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty."
             )
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again if no reply comes, and return the data of its reply."""
+        # A reading is requested again.
         for _ in range(repeats):
             try:
                 return self._exchange(name, command, data)
             except BosonTimeoutError:
                 continue
+        # The exchange, under a new number.
         with self._clock.hold(self._lock):
             self._sequence = fslp.next_sequence(self._sequence)
             self._transport.write(fslp.encode(self._sequence, command, data))
             reply = self._reply(name)
+        # What the reply says.
         if reply.command != command:
             raise BosonReplyError(
                 f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
                 f"Must be of command 0x{command:08X}."
             )
         if reply.status:
-            meaning = commands.STATUSES.get(reply.status, "unknown status")
+            meaning = STATUSES.get(reply.status, "unknown status")
             raise BosonStatusError(
                 f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
                 "Must be 0, OK.",
@@ -217,6 +351,7 @@ class Boson(Closing):
 
     def _reply(self, name: str) -> fslp.Frame:
         """Wait for the reply to the last request; discard all other frames."""
+        key = (fslp.COMMAND_CHANNEL, self._sequence)
         deadline = self._clock() + self.timeout
         received = 0
         while (remaining := deadline - self._clock()) > 0:
@@ -228,7 +363,6 @@ class Boson(Closing):
                     f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
                     "Must be a Boson's command port that no other program uses."
                 )
-            key = (fslp.COMMAND_CHANNEL, self._sequence)
             for frame in self._decoder.feed(piece):
                 if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
                     return frame
@@ -236,5 +370,7 @@ class Boson(Closing):
         raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
 
 
-KIND: Final = CameraKind(over_v4l2(telemetry.metadata), Boson.from_url, (0, telemetry.ROWS))
-"""The kind of camera of a session's ``kind: boson``."""
+# Of a session's ``kind: boson``.
+KIND: Final = CameraKind(
+    partial(v4l2.open_url, decode=telemetry.metadata), Boson.from_url, (0, telemetry.ROWS)
+)
