@@ -107,7 +107,7 @@ materials text*         as listed by 'data'; all by default
 --search whole=5        largest delay that is sought, either way [frame]
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
---method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
+--method text           one step alone, by rows: subspace, calibrated, dbvt, apparent
 --emissivity number+    of each band, for the method 'calibrated'
 --surroundings kelvin   temperature of what is reflected, as 22C
 --prior text            material of pixels that cannot be measured, as listed by 'data'

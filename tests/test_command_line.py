@@ -421,7 +421,7 @@ calibrate --maker a --correction-output y -o x -> correction-output --maker
 calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
-separate aligned.zarr response.zarr --method naive --workers 2 -o x -> workers --met
+separate aligned.zarr response.zarr --method dbvt --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc

@@ -54,6 +54,11 @@ RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
 USELESS: Final = 1e6
 
+WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
+"""Variables that a method without standard deviations never estimates."""
+WITHOUT_BACKGROUND: Final = (*WITHOUT_STD, "background_temperature")
+"""Variables that a method which neglects the background never estimates."""
+
 
 @dataclass(frozen=True)
 class Pixels:
@@ -114,19 +119,49 @@ class Survey(Pixels):
 
 @dataclass(frozen=True)
 class Tile:
-    """Inputs of one tile: linearised signals, responses, noise, and quantities known beforehand."""
+    """
+    Inputs of one tile: linearised signals, responses, noise, and quantities known beforehand.
 
-    signals: Array  # less the reference temperature (band, time, pixel) [K], finite
-    time: Array  # (time,) [s]
-    curves: tuple[Curve, ...]  # response of each band, of one reference temperature
-    noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
-    shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
-    rng: np.random.Generator  # the tile's own source of random starts
-    pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
-    segment: Whole | None = None  # number of shutter events before each frame (time,)
+    Bands stand in the order of their noise, the quietest first. Pixels follow one another along
+    the rows.
+
+    Attributes
+    ----------
+    signals : array
+        Signals less the reference temperature (band, time, pixel) [K], finite.
+    time : array
+        Times (time,) [s].
+    curves : tuple of Curve
+        Response of each band, of one reference temperature.
+    noise : tuple of float
+        Standard deviation of each band's signal at the reference temperature [K].
+    shape : tuple of int
+        Rows and columns.
+    rng : Generator
+        Source of random starts, of this tile alone.
+    pattern : tuple of float, optional
+        Residual fixed pattern of each band [K].
+    segment : array, optional
+        Number of shutter events before each frame (time,).
+    material : Material, optional
+        What pooling knows of the pixels.
+    emissivity : array, optional
+        Emissivity known beforehand (band, pixel) [1].
+    emissivity_covariance : array, optional
+        Its covariance (band, band, pixel) [1].
+    """
+
+    signals: Array
+    time: Array
+    curves: tuple[Curve, ...]
+    noise: tuple[float, ...]
+    shape: tuple[int, int]
+    rng: np.random.Generator
+    pattern: tuple[float, ...] | None = None
+    segment: Whole | None = None
     material: Material | None = None
-    emissivity: Array | None = None  # known beforehand (band, pixel) [1]
-    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    emissivity: Array | None = None
+    emissivity_covariance: Array | None = None
 
     @property
     def reference(self) -> float:
@@ -171,18 +206,59 @@ class Tile:
 
 @dataclass(frozen=True)
 class Estimate(Pixels):
-    """Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so."""
+    """
+    Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so.
 
-    object_temperature: Array  # (time, pixel) [K]
+    Attributes
+    ----------
+    object_temperature, background_temperature : array
+        Temperatures (time, pixel) [K].
+    emissivity : array
+        Emissivity (band, pixel) [1].
+    object_temperature_std, background_temperature_std, emissivity_std : array
+        Their standard deviations.
+    status : array
+        Bits of `schema.Status` (pixel).
+    reflection_ratio, reflection_ratio_std : array, optional
+        Reflectivity over that of the first band (band, pixel) [1].
+    emissivity_covariance : array, optional
+        Covariance of the emissivities (band, band, pixel) [1].
+    """
+
+    object_temperature: Array
     object_temperature_std: Array
-    background_temperature: Array  # (time, pixel) [K]
+    background_temperature: Array
     background_temperature_std: Array
-    emissivity: Array  # (band, pixel) [1]
+    emissivity: Array
     emissivity_std: Array
-    status: Bits  # `schema.Status` (pixel)
-    reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
+    status: Bits
+    reflection_ratio: Array | None = None
     reflection_ratio_std: Array | None = None
-    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    emissivity_covariance: Array | None = None
+
+    @classmethod
+    def without_std(
+        cls,
+        tile: Tile,
+        object_temperature: Array,
+        status: Bits,
+        emissivity: Array | None = None,
+        background_temperature: Array | None = None,
+    ) -> "Estimate":
+        """Estimate without standard deviations; NaN for quantities that are not passed."""
+        missing = np.full_like(object_temperature, np.nan)
+        no_emissivity = np.full((len(tile.curves), status.size), np.nan)
+        return cls(
+            object_temperature=object_temperature,
+            object_temperature_std=missing,
+            background_temperature=(
+                missing if background_temperature is None else background_temperature
+            ),
+            background_temperature_std=missing,
+            emissivity=no_emissivity if emissivity is None else emissivity,
+            emissivity_std=no_emissivity,
+            status=status,
+        )
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
