@@ -14,6 +14,7 @@ from scipy.special import chdtri
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._signals import stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
@@ -311,12 +312,12 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     offset, gain, centre = (
         correction[name].values[places] for name in ("offset_std", "gain_std", "centre")
     )
-    step = max(1, int(np.cbrt(counts[0].size / _LEVELS)))
-    some = counts[:, ::step, ::step, ::step].values.astype(np.float64)
-    some = some[:, :, good[::step, ::step]]
-    level = np.full(len(some), np.nan)
-    if some.size:
-        level = np.square(some - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
+    step = stride(counts.shape[1:], _LEVELS)
+    sample = counts[:, ::step, ::step, ::step].values.astype(np.float64)
+    sample = sample[:, :, good[::step, ::step]]
+    level = np.full(len(sample), np.nan)
+    if sample.size:
+        level = np.square(sample - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
     std = np.sqrt(offset**2 + gain**2 * level)
     return xr.DataArray(std, dims="band", attrs=schema.PATTERN_STD.attrs)
 

@@ -13,6 +13,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._signals import stride
 from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
@@ -233,9 +234,8 @@ class View:
         """
         pane, (frames, pixels) = self.pane(name), _LOOKED_AT
         times = slice(0, None, -(-self.time.size // frames))
-        step = max(1, int(np.sqrt(np.prod(self.shape) / pixels)))
-        some = slice(0, None, step)
-        values, good = pane.read(times, some, some), self.counted("measured")[some, some]
+        every = slice(0, None, stride(self.shape, pixels))
+        values, good = pane.read(times, every, every), self.counted("measured")[every, every]
         for part in (values[:, good], values):
             finite = part[np.isfinite(part)]
             if finite.size:
