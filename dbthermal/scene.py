@@ -127,8 +127,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
                 separating=separating,
             )
             blocks = _rows.blocks(result["object_temperature"].shape)
-            parts = (_let_go(result.isel(y=rows)) for rows in blocks)
-            store.save_rows(parts, target, provenance or store.provenance({}))
+            results = (_let_go(result.isel(y=rows)) for rows in blocks)
+            store.save_rows(results, target, provenance or store.provenance({}))
         return store.open_dataset(target)
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
@@ -149,18 +149,22 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
     if not isinstance(options, Mapping):
         kind = type(options).__name__
         raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
-    by_name = [one for one in signature(step).parameters.values() if one.kind is one.KEYWORD_ONLY]
+    by_name = [
+        parameter
+        for parameter in signature(step).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    ]
     hidden = {"lazy", "reflection_shift"} if step is align else {"lazy"}
-    known = [one.name for one in by_name if one.name not in hidden]
+    names = [parameter.name for parameter in by_name if parameter.name not in hidden]
     for option in options:
-        if option not in known:
-            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {known}.")
+        if option not in names:
+            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {names}.")
 
 
-def _let_go(part: xr.Dataset) -> xr.Dataset:
+def _let_go(rows: xr.Dataset) -> xr.Dataset:
     """Rows of a result, when those before need no more memory."""
     release()
-    return part
+    return rows
 
 
 def _aligned(
@@ -177,10 +181,10 @@ def _aligned(
         if field is not None and cameras_apart(aligned, response) > 0.0:
             return aligned, field
         return aligned, None
-    found = joint.compare(corrected, scale, **options)
-    aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    if found.field is not None and not cameras_apart(aligned, response) > 0.0:
+    comparison = joint.compare(corrected, scale, **options)
+    aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
+    if comparison.field is not None and not cameras_apart(aligned, response) > 0.0:
         # No delay of a shift that is not used.
-        found = joint.compare(corrected, scale, **options, side_by_side=False)
-        aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    return found.noted(aligned), found.field
+        comparison = joint.compare(corrected, scale, **options, side_by_side=False)
+        aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
+    return comparison.noted(aligned), comparison.field

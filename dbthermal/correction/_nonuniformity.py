@@ -166,13 +166,13 @@ def fit_correction(
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = (counts.sizes["y"], counts.sizes["x"])
-    parts = []
+    fits = []
     for band in counts:
         frames = band.values.astype(np.float64).reshape(-1, image[0] * image[1])
-        parts.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
-    gain, offset, bad, residual, level = (np.stack(part) for part in zip(*parts, strict=True))
+        fits.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
+    gain, offset, bad, residual, level = (np.stack(values) for values in zip(*fits, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
-    values = {name: part.reshape(-1, *image) for name, part in maps.items()}
+    values = {name: values.reshape(-1, *image) for name, values in maps.items()}
     values |= {"residual": residual, "level": level} | _residual_pattern(residual, level, blackbody)
     coords = {name: counts.coords[name] for name in counts.dims if name in counts.coords}
     attrs: dict[str, Any] = {"threshold": threshold, "detector_maximum": maximum}
@@ -213,9 +213,11 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     good = ~correction["bad"].values
     if not np.all(schema.measured(flat.values[good])):
         raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
-    seen = correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
-    level = np.mean(seen, axis=(1, 2), where=good, keepdims=True)
-    offset = np.where(good, correction["offset"].values - (seen - level), 0.0)
+    corrected = (
+        correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
+    )
+    level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
+    offset = np.where(good, correction["offset"].values - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
     if correction.keys() >= _PATTERN and "level" in correction:
         # The offset has the image's error, v, instead of that of n images, v / n.
@@ -397,6 +399,6 @@ def _require_rising(maps: xr.Dataset) -> xr.Dataset:
     """Refuse gains and offsets that are not finite, and gains of good pixels not positive."""
     for name, holds in {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}.items():
         if not np.all(schema.measured(maps[name]) & holds):
-            found = f"Invalid {name} of the correction: not finite, or not positive"
-            raise ValueError(f"{found}. Must be finite, and a gain positive.")
+            label = f"Invalid {name} of the correction: not finite, or not positive"
+            raise ValueError(f"{label}. Must be finite, and a gain positive.")
     return maps.drop_vars(["y", "x"], errors="ignore")

@@ -310,7 +310,8 @@ def get_method(name: str | Method) -> Method:
     if name not in METHODS:
         raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}, or a `Method`.")
     module = importlib.import_module(f"dbthermal.separation.{_MODULES[name]}")
-    return replace(module.METHOD, name=name)
+    method: Method = module.METHOD
+    return replace(method, name=name)
 
 
 def _separate_all(

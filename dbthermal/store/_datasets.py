@@ -56,10 +56,10 @@ def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> 
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
-    most = height or sizes["y"]
-    rows = min(most, math.ceil(pixels / width))
+    tallest = height or sizes["y"]
+    rows = min(tallest, math.ceil(pixels / width))
     if height:
-        rows = next(count for count in range(rows, most + 1) if most % count == 0)
+        rows = next(count for count in range(rows, tallest + 1) if tallest % count == 0)
     return tuple((sizes | {"y": rows, "x": width}).values())
 
 
@@ -124,12 +124,12 @@ def save_rows(
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    rest = iter(parts)
-    if (first := next(rest, None)) is None:
+    following = iter(parts)
+    if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
     if height is not None and (type(height) is not int or height < 1):
         raise ValueError(f"Invalid height {height!r} of the rows. Must be a whole number from 1.")
-    _save(chain([first], rest), path, provenance, height or first.sizes.get("y"))
+    _save(chain([first], following), path, provenance, height or first.sizes.get("y"))
 
 
 def _save(
@@ -155,15 +155,20 @@ def _save(
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {name: _chunks(one, height) for name, one in plain.variables.items()}
+            chunks = {name: _chunks(variable, height) for name, variable in plain.variables.items()}
             if number > 0:
-                rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
-                plain = plain.drop_vars(rest)
-            for name, one in plain.variables.items():
-                if one.chunks is not None:  # those of dask are written as those of the store
-                    plain[name] = one.chunk(dict(zip(one.dims, chunks[name], strict=True)))
+                constant = [
+                    name for name, variable in plain.variables.items() if "y" not in variable.dims
+                ]
+                plain = plain.drop_vars(constant)
+            for name, variable in plain.variables.items():
+                if variable.chunks is not None:  # those of dask are written as those of the store
+                    plain[name] = variable.chunk(
+                        dict(zip(variable.dims, chunks[name], strict=True))
+                    )
             encoding = {
-                name: {"chunks": one, "compressors": _COMPRESSORS} for name, one in chunks.items()
+                name: {"chunks": shape, "compressors": _COMPRESSORS}
+                for name, shape in chunks.items()
             }
             plain.to_zarr(
                 SummedStore(folder),
@@ -186,43 +191,50 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
 
 def _check(part: xr.Dataset) -> None:
     """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
-    every = {f"'{name}'": one.attrs for name, one in part.variables.items()}
-    for label, attrs in {"the dataset": part.attrs, **every}.items():
+    attributes = {f"'{name}'": variable.attrs for name, variable in part.variables.items()}
+    for owner, attrs in {"the dataset": part.attrs, **attributes}.items():
         for key, value in attrs.items():
             decoded = key in _DECODED or (key == "units" and " since " in str(value))
             if (decoded and attrs is not part.attrs) or key == "coordinates":
-                found = f"Invalid attribute '{key}' of {label}"
-                raise ValueError(f"{found}. Must be left out: values are kept as they are.")
+                label = f"Invalid attribute '{key}' of {owner}"
+                raise ValueError(f"{label}. Must be left out: values are kept as they are.")
             try:
-                json.dumps(value, default=lambda it: it.tolist())  # what NumPy made
+                json.dumps(value, default=lambda element: element.tolist())  # what NumPy made
             except (AttributeError, TypeError) as error:
-                found = f"Invalid attribute '{key}' of {label}, of type {type(value).__name__}"
-                raise TypeError(f"{found}. Must be text, numbers, or lists of these.") from error
-    for name, one in part.variables.items():
+                label = f"Invalid attribute '{key}' of {owner}, of type {type(value).__name__}"
+                raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
+    for name, variable in part.variables.items():
         if "/" in str(name):
             raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
-        text = one.dtype.kind == "O" and all(isinstance(it, str) for it in one.values.flat)
+        text = variable.dtype.kind == "O" and all(
+            isinstance(element, str) for element in variable.values.flat
+        )
         if not (
             text
-            or one.dtype.kind in "UTMm"
-            or (one.dtype.kind in "biuf" and one.dtype.itemsize <= 8)
+            or variable.dtype.kind in "UTMm"
+            or (variable.dtype.kind in "biuf" and variable.dtype.itemsize <= 8)
         ):
             rule = "Must be real numbers of at most 64 bits, truth values, or text"
-            raise TypeError(f"Invalid dtype {one.dtype} of '{name}'. {rule}.")
+            raise TypeError(f"Invalid dtype {variable.dtype} of '{name}'. {rule}.")
 
 
 def _check_same(part: xr.Dataset, first: xr.Dataset, number: int) -> None:
     """Refuse a part whose variables, units or coordinates are not those of the first."""
     for name in part.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
-    for name, one in part.variables.items():
-        other = first.variables[name]
-        same = one.dims == other.dims and one.dtype == other.dtype
-        sizes = [[it.sizes[dim] for dim in it.dims if dim != "y"] for it in (one, other)]
-        same &= sizes[0] == sizes[1] and one.attrs.get("units") == other.attrs.get("units")
-        if same and name in part.coords and "y" not in one.dims:
-            same = bool(one.equals(other))  # type: ignore[no-untyped-call]
-        if not same:
+    for name, variable in part.variables.items():
+        reference = first.variables[name]
+        equal = variable.dims == reference.dims and variable.dtype == reference.dtype
+        sizes = [
+            [candidate.sizes[dim] for dim in candidate.dims if dim != "y"]
+            for candidate in (variable, reference)
+        ]
+        equal &= sizes[0] == sizes[1] and variable.attrs.get("units") == reference.attrs.get(
+            "units"
+        )
+        if equal and name in part.coords and "y" not in variable.dims:
+            equal = bool(variable.equals(reference))  # type: ignore[no-untyped-call]
+        if not equal:
             raise ValueError(
                 f"Invalid '{name}' of rows {number}. Must have the dims, type, unit and, of a "
                 "coordinate, the values of the first."
@@ -325,19 +337,19 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     """
     if not (folders := [texts.as_path(part) for part in parts]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
-    first, *rest = folders
+    first, *following = folders
     with whole(path, ".zarr") as folder:
         shutil.copytree(first, folder, copy_function=_link)
-        metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
-        along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
+        metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
+        along = {file: array for file, array in metadata.items() if "y" in array["dimension_names"]}
         sums = last_sums(folder)
-        for part in rest:
-            for one, array in along.items():
-                sums |= _added(part / one.parent.name, one.parent, array)
-        for one, array in along.items():
-            one.unlink()
-            one.write_text(json.dumps(array, indent=2))
-            sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
+        for part in following:
+            for file, array in along.items():
+                sums |= _added(part / file.parent.name, file.parent, array)
+        for file, array in along.items():
+            file.unlink()
+            file.write_text(json.dumps(array, indent=2))
+            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(file.read_bytes()):08x}"
         (folder / SUMS).unlink()
         (folder / SUMS).write_bytes(sums_file(sums))
 
@@ -354,17 +366,17 @@ def _added(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
     """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
     place = array["dimension_names"].index("y")
     end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
-    own, sums = last_sums(part.parent), {}
+    part_sums, sums = last_sums(part.parent), {}
     if end % rows:
         raise ValueError(
             f"Invalid part '{part.parent}' after {end} rows in chunks of {rows}. Must follow whole "
             "chunks."
         )
-    for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
+    for chunk in [chunk for chunk in (part / "c").rglob("*") if chunk.is_file()]:
         numbers = list(chunk.relative_to(part / "c").parts)
         numbers[place] = str(int(numbers[place]) + end // rows)
         added = whole.joinpath("c", *numbers)
-        sums[added.relative_to(whole.parent).as_posix()] = own[
+        sums[added.relative_to(whole.parent).as_posix()] = part_sums[
             chunk.relative_to(part.parent).as_posix()
         ]
         added.parent.mkdir(parents=True, exist_ok=True)
