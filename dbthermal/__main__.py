@@ -369,12 +369,12 @@ def _lines(summary: Any, indent: str = "") -> Iterator[str]:
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")
             continue
-        parts = (
+        entries = (
             [f"{name} {number:g}" for name, number in value.items()]
             if isinstance(value, dict)
             else leaves(value)
         )
-        if line := ", ".join(map(str, parts)):
+        if line := ", ".join(map(str, entries)):
             yield f"{indent}{key}: {line}"
 
 

@@ -319,7 +319,7 @@ def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataA
     if counts.dims[:1] != ("band",):
         raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
-    both = zip(curves(response, names), counts.values, strict=True)
-    values = [band_curve.inverse(values_of_band) for band_curve, values_of_band in both]
+    pairs = zip(curves(response, names), counts.values, strict=True)
+    values = [band_curve.inverse(band_counts) for band_curve, band_counts in pairs]
     result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
     return result.assign_attrs(units="K", long_name="apparent temperature")

@@ -92,7 +92,7 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
         raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name both, such as: --bands 8-14 9.5.")
-    first, second = (recording(part, options) for part in (paths[:place], paths[place + 1 :]))
+    first, second = (recording(files, options) for files in (paths[:place], paths[place + 1 :]))
     return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
 
 
@@ -112,11 +112,11 @@ def saved(
     result: xr.Dataset, options: argparse.Namespace, path: Path | None = None
 ) -> dict[str, Any]:
     """Save a result with its provenance, a capture by rows, which may be lazy, and describe it."""
-    path, parts = path or options.output, [slice(None)]
+    path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
-        parts = [*_rows.blocks(result["counts"].shape)]
-    bar = tqdm(parts, desc=options.command, unit="block", disable=not sys.stderr.isatty())
-    rows = (result.isel(y=part, missing_dims="ignore") for part in bar)
+        blocks = [*_rows.blocks(result["counts"].shape)]
+    bar = tqdm(blocks, desc=options.command, unit="block", disable=not sys.stderr.isatty())
+    rows = (result.isel(y=block, missing_dims="ignore") for block in bar)
     store.save_rows(rows, path, provenance(options))
     return described(path)
 
@@ -179,9 +179,9 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
-            values = [part[np.isfinite(part)] for part in np.atleast_1d(good.values)]
-            if all(part.size for part in values):
-                medians = [round(float(np.median(part)), 4) for part in values]
+            values = [pixels[np.isfinite(pixels)] for pixels in np.atleast_1d(good.values)]
+            if all(pixels.size for pixels in values):
+                medians = [round(float(np.median(pixels)), 4) for pixels in values]
                 lines[f"median_{name}{unit}"] = dict(zip(lines["bands"], medians, strict=True))
     if not everything:
         return lines

@@ -118,14 +118,14 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
-        parts = np.zeros(frames.size) if segment is None else segment[frames]
-        movie, stepped = movie.isel(time=frames), np.diff(parts) != 0
-        segments = np.unique(parts)
+        segment_numbers = np.zeros(frames.size) if segment is None else segment[frames]
+        movie, stepped = movie.isel(time=frames), np.diff(segment_numbers) != 0
+        segments = np.unique(segment_numbers)
         level, still = np.empty(image), np.empty((segments.size, *image))
         for rows in _rows.blocks(movie.shape, _BLOCK):
             block = _samples(movie, rows)
             level[rows] = samples.noise(block)
-            still[:, rows] = [_mean(block[parts == number]) for number in segments]
+            still[:, rows] = [_mean(block[segment_numbers == number]) for number in segments]
         judged = np.isfinite(level)
         if not judged.any():
             raise ValueError(

@@ -2,7 +2,7 @@
 
 Begin with `solve(corrected, response)`; `METHODS` names the methods, and each method that has
 options takes them as its frozen record, such as `SubspaceSettings`. A `Method` of your code, a
-function of a `Tile` that returns an `Estimate`, is passed to `solve` in place of a name.
+function of a `_tiles.Tile` that returns a `_tiles.Estimate`, is passed to `solve` like a name.
 """
 
 import importlib
@@ -15,7 +15,6 @@ from dbthermal.separation._reflection import reflected_change
 from dbthermal.separation._run import run
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
-from dbthermal.separation._tiles import Estimate, Tile
 
 if TYPE_CHECKING:
     from dbthermal.separation._calibrated import CalibratedSettings
@@ -27,11 +26,9 @@ __all__ = [
     "METHODS",
     "CalibratedSettings",
     "DbvtSettings",
-    "Estimate",
     "Method",
     "Stream",
     "SubspaceSettings",
-    "Tile",
     "complete",
     "get_method",
     "materials",

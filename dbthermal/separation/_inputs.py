@@ -47,7 +47,7 @@ class Method:
     Attributes
     ----------
     separate : callable
-        `Estimate` of a `Tile`, and of the settings where the method has any.
+        A `_tiles.Estimate` of a `_tiles.Tile`, and of the settings where the method has any.
     settings : type, optional
         Frozen dataclass of the method's options; a field `batch` is the pixels of a tile.
     name : str

@@ -119,49 +119,19 @@ class Survey(Pixels):
 
 @dataclass(frozen=True)
 class Tile:
-    """
-    Inputs of one tile: linearised signals, responses, noise, and quantities known beforehand.
+    """Inputs of one tile: linearised signals, responses, noise, and quantities known beforehand."""
 
-    Bands stand in the order of their noise, the quietest first. Pixels follow one another along
-    the rows.
-
-    Attributes
-    ----------
-    signals : array
-        Signals less the reference temperature (band, time, pixel) [K], finite.
-    time : array
-        Times (time,) [s].
-    curves : tuple of Curve
-        Response of each band, of one reference temperature.
-    noise : tuple of float
-        Standard deviation of each band's signal at the reference temperature [K].
-    shape : tuple of int
-        Rows and columns.
-    rng : Generator
-        Source of random starts, of this tile alone.
-    pattern : tuple of float, optional
-        Residual fixed pattern of each band [K].
-    segment : array, optional
-        Number of shutter events before each frame (time,).
-    material : Material, optional
-        What pooling knows of the pixels.
-    emissivity : array, optional
-        Emissivity known beforehand (band, pixel) [1].
-    emissivity_covariance : array, optional
-        Its covariance (band, band, pixel) [1].
-    """
-
-    signals: Array
-    time: Array
-    curves: tuple[Curve, ...]
-    noise: tuple[float, ...]
-    shape: tuple[int, int]
-    rng: np.random.Generator
-    pattern: tuple[float, ...] | None = None
-    segment: Whole | None = None
+    signals: Array  # less the reference temperature (band, time, pixel) [K], finite
+    time: Array  # (time,) [s]
+    curves: tuple[Curve, ...]  # response of each band, of one reference temperature
+    noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
+    shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
+    rng: np.random.Generator  # the tile's own source of random starts
+    pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
+    segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
-    emissivity: Array | None = None
-    emissivity_covariance: Array | None = None
+    emissivity: Array | None = None  # known beforehand (band, pixel) [1]
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     @property
     def reference(self) -> float:
@@ -206,35 +176,18 @@ class Tile:
 
 @dataclass(frozen=True)
 class Estimate(Pixels):
-    """
-    Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so.
+    """Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so."""
 
-    Attributes
-    ----------
-    object_temperature, background_temperature : array
-        Temperatures (time, pixel) [K].
-    emissivity : array
-        Emissivity (band, pixel) [1].
-    object_temperature_std, background_temperature_std, emissivity_std : array
-        Their standard deviations.
-    status : array
-        Bits of `schema.Status` (pixel).
-    reflection_ratio, reflection_ratio_std : array, optional
-        Reflectivity over that of the first band (band, pixel) [1].
-    emissivity_covariance : array, optional
-        Covariance of the emissivities (band, band, pixel) [1].
-    """
-
-    object_temperature: Array
+    object_temperature: Array  # (time, pixel) [K]
     object_temperature_std: Array
-    background_temperature: Array
+    background_temperature: Array  # (time, pixel) [K]
     background_temperature_std: Array
-    emissivity: Array
+    emissivity: Array  # (band, pixel) [1]
     emissivity_std: Array
-    status: Bits
-    reflection_ratio: Array | None = None
+    status: Bits  # `schema.Status` (pixel)
+    reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
-    emissivity_covariance: Array | None = None
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     @classmethod
     def without_std(

@@ -254,11 +254,11 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """
     path = check_place(path, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as beside:
-        part = Path(beside) / path.name
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
         yield part
         if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(Path(beside) / "replaced")
+            path.rename(Path(folder) / "replaced")
         part.replace(path)
 
 

@@ -26,9 +26,9 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
 from dbthermal.response import require_range
-from dbthermal.separation import Estimate, Method, Tile
+from dbthermal.separation import Method
 from dbthermal.separation._inputs import check_fields, require
-from dbthermal.separation._tiles import WITHOUT_STD, Array, Mask
+from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
 
 
 @dataclass(frozen=True)

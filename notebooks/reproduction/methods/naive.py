@@ -21,10 +21,10 @@ from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
-from dbthermal.separation import Estimate, Method, Tile
+from dbthermal.separation import Method
 from dbthermal.separation._inputs import check_fields, require
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import WITHOUT_STD, Array, Mask, Pixels
+from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Pixels, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
