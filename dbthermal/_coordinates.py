@@ -56,11 +56,8 @@ def _require_same(
     """ValueError where two coordinates differ: numbers beyond rounding, all else as text."""
     if {values.dtype.kind, reference.dtype.kind} <= set("iuf"):
         actual, wanted = values.astype(np.float64), reference.astype(np.float64)
-        floats = [
-            np.finfo(coordinate.dtype).eps
-            for coordinate in (values, reference)
-            if coordinate.dtype.kind == "f"
-        ]
+        dtypes = (values.dtype, reference.dtype)
+        floats = [np.finfo(dtype).eps for dtype in dtypes if dtype.kind == "f"]
         tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(wanted).max(initial=0.0)
         if wanted.size > 1:
             tolerance += _STEP * np.abs(np.diff(wanted)).min()

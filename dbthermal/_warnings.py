@@ -1,4 +1,4 @@
-"""Sentences on what speaks against data that pass, which stay with these."""
+"""Warnings that are also stored in a dataset's attributes."""
 
 import warnings
 from typing import Final

@@ -144,7 +144,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 
 
 def _check_options(step: Callable[..., Any], options: Any) -> None:
-    """Refuse what is no mapping of options that a step has by name, and is not given here."""
+    """Refuse options that are no mapping, or that a step does not take by name."""
     name = step.__name__
     if not isinstance(options, Mapping):
         kind = type(options).__name__
@@ -162,7 +162,7 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
 
 
 def _let_go(rows: xr.Dataset) -> xr.Dataset:
-    """Rows of a result, when those before need no more memory."""
+    """Free the memory of the rows before; return these."""
     release()
     return rows
 
@@ -170,7 +170,7 @@ def _let_go(rows: xr.Dataset) -> xr.Dataset:
 def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Capture on one clock, and the shift of its reflections; None where they are not apart."""
+    """Synchronise the bands; return the capture, and the reflection shift or None."""
     options = {name: value for name, value in options.items() if value is not None}
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))

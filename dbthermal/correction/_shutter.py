@@ -77,15 +77,13 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     [21, 5, 2.1, 2.5, True]
     """
     counts = schema.check(corrected, "corrected")["counts"]
-    closed_frames = _closed_frames(counts, closed)
+    shut = _closed_frames(counts, closed)
     runs = []
     for index, name in enumerate(counts["band"].values):
-        marked = closed_frames[index] | _copies(counts.isel(band=index))
+        marked = shut[index] | _copies(counts.isel(band=index))
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
-            renewed = (
-                bool(closed_frames[index, first:after].any()) or after - first >= FEWEST_COPIES
-            )
+            renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     return _events(runs, counts["time"].values.astype(np.float64))
 
@@ -180,12 +178,10 @@ def _copies(counts: xr.DataArray) -> Mask:
     if candidates.size:  # the whole of their images
         copies[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
-        current, before = (
-            np.searchsorted(needed, frames) for frames in (candidates, candidates - 1)
-        )
+        after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
         for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
             block = counts.isel(time=needed, y=rows).values
-            copies[candidates] &= ~_changed(block[before], block[current])[0].any(axis=(1, 2))
+            copies[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
     return copies
 
 

@@ -79,7 +79,7 @@ class Explorer(anywidget.AnyWidget):
         return _export.curves(self.view, name, self.regions, self._state["pixels"])
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """Widget for who has one, and a picture for who has none."""
+        """Show the widget, or a static picture where widgets are not available."""
         bundle = super()._repr_mimebundle_(**options)
         data = bundle[0] if isinstance(bundle, tuple) else bundle
         if data is not None:
@@ -105,7 +105,7 @@ class Explorer(anywidget.AnyWidget):
         return self._limits[name]
 
     def _on_message(self, _: object, content: dict[str, Any], __: Sequence[object]) -> None:
-        """Answer a question of a page, which waits for it; an error is an answer, too."""
+        """Answer a request of the page; an error is an answer, too."""
         key = {name: content.get(name) for name in ("page", "kind")}
         self.view.progress = lambda text, share: self.send(
             {**key, "progress": f"{text}: {100 * share:.0f} %"}

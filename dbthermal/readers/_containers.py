@@ -125,11 +125,7 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
                 stored = content[start - size :][: variable[0].size * kind.itemsize].view(">u2")
                 if not np.array_equal(variable[0].values.ravel(), stored):
                     raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-    return {
-        str(n): variable
-        for n, variable in variables.items()
-        if variable.ndim == 3 or are_times(n, variable)
-    }
+    return {str(n): v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:

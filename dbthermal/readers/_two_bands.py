@@ -68,9 +68,9 @@ def two_bands(
     >>> import numpy as np
     >>> from dbthermal import readers
     >>> counts = np.arange(18000, 18060, dtype=np.uint16).reshape(5, 3, 4)
-    >>> one = readers.array(counts, unit="count", clock=30.0)
-    >>> other = readers.array(counts[:4] + 900, unit="count", clock=30.0)
-    >>> capture = two_bands(one, other, bands=("8-14", "9.5"), offset=0.01)
+    >>> first = readers.array(counts, unit="count", clock=30.0)
+    >>> second = readers.array(counts[:4] + 900, unit="count", clock=30.0)
+    >>> capture = two_bands(first, second, bands=("8-14", "9.5"), offset=0.01)
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
@@ -112,11 +112,11 @@ def two_bands(
     times = np.full((2, frames), np.nan)
     flags = np.full((2, frames), FileFlag.PADDED.value, dtype=np.uint16)
     for place, (recording, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
-        frames_recorded = recording.sizes["time"]
-        counts[place, :frames_recorded] = recording["counts"].values
-        counts[place, frames_recorded:] = recording["counts"].values[-1]
-        times[place, :frames_recorded] = recording["exposure_time"].values + shift
-        flags[place, :frames_recorded] = recording["frame_flags"].values
+        length = recording.sizes["time"]
+        counts[place, :length] = recording["counts"].values
+        counts[place, length:] = recording["counts"].values[-1]
+        times[place, :length] = recording["exposure_time"].values + shift
+        flags[place, :length] = recording["frame_flags"].values
     longer = int(second.sizes["time"] > first.sizes["time"])
     clock = pair[longer]["time"].values + (0.0, late)[longer]
     variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
@@ -130,19 +130,15 @@ def two_bands(
         "files": {name: dict(recording.attrs) for name, recording in zip(names, pair, strict=True)},
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
-    borders = [
-        _border(counts_of_band, name)
-        for counts_of_band, name in zip(overlapping, names, strict=True)
-    ]
+    borders = map(_border, overlapping, names)
     return warned(capture, *_temperatures(overlapping), *filter(None, borders))
 
 
 def _names(bands: Any) -> list[str]:
     """Names of two bands, which must be texts, and differ."""
     is_pair = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
-    names = (
-        [str(name) for name in bands if isinstance(name, str) and name.strip()] if is_pair else []
-    )
+    listed = bands if is_pair else []
+    names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if len({*names}) != 2:
         raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
     return names
