@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-from dbthermal._signals import stride
+from dbthermal._samples import stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 

@@ -15,7 +15,7 @@ import xarray as xr
 from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-from dbthermal._signals import stride
+from dbthermal._samples import stride
 
 Integers = npt.NDArray[np.int64]
 
