@@ -142,8 +142,8 @@ lab: ## open JupyterLab on a copy of the five-minute tour, in results/lab
 bench: .venv/installed ## measure the default call, every method, and a run from disk to disk, into results/bench
 	$(python) -m reproduction.benchmark
 
-attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/trust.md
-	PYTHONPATH=tests:notebooks $(python) -m attack --inputs 6000 --seed 900001 --write docs/trust.md
+attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/attack.md
+	PYTHONPATH=tests:notebooks $(python) -m attack --inputs 6000 --seed 900001 --write docs/attack.md
 
 lock: .venv/installed ## write both locks anew from pyproject.toml, keeping the pins that still fit
 	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet uv

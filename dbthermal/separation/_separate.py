@@ -83,7 +83,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     settings : SubspaceSettings, optional
         Options of the method "subspace".
     alone : Dataset, optional
-        Result of `solve` for the same arguments, if at hand: the first step is not done again.
+        Result of `solve` for the same arguments, if at hand: of cameras at one place the first step
+        is not done again.
     workers : int
         Number of threads.
     progress : bool
@@ -130,7 +131,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
-    if alone is None or source == "found":
+    if alone is None or reflection_shift is not None:
         alone = separated(known, workers=workers, progress=progress)
     doubts = [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
     if reflection_shift is not None:

@@ -8,18 +8,20 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
 from dbthermal._arrays import empty, release
+from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
 from dbthermal.separation._apart.side_by_side import Regroup
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import Estimate, Mask, Material
+from dbthermal.separation._tiles import Estimate, Mask, Material, Whole
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance  # settings of a method from outside
@@ -368,28 +370,42 @@ def _write(
 
     The tile's bands have these places in the capture. What has no estimate becomes NaN.
     """
-    order = np.argsort(bands)
-    complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
+    order, shape = np.argsort(bands), tuple(part.stop - part.start for part in cut.window)
+    unestimated = np.ones(cut.status.size, dtype=bool)
+    for _, pixels, _ in estimates:
+        unestimated &= ~pixels
     for name in map(str, result.data_vars):
-        target = result.variables[name].values[..., *cut.window]
-        dims, shape = result.variables[name].dims, target.shape[-2:]
+        target, dims = result.variables[name].values[..., *cut.window], result.variables[name].dims
         if name == "status":
             target[...] = cut.status.reshape(shape)
-        elif not complete or any(getattr(estimate, name) is None for _, _, estimate in estimates):
-            target[...] = np.nan
+        else:
+            target[..., unestimated.reshape(shape)] = np.nan
         for frames, pixels, estimate in estimates:
-            values = getattr(estimate, name)
+            values, places = getattr(estimate, name), pixels.reshape(shape)
             if values is None:
-                continue
-            where = pixels.reshape(shape)
-            if name == "status":
-                target[where] |= values
+                target[..., places] = np.nan
+            elif name == "status":
+                target[places] |= values
             elif "band" in dims:
-                target[..., where] = values[np.ix_(*[order] * (values.ndim - 1))]
-            elif np.all(frames) and np.all(where):
+                target[..., places] = values[np.ix_(*[order] * (values.ndim - 1))]
+            elif np.all(frames) and np.all(pixels) and np.all(cut.valid):
                 target[...] = values.reshape(target.shape)
             else:
-                rows, columns = np.nonzero(where)
-                target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values
-        if "time" in dims and not np.all(cut.valid):
-            target[~cut.valid.reshape(-1, *shape)] = np.nan
+                values, places = np.asarray(values, np.float32), np.flatnonzero(pixels)
+                _scatter(values, frames, places, cut.valid, target)
+
+
+@compiled
+def _scatter(
+    values: npt.NDArray[np.float32], frames: Mask, places: Whole, valid: Mask, film: Any
+) -> None:
+    """Write values (time, pixel) at some frames and places of a film (time, y, x), in place.
+
+    NaN at its other frames, and at samples (time, pixel) that are not valid.
+    """
+    row, width = 0, film.shape[2]
+    for t in range(frames.size):
+        for p in range(places.size):
+            measured = frames[t] and valid[t, places[p]]
+            film[t, places[p] // width, places[p] % width] = values[row, p] if measured else np.nan
+        row += frames[t]

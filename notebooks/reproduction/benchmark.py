@@ -263,20 +263,20 @@ def machine() -> str:
 
 def gpu() -> str:
     """Name of the first GPU of torch."""
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "a GPU was not at hand"
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
 
 
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
-"""Marks around the default call's figures in README.md and docs/benchmarks.md."""
+"""Marks around the default call's figures in docs/benchmarks.md."""
 
 DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
-pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` treats each
-pixel alone, and is told the shift between cameras apart. Times are of one thread's processor,
-after a first call that compiles; errors are medians over the pixels without a flag. What is
-measured of 640x512 pixels is one capture, by the clock, with two threads.
+pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` works pixel
+by pixel, and for displaced cameras its time does not include the shift of the reflections. Times
+are processor times of one thread, after a first call that compiles; errors are medians over the
+unflagged pixels. Frames of 640x512 are one capture, timed by the clock, with two threads.
 
 {machine}.
-Load when it began: {busy:.1f}; the clock's figures are too slow where others work on it.
+Load average at the start: {busy:.1f}; on a loaded computer, times by the clock are too long.
 
 {table}
 """
@@ -284,8 +284,8 @@ Load when it began: {busy:.1f}; the clock's figures are too slow where others wo
 HEAD: Final = """# Benchmarks
 
 Made by `make bench` on {machine}.
-Load of the machine when it began: {busy:.1f}; where others work on it, what is of the clock is too
-slow. All captures are simulated.
+Load average at the start: {busy:.1f}; on a loaded computer, times by the clock are too long. All
+captures are simulated.
 
 ## The default call
 
@@ -295,22 +295,22 @@ slow. All captures are simulated.
 
 {ratios}
 
-Processor time of one thread, {frames} frames, two bands, the most pixels. Exponents are those of a
-power law over the sizes in brackets, for at small ones what has nothing to do with the size counts;
-over frames of {few} pixels, over bands of {pixels}.
+Processor time of one thread, {frames} frames, two bands, the largest number of pixels. Exponents
+are those of a power law over the sizes in brackets; small sizes contain a constant part. Series
+over frames have {few} pixels, series over bands {pixels}.
 
 {methods}
 
 `subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
 
-`subspace` by the form of its steps ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
-thread, of a GPU the clock's; {gpu}. Bytes are those of the samples and of the four films
-of results, against what a copy reads and writes in the same memory.
+`subspace` compiled and on tensors ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
+thread, on a GPU by the clock; {gpu}. Bytes are those of the samples and of the four films
+of results, compared with a copy in the same memory.
 
 {forms}
 
-On paper, from the rate of {processes} processes, with nothing lost between machines, which share
-only a disk.
+Estimates from the rate of {processes} processes, without any loss between computers that share only
+a disk.
 
 {costs}
 """
@@ -429,10 +429,10 @@ def figure(times: Times) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, and write results/bench/benchmarks.md and .png; README and docs too, if asked."""
+    """Measure, and write results/bench/benchmarks.md and .png; the page in docs too, if asked."""
     parser = argparse.ArgumentParser(prog="reproduction.benchmark", description=__doc__)
     parser.add_argument("--default-call", action="store_true", help="measure nothing else")
-    parser.add_argument("--write", action="store_true", help="write README.md and docs, too")
+    parser.add_argument("--write", action="store_true", help="write docs/benchmarks.md, too")
     chosen = parser.parse_args(arguments)
     busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
     folder.mkdir(parents=True, exist_ok=True)
@@ -442,7 +442,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             calls[name] = call
             print(*name, call, flush=True)
     text = default = default_figures(calls, busy)
-    readme, page = paths.root() / "README.md", paths.root() / "docs" / "benchmarks.md"
+    page = paths.root() / "docs" / "benchmarks.md"
     if not chosen.default_call:
         times = all_series()
         with TemporaryDirectory(dir=folder) as place:
@@ -453,9 +453,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             page.write_text(text, encoding="utf-8")
     store.save_text(text, folder / "benchmarks.md", record)
     if chosen.write:
-        for path in (readme, page):
-            old = path.read_text(encoding="utf-8")
-            path.write_text(verify.enclosed(old, MARKS, default, path.name), encoding="utf-8")
+        old = page.read_text(encoding="utf-8")
+        page.write_text(verify.enclosed(old, MARKS, default, page.name), encoding="utf-8")
     print(text)
     return 0
 

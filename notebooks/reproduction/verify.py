@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from reproduction import integrity, paper, paths
+from reproduction import accuracy, integrity, paper, paths
 from reproduction import numbers as headline
 
 TOLERANCE: Final = 0.01
@@ -85,20 +85,25 @@ def enclosed(page: str, marks: tuple[str, str], text: str, name: str) -> str:
     return f"{head}{start}\n\n{text}\n{stop}{tail}"
 
 
-def with_table(page: str, numbers: Mapping[str, Numbers]) -> str:
-    """Text of docs/paper.md with the comparison with the paper between its `MARKS`."""
-    return enclosed(page, MARKS, paper.markdown(numbers), "docs/paper.md")
+def pages(numbers: Mapping[str, Numbers]) -> Iterator[tuple[Path, str]]:
+    """Yield each page that holds reference numbers, with its text for these numbers."""
+    for name, marks, text in (
+        ("docs/paper.md", MARKS, paper.markdown(numbers)),
+        ("docs/accuracy.md", accuracy.MARKS, accuracy.markdown(numbers)),
+        ("README.md", accuracy.README_MARKS, accuracy.figure_6(numbers)),
+    ):
+        page = paths.root() / name
+        yield page, enclosed(page.read_text(encoding="utf-8"), marks, text, name)
 
 
 def record(numbers: Mapping[str, Numbers], reference: Mapping[str, object]) -> None:
-    """Keep a run's numbers as the reference of its kind; with data, in docs/paper.md, too."""
+    """Keep a run's numbers as the reference of its kind; with data, on the pages, too."""
     kind = kind_of(numbers)
     text = json.dumps({**reference, kind: numbers}, indent=1, sort_keys=True)
     reference_path().write_text(text + "\n", encoding="utf-8")
     if kind == "with data":
-        page = paths.root() / "docs" / "paper.md"
-        text = with_table(page.read_text(encoding="utf-8"), numbers)
-        page.write_text(text, encoding="utf-8")
+        for page, text in pages(numbers):
+            page.write_text(text, encoding="utf-8")
     print(f"kept {sum(map(len, numbers.values()))} numbers, {kind}")
 
 

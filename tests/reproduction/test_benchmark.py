@@ -50,15 +50,14 @@ def test_the_table_says_what_was_measured() -> None:
 
 
 def test_the_default_call_is_on_its_pages() -> None:
-    """Its figures are said first in docs/benchmarks.md and in README.md, between their marks."""
+    """Its figures stand first in docs/benchmarks.md, between their marks."""
     call = default_call.Call(pixel=7e-5, rmse=0.0312, cover=0.951, frame_rate=31.0, peak=4.2e9)
     calls = {("separate", "one place"): call}
     text = benchmark.default_figures(calls, 0.5)
     line = "| `separate` | one place | 70 | 31 | 31 | 4.2 GB | 0.031 K | 95.1 % |"
     assert line in text.splitlines()
-    for name in ("README.md", "docs/benchmarks.md"):
-        page = (paths.root() / name).read_text(encoding="utf-8")
-        assert text in verify.enclosed(page, benchmark.MARKS, text, name)
+    page = (paths.root() / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert text in verify.enclosed(page, benchmark.MARKS, text, "docs/benchmarks.md")
 
 
 @pytest.mark.slow

@@ -1,8 +1,7 @@
 """Equations that couple the object signals at both cameras' places, of all pixels; see `joint`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +17,7 @@ from dbthermal._arrays import Array, parts
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
-from dbthermal.separation._apart.displaced import Displacement, without
+from dbthermal.separation._apart.displaced import without
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.reflection_ratio import (
     CHANCE,
@@ -217,7 +216,7 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
         forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
-        bends=bends([inputs.curves[band] for band in inputs.bands]),
+        bends=bends(tuple(inputs.curves[band] for band in inputs.bands)),
     )
 
 
@@ -229,7 +228,8 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def bends(curves: list[Curve]) -> Floats:
+@lru_cache
+def bends(curves: tuple[Curve, ...]) -> Floats:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)
@@ -301,68 +301,91 @@ def _bridge(film: Floats, start: int, stop: int, solved: Mask, last: Whole) -> N
             last[pixel] = frame
 
 
-def first_band(
-    inputs: Inputs, loose: Whole, frames: Whole
-) -> tuple[Array, Array, Callable[[slice | Whole], Floats], Floats]:
-    """
-    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
+@dataclass(frozen=True)
+class Change:
+    """Change of e_1 u_1(x) in the reference band from r to p, of loose pixels: smooth over time."""
 
-    Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
-    frame) [K], of any frames, and its variance (loose): smoothed over time, it is that of
-    e_1 u_1(x) and holds little of that of the reflection. Bad pixels have no part in it.
+    curves: Array  # coefficients (loose, column) [K]
+    functions: Array  # of which they are (time, column)
+    variance: Array  # (loose) [K^2]
+
+    def at(self, frames: slice | Whole) -> Floats:
+        """Change (loose, frame) [K] at some frames."""
+        return np.asarray(self.curves @ self.functions[frames].T)
+
+
+def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
+    """Signal (frame, pixel) [K] of the reference band, and the steps of the camera in it.
+
+    A sample that is no measurement is 0, an outlier of the regression.
+    """
+    capture, reference = inputs.capture, inputs.bands[0]
+    counts = capture["counts"].isel(band=reference, time=frames).values
+    counts = np.where(schema.measured(counts), counts, np.nan).reshape(frames.size, -1)
+    curve, functions = inputs.curves[reference], smooth_functions(capture)
+    first = np.nan_to_num(curve.linearise(counts) - curve.reference)
+    steps = np.zeros_like(first)
+    if functions.steps:
+        of_camera = functions.functions - functions.object_part
+        for rows in inputs.blocks:
+            pixels = np.arange(rows.start, rows.stop)[:, np.newaxis] * capture.sizes["x"]
+            pixels = (pixels + np.arange(capture.sizes["x"])).ravel()
+            steps[:, pixels] = of_camera[frames] @ (functions.functions.T @ _film(inputs, pixels))
+    return first, steps
+
+
+def change(inputs: Inputs, loose: Whole) -> Change:
+    """
+    Change of the reference band's signal to p of loose pixels, smoothed over time.
+
+    So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
+    no part in it.
     """
     displacement = inputs.displacement
     assert displacement is not None
-    key = "first band", loose.tobytes(), frames.tobytes()
-    return displacement.once(key, lambda: _first_band(inputs, displacement, loose, frames))
-
-
-def _first_band(
-    inputs: Inputs, displacement: Displacement, loose: Whole, frames: Whole
-) -> tuple[Array, Array, Callable[[slice | Whole], Floats], Floats]:
-    """See `first_band`."""
-    capture = inputs.capture
-    (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
-    segment = capture["segment"].values if "segment" in capture else None
-    time = capture["time"].values
-    functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4), segment=segment)
-    basis, own = functions.functions, functions.object_part
-    first, steps = np.empty((2, frames.size, height * width))
-    change, unknown = np.zeros((loose.size, basis.shape[1])), np.zeros(loose.size, dtype=bool)
-    (energy, lagged), largest = np.zeros((2, loose.size)), 0.0
-    for rows in inputs.blocks:
-        top, source = rows.start, displacement.source(rows)
-        chosen = (loose // width >= top) & (loose // width < rows.stop)
-        counts = capture["counts"].isel(band=displacement.reference, y=source).values
-        counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
-        signal = curve.linearise(counts) - curve.reference
-        inside = slice((top - source.start) * width, (rows.stop - source.start) * width)
-        here = slice(top * width, rows.stop * width)
-        first[:, here] = signal[frames, inside]
-        both = np.nan_to_num(bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
-        steps[:, here] = (basis - own)[frames] @ (both[inside] @ basis).T
-        at = displacement.weights(rows, source)[loose[chosen] - top * width]
-        *_, flags = quality.read(capture.isel(band=[displacement.reference], y=source))
-        bad = quality.unusable(flags)
-        at = without(at, bad, width)
-        unknown[chosen] = abs(at) @ bad > 0.0
-        moved = at @ both - both[loose[chosen] - source.start * width]
-        moved[unknown[chosen]] = 0.0
-        fitted = moved @ basis
-        error = moved - fitted @ basis.T
-        energy[chosen] = (error**2).sum(axis=1)
-        lagged[chosen] = (error[:, 1:] * error[:, :-1]).sum(axis=1)
-        change[chosen] = fitted
-        largest = max(largest, np.max((fitted @ own.T) ** 2, initial=0.0))
+    functions = smooth_functions(inputs.capture)
+    bad = displacement.once("bad", lambda: _bad(inputs))
+    there = without(displacement.resample[loose], bad, displacement.shape[1])
+    unknown = abs(there) @ bad > 0.0
+    # Only the pixels that they are made of are read.
+    pixels = np.unique(np.concatenate([loose, there.indices]))
+    film = _film(inputs, pixels).T
+    moved = there[:, pixels] @ film - film[np.searchsorted(pixels, loose)]
+    moved[unknown] = 0.0
+    curves = moved @ functions.functions
+    error = moved - curves @ functions.functions.T
+    energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)
     # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
-    lagged = np.clip(lagged / energy, 0.0, 0.98)
-    variance = energy * basis.shape[1] / time.size**2 * (1.0 + lagged) / (1.0 - lagged)
+    lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
+    frames, columns = functions.functions.shape
+    variance = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
     # One that is not known, beside bad pixels, may be as large as any other.
-    variance[unknown] = np.max(first**2, initial=0.0) if unknown.all() else largest
-    # A sample that is no measurement is an outlier of the regression.
-    return (
-        np.nan_to_num(first),
-        steps,
-        lambda some: change @ own[some].T,
-        np.nan_to_num(variance),
-    )
+    largest = film if unknown.all() else curves @ functions.object_part.T
+    variance[unknown] = np.max(largest**2, initial=0.0)
+    return Change(curves, functions.object_part, variance)
+
+
+def _bad(inputs: Inputs) -> Mask:
+    """Bad pixels (pixel) of the reference band."""
+    band = inputs.capture.isel(band=[inputs.bands[0]])
+    status = [quality.read(band.isel(y=rows))[2] for rows in inputs.blocks]
+    return quality.unusable(np.concatenate(status))
+
+
+def _film(inputs: Inputs, pixels: Whole) -> Floats:
+    """Signal (time, pixel) [K] of some pixels of the reference band, its gaps bridged."""
+    capture, curve = inputs.capture, inputs.curves[inputs.bands[0]]
+    places = np.divmod(pixels, capture.sizes["x"])
+    row, column = (xr.DataArray(place, dims="pixel") for place in places)
+    counts = capture["counts"].isel(band=inputs.bands[0], y=row, x=column).values
+    counts = np.where(schema.measured(counts), counts, np.nan)
+    film = curve.linearise(counts) - curve.reference
+    return np.nan_to_num(bridge(film, np.ones(pixels.size, dtype=bool)))
+
+
+def smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
+    """Smooth functions of the frames of a capture, with the steps of the camera."""
+    time = capture["time"].values[frames].astype(np.float64)
+    segment = capture["segment"].values[frames].astype(np.intp) if "segment" in capture else None
+    order = min(HIGHEST_ORDER, time.size // 4)
+    return smooth.subspace(time, order, segment=segment)

@@ -20,6 +20,7 @@ with the weights :math:`(1 - g) g^j`.
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -27,7 +28,7 @@ import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, copied, release
+from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours
@@ -121,7 +122,7 @@ class Joint:
     frames: Frames
     signals: Floats  # of the object at r and at p (2, node, pixel) [K]; NaN unknown
     emissivity: Floats  # of which it is made (band, pixel) [1]
-    factor: Floats  # variance of the object over that of a pixel alone (pixel) [1]
+    factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
     def difference(self, rows: slice, some: slice | Whole) -> Floats:
@@ -133,7 +134,7 @@ class Joint:
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
         signals, weights, parts = self.signals[..., pixels], self.frames.weights, []
-        bends = system.bends([self.inputs.curves[band] for band in self.inputs.bands])
+        bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
         for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
             change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
             change = np.nan_to_num(share.astype(np.float32) * change)
@@ -166,7 +167,7 @@ class Joint:
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * one
             for axis, one in zip((1, 2), off, strict=True)
         ]
-        factor = self.factor.reshape(status.shape)
+        factor = self.factor().reshape(status.shape)
         for part in self.inputs.blocks:
             squares = [np.tensordot(basis, one[:, part], 1) ** 2 for one in slopes]
             std[:, part] = np.sqrt(factor[part] * std[:, part] ** 2 + sum(squares))
@@ -199,59 +200,93 @@ def solve(
     else that of the result. None where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        raw = system.first_emissivity(inputs, result)
         maps = maps if frames.smooth else None
-        solved = system.told(film)[0]
-        if maps is not None and material is not None:
-            raw, given = system.of_material(inputs, raw, material)
-            solved |= given & maps.usable.ravel()
-        solved &= np.all(np.isfinite(raw), axis=0)
+        raw, solved = _solvable(inputs, result, maps, material)
         equations = system.equations(inputs, system.inside(raw), solved)
-        places, some = equations.solved, looked_at(len(film))
-        first, steps, change, variance = system.first_band(inputs, equations.loose, some)
+        pooled = material is not None and np.isfinite(material.emissivity).any()
+        places, sampled = equations.solved, looked_at(result.sizes["time"])
+        if pooled and frames.smooth:
+            sampled = frames.nodes
+        change = system.change(inputs, equations.loose)
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)
         else:
             shares = system.coefficients(inputs, raw, solved)[:, places]
             target, size = _by_film(inputs, result, raw, equations, shares, before)
 
-        def objects_at(at: Whole, equations: system.Equations) -> tuple[Floats, Floats, Floats]:
+        def objects_at(
+            at: Whole, equations: system.Equations, start: Floats | None = None
+        ) -> tuple[Floats, Floats, Floats]:
             """Object at both places and the last step (solved, frame) [K] of some frames."""
+            combination, guess = target(at)
+            guess = guess if start is None else np.where(np.isfinite(start), start, guess)
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
-                return equations.packed.solve(*target(at), change(at))
+                return equations.packed.solve(combination, guess, change.at(at))
 
-        here, beside, _ = objects_at(some, equations)
+        # The object at both places at a few frames: does its gradient matter?
+        start = None
+        if sampled is frames.nodes and before is not None:
+            start = before.signals[0][:, places].T
+        here, beside, step = objects_at(sampled, equations, start)
         others = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
         share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
         if not _most(share) > _MATTERS:
             return None
+        # The emissivities, if they are not those of a material.
         emissivity = system.inside(raw)
         of_slope: Floats = np.zeros(solved.size)
         of_ratio: Floats = np.zeros(solved.size)
-        if material is not None and np.isfinite(material.emissivity).any():
+        if material is not None and pooled:
             of_slope = np.nan_to_num(material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
+            first, steps = system.samples(inputs, sampled)
             band = first[:, places], steps[:, places]
+            solve_at = partial(objects_at, sampled)
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, lambda it: objects_at(some, it)[:2], band
+                inputs, result, raw, solved, equations, solve_at, (here, beside), band
             )
-            here, beside, _ = objects_at(some, equations)
-        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
-        unsettled, parts = np.zeros(solved.size, dtype=bool), frames.parts()
-        results = threads.map(lambda part: objects_at(frames.nodes[part], equations), parts)
-        for part, (*pair, step) in zip(parts, results, strict=True):
-            signals[:, part, places] = np.swapaxes(pair, 1, 2)
-            unsettled[places] |= step > 10.0 * system.CONVERGED
-        signals[np.abs(signals) > USELESS] = np.nan
+            here, beside, _ = objects_at(sampled, equations, here)
+        solutions = [(slice(None), (here, beside, step))]
+        if sampled is not frames.nodes:
+            parts = frames.parts()
+            results = threads.map(lambda part: objects_at(frames.nodes[part], equations), parts)
+            solutions = list(zip(parts, results, strict=True))
+        signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
         off *= equations.spread(np.mean((beside - here) ** 2, axis=1))
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
-        factor = _factor(inputs, equations, np.array(sizes), variance, blur)
-    return Joint(inputs, frames, signals, emissivity, factor, unsettled | np.isnan(factor))
+    errors = partial(_factor, inputs, equations, np.array(sizes), change.variance, blur)
+    return Joint(inputs, frames, signals, emissivity, errors, unsettled)
+
+
+def _solvable(
+    inputs: Inputs, result: xr.Dataset, maps: Planes | None, material: Material | None
+) -> tuple[Floats, Mask]:
+    """Emissivities (band, pixel) [1] of the equations, and the pixels that have one."""
+    film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
+    raw, solved = system.first_emissivity(inputs, result), system.told(film)[0]
+    if maps is not None and material is not None:
+        raw, given = system.of_material(inputs, raw, material)
+        solved |= given & maps.usable.ravel()
+    return raw, solved & np.all(np.isfinite(raw), axis=0)
+
+
+def _spread(
+    solutions: list[tuple[slice, tuple[Floats, Floats, Floats]]],
+    shape: tuple[int, int],
+    places: Whole,
+) -> tuple[Floats, Mask]:
+    """Signals (2, node, pixel) [K] of solutions of some nodes, and the pixels that go on moving."""
+    signals = np.full((2, *shape), np.nan, np.float32)
+    unsettled = np.zeros(shape[1], dtype=bool)
+    for part, (*pair, step) in solutions:
+        signals[:, part, places] = np.swapaxes(pair, 1, 2)
+        unsettled[places] |= step > 10.0 * system.CONVERGED
+    signals[np.abs(signals) > USELESS] = np.nan
+    return signals, unsettled
 
 
 Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
@@ -315,41 +350,22 @@ def _by_film(
     return target, np.sqrt(np.mean(stds**2, axis=0))
 
 
-def from_result(inputs: Inputs, result: xr.Dataset, frames: Frames) -> Joint:
-    """Object of both places of a result that is solved already."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-        emissivity = system.inside(system.first_emissivity(inputs, result))
-        solved = np.all(np.isfinite(emissivity), axis=0) & system.told(film)[0]
-        equations = system.equations(inputs, emissivity, solved)
-        change = system.first_band(inputs, equations.loose, looked_at(len(film)))[2]
-        curve, places = inputs.curves[inputs.bands[0]], equations.solved
-        signals = np.full((2, frames.nodes.size, solved.size), np.nan, np.float32)
-        nodes = system.bridge(film[frames.nodes], solved)
-        for part in frames.parts():
-            signal = (curve.signal(nodes[part][:, places]) - curve.reference).T
-            beside = equations.packed.beside(signal, change(frames.nodes[part]))
-            signals[:, part, places] = signal.T, beside.T
-        signals[np.abs(signals) > USELESS] = np.nan
-    unsettled = np.zeros(solved.size, dtype=bool)
-    return Joint(inputs, frames, signals, emissivity, np.ones(solved.size), unsettled)
-
-
 def _emissivities(
     inputs: Inputs,
     result: xr.Dataset,
     raw: Floats,
     solved: Mask,
     equations: system.Equations,
-    looked_at: Callable[[system.Equations], tuple[Floats, Floats]],
-    band: tuple[Array, Array],
+    solve_at: Callable[[system.Equations, Floats], tuple[Floats, Floats, Floats]],
+    places: tuple[Floats, Floats],
+    band: tuple[Floats, Floats],
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     step = np.zeros(solved.size)
     for _ in range(_ROUNDS):
-        found = _emission(looked_at(equations), band, emissivity[0, solved], noise)
+        found = _emission(places, band, emissivity[0, solved], noise)
         slope, variance, known = (equations.spread(one) for one in found)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
@@ -367,11 +383,12 @@ def _emissivities(
         change = np.abs(emissivity - before)[0, solved]
         if _most(change) < _SETTLED:
             break
+        places = solve_at(equations, places[0])[:2]
     return equations, emissivity, variance
 
 
 def _emission(
-    places: tuple[Floats, Floats], band: tuple[Array, Array], emissivity: Floats, noise: float
+    places: tuple[Floats, Floats], band: tuple[Floats, Floats], emissivity: Floats, noise: float
 ) -> tuple[Floats, Floats, Mask]:
     """
     Emissivity of the first band as its slope over the object, its variance, and where it is told.
@@ -380,7 +397,7 @@ def _emission(
     the camera in it (frame, solved).
     """
     own = places[0].T.astype(np.float64)
-    line = residuals.regress(own, band[0], noise)
+    line = residuals.regress(own, np.asarray(band[0], np.float64), noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     steep = np.maximum(_slope(*places), 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
@@ -397,6 +414,7 @@ def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
     return np.where(np.isfinite(slope), slope, 1.0)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _factor(
     inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
 ) -> Floats:

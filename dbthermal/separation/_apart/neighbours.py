@@ -15,7 +15,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 from scipy.special import chdtri
 
 from dbthermal._arrays import Array
@@ -30,8 +31,12 @@ from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance
 from dbthermal.separation._tiles import Material, Survey
 
-# Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
+"""Deviation of the blur of the bands whose ratios are compared [pixel]."""
+
+BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
+"""Those of a material, each wider than the one before."""
+
 # Flags of a model that does not hold: the pixel tells nothing of its material.
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
@@ -84,7 +89,11 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def materials(
-    inputs: Inputs, planes: Planes, alone: xr.Dataset, threads: Executor, bar: Any
+    inputs: Inputs,
+    scatters: dict[float, Scatters],
+    alone: xr.Dataset,
+    threads: Executor,
+    bar: Any,
 ) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
@@ -92,15 +101,17 @@ def materials(
     beyond it: a variance. A material too narrow for it has that of the others.
     """
     assert inputs.labels is not None
-    labels, noise = inputs.labels.reshape(planes.usable.shape), inputs.noise[inputs.bands]
-    material = sharp = None
-    for blur in (0.0, BLUR, 2.0 * BLUR):
+    noise, shape = inputs.noise[inputs.bands], alone["status"].shape
+    labels, material, sharp = inputs.labels.reshape(shape), None, None
+    for blur, scatter in scatters.items():
         size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
-        places = np.flatnonzero(pool.select(np.where(inner & planes.usable, labels, -1).ravel()))
+        places = np.flatnonzero(
+            pool.select(np.where(inner.ravel() & scatter.usable, inputs.labels, -1))
+        )
         if places.size:  # else all materials are too narrow
-            image = Image(inputs.labels, places, planes.usable.shape[1])
-            survey = _survey(planes.scatters(blur), alone, noise, places)
+            image = Image(inputs.labels, places, shape[1])
+            survey = _survey(scatter, alone, noise, places)
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
             sharp = wider if sharp is None else sharp
             material = wider if material is None else _blurred(sharp, material, wider, inputs)
@@ -183,10 +194,17 @@ def shared(
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
-def _median(part: Floats, weight: Floats) -> Floats:
+def _median(values: Floats, weight: Floats) -> Floats:
     """Median (y, x) of the pixels around; one without weight counts as their mean."""
-    filled = np.where(weight > 0, part, np.nan_to_num(_mean(part, weight, _WIDE)))
-    return np.asarray(median_filter(filled, 1 + 2 * round(_WIDE), mode="nearest"))
+    filled = np.where(weight > 0, values, np.nan_to_num(_mean(values, weight, _WIDE)))
+    reach = round(_WIDE)
+    # At every few pixels, then interpolated: it changes as slowly as its window is wide.
+    stride = max(1, reach // 2)
+    padded = np.pad(filled, reach, mode="edge")
+    around = sliding_window_view(padded, (1 + 2 * reach, 1 + 2 * reach))[::stride, ::stride]
+    coarse = np.median(around.reshape(*around.shape[:2], -1), axis=2)
+    place = np.indices(filled.shape) / stride
+    return np.asarray(map_coordinates(coarse, place, order=1, mode="nearest"))
 
 
 def _mean(part: Floats, weight: Floats, deviation: float) -> Floats:

@@ -49,6 +49,7 @@ class Scatters:
     scatter: Array  # whitened, less that of the noise (band, band, pixel) [1]
     freedom: Array  # degrees of freedom of the noise (pixel)
     noise: Array  # by which it is whitened (band, pixel) [K]
+    usable: Mask  # (pixel)
 
     @property
     @np.errstate(invalid="ignore", divide="ignore")
@@ -109,6 +110,7 @@ class Planes:
         whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
         return whole, variance * (order + self.steps) / frames
 
+    @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def scatters(self, blur: float = 0.0) -> Scatters:
         """Scatter of each pixel, of maps that are blurred by a deviation [pixel]."""
         bands, pixels = len(self.maps), self.usable.size
@@ -127,8 +129,9 @@ class Planes:
                 total = np.einsum("fp,fp->p", flat[first], flat[second])
                 total = total / (noise[first] * noise[second]) - freedom * (first == second)
                 scatter[first, second] = scatter[second, first] = total
-        scatter[..., ~self.usable.ravel()] = 0.0
-        return Scatters(scatter, freedom, noise)
+        usable = self.usable.ravel()
+        scatter[..., ~usable] = 0.0
+        return Scatters(scatter, freedom, noise, usable)
 
 
 def project(
@@ -136,13 +139,13 @@ def project(
 ) -> Planes:
     """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
-    rapid, columns = _functions(inputs), _smooth_functions(inputs.capture)
+    rapid, columns = _functions(inputs), system.smooth_functions(inputs.capture)
     maps = np.zeros((len(bands), rapid.shape[1], height, width), np.float32)
     straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
     noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
-    response = _response([inputs.curves[band] for band in bands])
+    response = _response(tuple(inputs.curves[band] for band in bands))
     film = result["object_temperature"].values.reshape(len(rapid), -1)
 
     def block(rows: slice) -> None:
@@ -154,9 +157,13 @@ def project(
                 few = columns.functions[frames]
                 inverse = np.linalg.solve(few.T @ few, few.T)
                 rest = rapid[frames] - few @ (inverse @ rapid[frames])
-                x, shares = film[frames][:, places], emissivity[:, places].astype(np.float64)
-                signals = np.ascontiguousarray(tile.signals)
-                _straighten(signals, x, shares, response)
+                x = film[:, places] if frames.all() else film[np.ix_(frames, places)]
+                shares = emissivity[:, places].astype(np.float64)
+                emitted = np.empty(x.shape, np.float32)
+                _emit(np.asarray(x, np.float32), response, emitted)
+                inverse, rest = inverse.astype(np.float32), rest.astype(np.float32)
+                signals = np.ascontiguousarray(tile.signals, np.float32)
+                _straighten(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
@@ -164,11 +171,11 @@ def project(
                     there = np.searchsorted(cut.places, places)
                     for band, part in enumerate(more, 1):
                         straight[band][:, places] += inverse @ part[:, there]
-                _without_object(signals, x, shares, response)
+                _without_object(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = rest.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
-                freedom[row, column] = np.sum(rest**2)
+                freedom[row, column] = np.sum(rest**2, dtype=np.float64)
                 usable[row, column] = True
         release()
 
@@ -202,23 +209,31 @@ def _emitted(response: Response, temperature: float) -> float:
 
 
 @compiled
+def _emit(film: npt.NDArray[np.float32], response: Response, emitted: Any) -> None:
+    """Signals (time, pixel) [K] of blackbodies in the first band, in place."""
+    for t in range(film.shape[0]):
+        for p in range(film.shape[1]):
+            emitted[t, p] = _emitted(response, film[t, p])
+
+
+@compiled
 def _straighten(
-    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
+    signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
     """Take the bend of the background out of signals (band, time, pixel) [K], in place.
 
-    The background is what the first band holds beside an object (time, pixel) [K]; where that is
-    not known nothing is taken out.
+    The background is what the first band holds beside the signal of an object (time, pixel) [K];
+    where that is not known nothing is taken out.
     """
     bands, frames, pixels = signals.shape
     low, high = _polynomial_at(response.series, -1.0), _polynomial_at(response.series, 1.0)
     for t in range(frames):
         for p in range(pixels):
             share = emissivity[0, p]
-            emitted = share * _emitted(response, film[t, p])
-            if np.isnan(emitted):
+            background = (signals[0, t, p] - share * emitted[t, p]) / (1.0 - share)
+            if np.isnan(background):
                 continue
-            background = min(max((signals[0, t, p] - emitted) / (1.0 - share), low), high)
+            background = min(max(background, low), high)
             for band in range(1, bands):
                 bend = _polynomial_at(response.bends[band - 1], background)
                 signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
@@ -226,13 +241,13 @@ def _straighten(
 
 @compiled
 def _without_object(
-    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
+    signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
-    """Take an object (time, pixel) [K] out of signals (band, time, pixel) [K], in place."""
+    """Take an object's signal (time, pixel) [K] out of those (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
     for t in range(frames):
         for p in range(pixels):
-            signal = _emitted(response, film[t, p])
+            signal = np.float64(emitted[t, p])
             if np.isnan(signal * emissivity[0, p]):
                 continue
             for band in range(bands):
@@ -240,7 +255,7 @@ def _without_object(
                 signals[band, t, p] -= emissivity[band, p] * (signal + bend)
 
 
-def _response(curves: list[Curve]) -> Response:
+def _response(curves: tuple[Curve, ...]) -> Response:
     """Polynomials of the responses of the bands, the quietest first."""
     low, high = curves[0].lowest, curves[0].highest
     kelvin = np.linspace(low, high, 64)
@@ -257,19 +272,11 @@ def _interpolated(inputs: Inputs) -> Array:
     return np.asarray(capture["noise_factor"].values if "noise_factor" in capture else whole)
 
 
-def _smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
-    """Smooth functions of the frames of a capture, with the steps of the camera."""
-    time = capture["time"].values[frames].astype(np.float64)
-    segment = capture["segment"].values[frames].astype(np.intp) if "segment" in capture else None
-    order = min(reflection_ratio.HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=segment)
-
-
 def _functions(inputs: Inputs) -> Array:
     """Functions (time, function) of most of the rapid changes of the reference band."""
     capture = inputs.capture
     counts, frames = quality.sample(capture, _SAMPLE)
-    basis = _smooth_functions(capture, frames).functions
+    basis = system.smooth_functions(capture, frames).functions
     signals = counts[inputs.bands[0]]
     rapid = smooth.leading((signals - basis @ (basis.T @ signals)).T, _PLANES)
     functions = np.zeros((frames.size, rapid.shape[1]))

@@ -25,15 +25,18 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 
 # Turns of the materials and the object of each camera's own place.
 _TURNS: Final = 2
+# What a displacement keeps of the pixels alone.
+_OBJECTS: Final = "objects"
 
 
 def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
     """Separate without materials, then by the ratios of bands that are blurred alike."""
-    assert inputs.displacement is not None
+    displacement = inputs.displacement
+    assert displacement is not None
     each(inputs, None)
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
-    if inputs.method.survey is not None and inputs.displacement.moves:
+    if inputs.method.survey is not None and displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
@@ -52,6 +55,7 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
         each(inputs, material)
     if objects is not None:
         objects.finish(result)
+    displacement.found[_OBJECTS] = objects
 
 
 def pooled(
@@ -68,13 +72,19 @@ def pooled(
     The first are those of the object and emissivities of pixels alone, and may be regrouped; the
     second those of what the first make of these.
     """
+    assert inputs.displacement is not None
     frames = joint.Frames.of(before)
-    objects: joint.Joint | None = joint.from_result(inputs, before, frames)
+    objects: joint.Joint | None = inputs.displacement.found[_OBJECTS]
     shares = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
-        maps = planes.project(inputs, before, shares, threads)
-        survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
+        # Of a smooth object the difference changes no rapid product.
+        plain = replace(inputs, difference=None) if frames.smooth else inputs
+        maps = planes.project(plain, before, shares, threads)
+        scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
+        survey = partial(
+            neighbours.materials, scatters=scatters, alone=before, threads=threads, bar=bar
+        )
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
