@@ -181,10 +181,10 @@ def _aligned(
         if field is not None and cameras_apart(aligned, response) > 0.0:
             return aligned, field
         return aligned, None
-    comparison = joint.compare(corrected, scale, **options)
-    aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
-    if comparison.field is not None and not cameras_apart(aligned, response) > 0.0:
+    found = joint.compare(corrected, scale, **options)
+    aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
+    if found.field is not None and not cameras_apart(aligned, response) > 0.0:
         # No delay of a shift that is not used.
-        comparison = joint.compare(corrected, scale, **options, side_by_side=False)
-        aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
-    return comparison.noted(aligned), comparison.field
+        found = joint.compare(corrected, scale, **options, side_by_side=False)
+        aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
+    return found.noted(aligned), found.field

@@ -39,13 +39,13 @@ def record(options: argparse.Namespace) -> int:
 
 
 def _say(text: str, *, end: str = "\n", file: TextIO | None = None) -> None:
-    """Print a text, ignoring a closed pipe."""
+    """Print a text; where nobody reads any more, this and all that follows is passed over."""
     stream = file or sys.stdout
     try:
         print(text, end=end, file=stream, flush=True)
     except OSError:
-        with Path(os.devnull).open("wb") as null:
-            os.dup2(null.fileno(), stream.fileno())
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), stream.fileno())
 
 
 def _run(session: Session, folder: Path, *, dry: bool) -> int:
