@@ -13,10 +13,9 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from dbthermal import __version__
 from dbthermal._cli import is_source, leaves, unused
@@ -107,7 +106,7 @@ materials text*         as listed by 'data'; all by default
 --search whole=5        largest delay that is sought, either way [frame]
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
---method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
+--method text           one step alone, by rows: subspace, calibrated, dbvt, apparent
 --emissivity number+    of each band, for the method 'calibrated'
 --surroundings kelvin   temperature of what is reflected, as 22C
 --prior text            material of pixels that cannot be measured, as listed by 'data'
@@ -200,60 +199,31 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 """Command, its function and arguments; its summary; examples."""
 
 
-class _Parser(argparse.ArgumentParser):
-    """Parser whose errors name the command, option or choice that was probably meant."""
-
-    def error(self, message: str) -> NoReturn:
-        """End with the usage and a message."""
-        super().error(_hinted(message))
-
-
-def _hinted(message: str) -> str:
-    """Message on an unknown name; if one of those that it lists is close to it, with this one."""
-    head, *listed = re.split(r"Must be one of|choose from", message, maxsplit=1)
-    named = re.search(r"'([^']+)'", head)
-    if not listed or not named:
-        return message
-    close = get_close_matches(named.group(1), re.findall(r"[\w.-][^',()\[\]]*", listed[0]), n=1)
-    return f"{message} Did you mean '{close[0]}'?" if close else message
-
-
-def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Options of a command line; an option that the command has not is refused with its options."""
-    parser = _parser()
-    options, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        command = _commands(parser)[options.command]
-        names = ", ".join(f"'{name}'" for name in command._option_string_actions)
-        command.error(f"unknown argument '{unknown[0]}' (choose from {names})")
-    return options
-
-
-def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """Parsers of the commands by their names."""
-    return dict(next(one for one in parser._actions if one.choices).choices or {})
-
-
 def _parser() -> argparse.ArgumentParser:
+    """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    parser = _Parser("dbthermal", description=__doc__, **plain)
+    parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
     for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
+        # A block of the table: the command with its arguments, its summary, its examples.
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
-        ends = "\n".join(
-            ["examples:", *(f"  dbthermal {name} {line}".rstrip(" -") for line in lines)]
+        examples = [f"  dbthermal {name} {line}".rstrip(" -") for line in lines]
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=f"{summary[0].upper()}{summary[1:]}.",
+            epilog="\n".join(["examples:", *examples]),
+            **plain,
         )
-        title = f"{summary[0].upper()}{summary[1:]}."
-        added = commands.add_parser(name, help=summary, description=title, epilog=ends, **plain)
-        added.set_defaults(place=place)
-        added._negative_number_matcher = re.compile(r"-[\d.]+[CK]?$")  # no option: -5C
+        command.set_defaults(place=place)
+        command._negative_number_matcher = re.compile(r"-[\d.]+[CK]?$")  # no option: -5C
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []
-            added.add_argument(*short, argument, **_options(*table[argument]))
+            command.add_argument(*short, argument, **_options(*table[argument]))
     return parser
 
 
@@ -264,27 +234,30 @@ def _options(kind: str, text: str) -> dict[str, Any]:
     if "|" in kind:
         return {"choices": kind.split("|"), "help": text}
     ((name, number, default),) = re.findall(r"^([a-z]+)([0-9+*?]?)[!&]?=?(.*)$", kind)
-    made: dict[str, Any] = {"type": _KINDS[name], "help": text}
-    made |= {"nargs": int(number) if number.isdigit() else number} if number else {}
-    made |= {"required": True} if "!" in kind else {}
-    made |= {"action": "append", "default": []} if "&" in kind else {}
-    return made | (
-        {"default": _KINDS[name](default), "help": f"{text} ({default})"} if default else {}
-    )
+    options: dict[str, Any] = {"type": _KINDS[name], "help": text}
+    if number:
+        options["nargs"] = int(number) if number.isdigit() else number
+    if "!" in kind:
+        options["required"] = True
+    if "&" in kind:
+        options |= {"action": "append", "default": []}
+    if default:
+        options |= {"default": _KINDS[name](default), "help": f"{text} ({default})"}
+    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    told = set[str]()
+    printed = set[str]()
 
-    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+    def print_once(message: Warning | str, *_: Any, **__: Any) -> None:
         """Print a warning, once."""
-        if str(message) not in told:
+        if str(message) not in printed:
             print(f"Warning: {message}", file=sys.stderr)
-        told.add(str(message))
+        printed.add(str(message))
 
-    warnings.showwarning = tell
-    options = _parsed(arguments)
+    warnings.showwarning = print_once
+    options = _parser().parse_args(arguments)
     try:
         unused.refuse(options, sys.argv[1:] if arguments is None else arguments)
         return _carry_out(options)
@@ -297,9 +270,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.traceback:
             raise
         status, reason = 1, _reason(error, options.command)
-        for name in vars(options):  # of an argument of Python, as it is named here
+        for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
-    print(f"dbthermal {options.command}: {_hinted(reason)}", file=sys.stderr)
+    print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
 
@@ -309,7 +282,7 @@ def _reason(error: Exception, command: str) -> str:
     if isinstance(error, ImportError) and extra:
         extra = command if command == "report" else extra  # which has all that it needs
         return str(import_module("dbthermal._text").missing_library(error.name, extra))
-    if isinstance(error, FileNotFoundError) and error.filename:  # of the system, else our own
+    if isinstance(error, FileNotFoundError) and error.filename:  # of the system, not of dbthermal
         return f"No file or folder '{error.filename}'. Must exist."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
@@ -324,38 +297,46 @@ def _carry_out(options: argparse.Namespace) -> int:
         return 0
     if options.command == "record":
         return int(_function(options)(options))
-    values = vars(options).items()
-    sources = [one for name, value in values for one in leaves(value) if is_source(name, one)]
-    targets = [one for name, one in values if name.endswith("output") and one]
+    sources, targets = _sources_and_targets(options)
+    if options.dry_run:
+        foreseen = import_module("dbthermal._cli.steps").foreseen
+        summary = foreseen(options, sources, targets)
+    else:
+        start = time.monotonic()
+        summary = _function(options)(options)
+        if not sys.stderr.isatty():  # where no bar was shown
+            print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
+    print(text, flush=True)
+    return 0
+
+
+def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[Path]]:
+    """Paths that a command reads, which must exist, and writes, which must be free."""
+    arguments = vars(options).items()
+    sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
+    targets = [value for name, value in arguments if name.endswith("output") and value]
     for path in sources:
         if not path.exists():
             raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()
-        if any(place in (one, *one.parents) or one in place.parents for one in taken):
-            found = f"Invalid output '{path}': it is another one, or it is read"
-            raise ValueError(f"{found}. Must be another place.")
+        if any(place in (other, *other.parents) or other in place.parents for other in taken):
+            label = f"Invalid output '{path}': it is another one, or it is read"
+            raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
-    if options.dry_run:
-        foreseen = import_module("dbthermal._cli.steps").foreseen
-        summary = foreseen(options, sources, targets)
-    else:
-        began = time.monotonic()
-        summary = _function(options)(options)
-        if not sys.stderr.isatty():  # where no bar was shown
-            print(f"{options.command}: {time.monotonic() - began:.1f} s", file=sys.stderr)
-    text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
-    print(text, flush=True)
-    return 0
+    return sources, targets
 
 
 def _completion() -> str:
     """Function of bash, and of zsh, for names of commands and options; files are left to it."""
-    commands = _commands(_parser()).items()
-    named = {name: " ".join(one._option_string_actions) for name, one in commands}
+    commands = next(action.choices for action in _parser()._actions if action.choices)
+    named = {
+        name: " ".join(parser._option_string_actions) for name, parser in dict(commands).items()
+    }
     cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
     return f"""_dbthermal() {{
   local words='{" ".join(named)}'
@@ -369,13 +350,13 @@ complete -o default -F _dbthermal dbthermal"""
 
 
 def _function(options: argparse.Namespace) -> Any:
-    """Function of a command, imported when nothing speaks against it."""
+    """Function of a command, imported when its paths have been checked."""
     module, function = options.place.split(".")
     return getattr(import_module(f"dbthermal._cli.{module}"), function)
 
 
 def _plain(value: Any) -> Any:
-    """Array or number of NumPy as JSON takes it, and others as text."""
+    """Value as JSON takes it: an array or number of NumPy as a list or number, else as text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
@@ -383,18 +364,18 @@ def _lines(summary: Any, indent: str = "") -> Iterator[str]:
     """Summary as text: a line for each entry that is not empty, numbers in one line."""
     for key, value in summary.items():
         if isinstance(value, dict) and any(
-            isinstance(one, dict | list | str) for one in value.values()
+            isinstance(entry, dict | list | str) for entry in value.values()
         ):
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")
             continue
-        parts = (
+        entries = (
             [f"{name} {number:g}" for name, number in value.items()]
             if isinstance(value, dict)
             else leaves(value)
         )
-        if shown := ", ".join(map(str, parts)):
-            yield f"{indent}{key}: {shown}"
+        if line := ", ".join(map(str, entries)):
+            yield f"{indent}{key}: {line}"
 
 
 if __name__ == "__main__":

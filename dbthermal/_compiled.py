@@ -91,16 +91,16 @@ class _Cache(FunctionCache):
             return
         path, digest = self._place(sig, data.codegen)
         content = dumps(self._impl.reduce(data))  # type: ignore[no-untyped-call]
-        part = path.with_name(f".{path.name}.{uuid4().hex}")
+        draft = path.with_name(f".{path.name}.{uuid4().hex}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(digest + hashlib.sha256(digest + content).digest() + content)
-            part.replace(path)
+            draft.write_bytes(digest + hashlib.sha256(digest + content).digest() + content)
+            draft.replace(path)
             _LOGGER.debug("Compiled code is kept as '%s'.", path)
         except OSError as error:
             _LOGGER.warning("Compiled code is not kept as '%s': %s.", path, error)
             with suppress(OSError):
-                part.unlink()
+                draft.unlink()
 
     def in_turn(self, compile_for: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """Compilation that frees the lock of its file at its end, however it ends."""
@@ -160,19 +160,19 @@ def _kinds(types: Any) -> Iterator[str]:
         yield from _kinds(getattr(kind, "types", ()))
 
 
-def _described(value: Any, seen: dict[int, int]) -> Iterator[str]:
+def _described(value: Any, visited: dict[int, int]) -> Iterator[str]:
     """All of a compiled function, constant or name that is in the machine code."""
     if isinstance(value, Dispatcher):
-        first = id(value) not in seen
-        yield f"function {seen.setdefault(id(value), len(seen))}"
+        first = id(value) not in visited
+        yield f"function {visited.setdefault(id(value), len(visited))}"
         if first:
             options = value.targetoptions
-            yield from _described([(name, options[name]) for name in sorted(options)], seen)
-            yield from _of_function(value.py_func, seen)
+            yield from _described([(name, options[name]) for name in sorted(options)], visited)
+            yield from _of_function(value.py_func, visited)
     elif isinstance(value, tuple | list):
         yield f"{type(value).__qualname__} {len(value)} {getattr(value, '_fields', '')}"
-        for part in value:
-            yield from _described(part, seen)
+        for element in value:
+            yield from _described(element, visited)
     elif not isinstance(value, ModuleType):  # of which what is used is described
         yield _plainly(value)
 
@@ -193,16 +193,16 @@ def _plainly(value: Any) -> str:
     raise TypeError(f"Invalid {value!r} in a compiled function. Must be a number, or compiled.")
 
 
-def _of_function(function: Any, seen: dict[int, int]) -> Iterator[str]:
+def _of_function(function: Any, visited: dict[int, int]) -> Iterator[str]:
     """Code and defaults of a function, and what its global and free names stand for."""
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     free = dict(zip(function.__code__.co_freevars, cells, strict=True))
-    yield from _described(function.__defaults__, seen)
-    yield from _described(sorted((function.__kwdefaults__ or {}).items()), seen)
-    yield from _of_code(function.__code__, {**function.__globals__, **free}, seen)
+    yield from _described(function.__defaults__, visited)
+    yield from _described(sorted((function.__kwdefaults__ or {}).items()), visited)
+    yield from _of_code(function.__code__, {**function.__globals__, **free}, visited)
 
 
-def _of_code(code: CodeType, names: Mapping[str, Any], seen: dict[int, int]) -> Iterator[str]:
+def _of_code(code: CodeType, names: Mapping[str, Any], visited: dict[int, int]) -> Iterator[str]:
     """Instructions of code, which depend on no comment, docstring or line."""
     yield f"arguments {code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]}"
     owner: Any = None  # module or type of which the next instruction may take a name
@@ -212,14 +212,14 @@ def _of_code(code: CodeType, names: Mapping[str, Any], seen: dict[int, int]) -> 
         yield step.opname
         loaded = None
         if step.opname == "LOAD_CONST" and isinstance(step.argval, CodeType):
-            yield from _of_code(step.argval, names, seen)
+            yield from _of_code(step.argval, names, visited)
         elif step.opname == "LOAD_CONST":
-            yield from _described(step.argval, seen)
+            yield from _described(step.argval, visited)
         else:
             yield str(step.argval)
         if step.opname in {"LOAD_GLOBAL", "LOAD_DEREF"}:
             loaded = names.get(step.argval)
         elif step.opname in {"LOAD_ATTR", "LOAD_METHOD"}:
             loaded = getattr(owner, step.argval, None)
-        yield from _described(loaded, seen)
+        yield from _described(loaded, visited)
         owner = loaded if isinstance(loaded, ModuleType | type) else None

@@ -33,8 +33,8 @@ def laid_on(
     `label` and `of` name the two in the ValueError, for other bands, sizes or values.
     """
     if not isinstance(array, xr.DataArray | xr.Dataset):
-        found = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
-        raise TypeError(f"{found}. Must be a DataArray or a Dataset.")
+        message = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
+        raise TypeError(f"{message}. Must be a DataArray or a Dataset.")
     shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
     if "band" in shared and "band" in array.coords and "band" in reference.coords:
         names = [str(name) for name in reference["band"].values]
@@ -50,20 +50,23 @@ def laid_on(
     )
 
 
-def _require_same(here: npt.NDArray[Any], there: npt.NDArray[Any], label: str, of: str) -> None:
+def _require_same(
+    values: npt.NDArray[Any], reference: npt.NDArray[Any], label: str, of: str
+) -> None:
     """ValueError where two coordinates differ: numbers beyond rounding, all else as text."""
-    if {here.dtype.kind, there.dtype.kind} <= set("iuf"):
-        left, right = here.astype(np.float64), there.astype(np.float64)
-        floats = [np.finfo(part.dtype).eps for part in (here, there) if part.dtype.kind == "f"]
-        tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(right).max(initial=0.0)
-        if right.size > 1:
-            tolerance += _STEP * np.abs(np.diff(right)).min()
-        same = np.abs(left - right) <= tolerance
+    if {values.dtype.kind, reference.dtype.kind} <= set("iuf"):
+        actual, wanted = values.astype(np.float64), reference.astype(np.float64)
+        dtypes = (values.dtype, reference.dtype)
+        floats = [np.finfo(dtype).eps for dtype in dtypes if dtype.kind == "f"]
+        tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(wanted).max(initial=0.0)
+        if wanted.size > 1:
+            tolerance += _STEP * np.abs(np.diff(wanted)).min()
+        equal = np.abs(actual - wanted) <= tolerance
     else:
-        same = here.astype(str) == there.astype(str)
-    if not same.all():
-        first = int(np.argmin(same))
+        equal = values.astype(str) == reference.astype(str)
+    if not equal.all():
+        first = int(np.argmin(equal))
         raise ValueError(
-            f"Invalid {label}: {here[first]} at position {first}, where that of {of} is "
-            f"{there[first]}. Must be the same."
+            f"Invalid {label}: {values[first]} at position {first}, where that of {of} is "
+            f"{reference[first]}. Must be the same."
         )

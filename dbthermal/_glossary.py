@@ -193,6 +193,6 @@ def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
     attrs : mapping
         Attributes of each input. The result is empty if none of them states its origin.
     """
-    stated = [str(one["origin"]) for one in attrs if "origin" in one]
-    others = [one for one in stated if one != MEASURED]
-    return {"origin": (others or stated)[0]} if stated else {}
+    stated = [str(mapping["origin"]) for mapping in attrs if "origin" in mapping]
+    artificial = [text for text in stated if text != MEASURED]
+    return {"origin": (artificial or stated)[0]} if stated else {}

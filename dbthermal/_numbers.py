@@ -27,22 +27,22 @@ def real_numbers(
     name: str, value: Any, within: Limits | None = None, shape: tuple[int, ...] | None = None
 ) -> Array:
     """Value as a float array, of a shape and within limits if they are given."""
-    given = np.asarray(value)
-    if given.dtype.kind not in "fui":
-        (first,) = given.reshape(-1)[:1].tolist() or [value]
+    raw = np.asarray(value)
+    if raw.dtype.kind not in "fui":
+        (first,) = raw.reshape(-1)[:1].tolist() or [value]
         kind = type(first).__name__
         raise TypeError(f"Invalid {name} {first!r:.60}. Must be a number, not of type {kind}.")
     unit = name.partition("[")[2].partition("]")[0].replace("^", "")
     stated = getattr(value, "attrs", {}).get("units", unit)
     if unit and str(stated).replace("^", "") != unit:
         raise ValueError(f"Invalid units '{stated}' of {name}. Must be '{unit}'.")
-    if shape not in (None, given.shape):
-        raise ValueError(f"Invalid {name} {value!s:.60} of shape {given.shape}. Must have {shape}.")
-    array = given.astype(np.float64, copy=False)
+    if shape not in (None, raw.shape):
+        raise ValueError(f"Invalid {name} {value!s:.60} of shape {raw.shape}. Must have {shape}.")
+    array = raw.astype(np.float64, copy=False)
     if within and np.any(bad := ~((array >= within[0]) & (array <= within[1]))):
         rule = "be finite and positive" if within is POSITIVE else f"lie in {[*within]}"
         rule += ": in kelvin, not in degrees Celsius or counts" if within is KELVIN else ""
-        raise ValueError(f"Invalid {name} {given[bad].flat[0]}. Must {rule}.")
+        raise ValueError(f"Invalid {name} {raw[bad].flat[0]}. Must {rule}.")
     return array
 
 

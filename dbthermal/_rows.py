@@ -34,16 +34,16 @@ class _Rows(BackendArray):
 
     def _read(self, key: tuple[Any, ...]) -> Values:
         """Values at a number, slice or array of places along each dim."""
-        places = [np.arange(size)[one] for size, one in zip(self.shape, key, strict=True)]
-        *others, rows, columns = (np.atleast_1d(place) for place in places)
-        result = np.empty([*map(len, others), rows.size, columns.size], dtype=self.dtype)
+        places = [np.arange(size)[index] for size, index in zip(self.shape, key, strict=True)]
+        *leading, rows, columns = (np.atleast_1d(place) for place in places)
+        result = np.empty([*map(len, leading), rows.size, columns.size], dtype=self.dtype)
         for block in blocks(self.shape):
             (wanted,) = np.nonzero((rows >= block.start) & (rows < block.stop))
             if wanted.size:
                 first, last = rows[wanted].min(), rows[wanted].max()
                 values = self._compute(slice(int(first), int(last) + 1))
-                for axis, one in enumerate((*others, rows[wanted] - first, columns)):
-                    values = values[(slice(None),) * axis + (_even(one),)]
+                for axis, index in enumerate((*leading, rows[wanted] - first, columns)):
+                    values = values[(slice(None),) * axis + (_even(index),)]
                 result[..., _even(wanted), :] = values
         whole = (slice(None) if place.ndim else 0 for place in places)
         return np.asarray(result[tuple(whole)])

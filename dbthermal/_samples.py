@@ -1,4 +1,4 @@
-r"""Samples that are no measurement by their values: clipped at a level, or repeated.
+r"""Samples of a capture: those that are no measurement by their values, gaps, subsamples.
 
 A camera that saturates heaps samples on one value, the highest or the lowest of a pixel, wherever
 that lies; one that freezes repeats its values. Whole counts do both by chance. How often follows
@@ -12,12 +12,13 @@ nothing can be told, and nothing is.
 """
 
 from dataclasses import dataclass
+from math import prod
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.special import bdtrc, ndtri
 
 from dbthermal._arrays import Array, Mask
@@ -106,18 +107,20 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     if _STILLEST * (groups - 4) * signals.shape[2] < _FEWEST_STILL:
         return np.full(bands, np.nan)
     three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
-    rapid, change, around = np.empty((3, bands, groups - 4, signals.shape[2]))
+    rapid, change, surroundings = np.empty((3, bands, groups - 4, signals.shape[2]))
     step = max(16, _AT_ONCE // three[:, 0].size)
     for start in range(0, groups - 4, step):  # a few at a time, which stay in the cache
         stop = min(start + step, groups - 4)
         differences = _differences(three[:, start : stop + 4])
-        rapid[:, start:stop], change[:, start:stop], around[:, start:stop] = differences
-    rapid, change, around = (part.reshape(bands, -1) for part in (rapid, change, around))
-    valid = np.all(np.isfinite(rapid) & (around > 0), axis=0)  # NaN is not
+        rapid[:, start:stop], change[:, start:stop], surroundings[:, start:stop] = differences
+    rapid, change, surroundings = (
+        statistic.reshape(bands, -1) for statistic in (rapid, change, surroundings)
+    )
+    valid = np.all(np.isfinite(rapid) & (surroundings > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))
     if number < _FEWEST_STILL:
         return np.full(bands, np.nan)
-    motion = around / np.median(around[:, valid], axis=1, keepdims=True)
+    motion = surroundings / np.median(surroundings[:, valid], axis=1, keepdims=True)
     stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
     still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
     ordered = np.sort(np.abs(still), axis=1)
@@ -141,10 +144,10 @@ def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
     change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
     third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
     # A mean of three has a third of the noise's variance, their third difference 10 times that.
-    around = 0.3 * third**2
+    surroundings = 0.3 * third**2
     for first in (0, 1, 3, 4):
-        around += rapid[:, first : first + inner] ** 2
-    return rapid[:, 2:-2], change, around
+        surroundings += rapid[:, first : first + inner] ** 2
+    return rapid[:, 2:-2], change, surroundings
 
 
 def resampled_noise(
@@ -156,25 +159,34 @@ def resampled_noise(
     resampled and of the results; 1 where nothing is stated.
     """
     usual = np.mean(_roughness(counts) ** 2, axis=1) ** 0.5
-    found = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
-    ratio = np.divide(found, stated, out=np.zeros_like(stated), where=stated > 0.0)
+    roughness = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
+    ratio = np.divide(roughness, stated, out=np.zeros_like(stated), where=stated > 0.0)
     ratio = ratio.reshape(-1, width)
-    mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
+    mean, share = (uniform_filter(image, _AROUND) for image in (ratio, (ratio > 0.0) * 1.0))
     return np.asarray(np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel())
 
 
 def _roughness(counts: npt.NDArray[Any]) -> Array:
     """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
-    every = slice(None, None, max(1, counts.shape[1] // _STEPS))
-    steps = np.abs(counts[:, 1:][:, every] - counts[:, :-1][:, every])
+    sampled = slice(None, None, max(1, counts.shape[1] // _STEPS))
+    steps = np.abs(counts[:, 1:][:, sampled] - counts[:, :-1][:, sampled])
     return np.asarray(np.median(steps, axis=1, overwrite_input=True))
+
+
+def stride(shape: tuple[int, ...], number: int) -> int:
+    """Step along every axis of a shape that selects about so many values, evenly spaced.
+
+    Rounded down: at most 2^n times the number are selected along n axes.
+    """
+    step = (prod(shape) / number) ** (1.0 / len(shape))
+    return max(1, int(round(step, 9)))  # a whole root is whole
 
 
 def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
     """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / pixels)))
-    some = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
-    return np.asarray(some.reshape(*some.shape[:2], -1))
+    step = stride((counts.sizes["y"], counts.sizes["x"]), pixels)
+    sample = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
+    return np.asarray(sample.reshape(*sample.shape[:2], -1))
 
 
 def rounding_std(counts: npt.NDArray[Any]) -> Array:
@@ -186,17 +198,17 @@ def rounding_std(counts: npt.NDArray[Any]) -> Array:
     if counts.shape[1] < MINIMUM_FRAMES:
         return np.zeros(len(counts))
     size = max(16, _AT_ONCE // counts[:, 0].size)
-    parts = [slice(start, start + size + 1) for start in range(0, counts.shape[1] - 1, size)]
+    spans = [slice(start, start + size + 1) for start in range(0, counts.shape[1] - 1, size)]
     step = np.full((len(counts), counts.shape[2]), np.inf)
     with np.errstate(invalid="ignore"):  # infinite counts are no rounded ones
-        for part in parts:
-            change = _changes(counts[:, part])
+        for span in spans:
+            change = _changes(counts[:, span])
             step = np.minimum(step, np.where(change > 0, change, np.inf).min(axis=1))
         rounded = np.isfinite(step)  # (band, pixel)
-        for part in parts:
+        for span in spans:
             if not rounded.any():  # as soon as is known
                 break
-            change = _changes(counts[:, part]) / step[:, np.newaxis]
+            change = _changes(counts[:, span]) / step[:, np.newaxis]
             rounded &= ~np.any(np.abs(change - np.rint(change)) > _OFF_MULTIPLE, axis=1)
     return np.asarray(np.median(np.where(rounded, step, 0.0), axis=1) / np.sqrt(12.0))
 
@@ -220,24 +232,24 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
 
     Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
     """
-    every = slice(None, None, max(1, counts.shape[1] // PIXELS))
-    some = np.where(valid[:, every], counts[:, every].astype(np.float64), np.nan)
-    changing = np.any(some[1:] != some[:-1], axis=1)  # true for NaN
-    if some.shape[1] >= PIXELS:
-        some = some[np.concatenate([[True], changing])]
-    if len(some) < MINIMUM_FRAMES:
+    sampled = slice(None, None, max(1, counts.shape[1] // PIXELS))
+    sample = np.where(valid[:, sampled], counts[:, sampled].astype(np.float64), np.nan)
+    changing = np.any(sample[1:] != sample[:-1], axis=1)  # true for NaN
+    if sample.shape[1] >= PIXELS:
+        sample = sample[np.concatenate([[True], changing])]
+    if len(sample) < MINIMUM_FRAMES:
         return Grain(stated, 1.0)
-    change = np.abs(np.diff(some, axis=0))
+    change = np.abs(np.diff(sample, axis=0))
     step = np.min(change, axis=0, initial=np.inf, where=change > 0)
-    for reduced in (np.fmin.reduce(some, axis=0), np.fmax.reduce(some, axis=0)):
-        at_end = some == reduced
-        some[at_end & (np.count_nonzero(at_end, axis=0) >= FEWEST)] = np.nan
-    level = noise(some)
-    known = (level > 0) & np.isfinite(step)
-    if not known.any():
+    for reduced in (np.fmin.reduce(sample, axis=0), np.fmax.reduce(sample, axis=0)):
+        at_end = sample == reduced
+        sample[at_end & (np.count_nonzero(at_end, axis=0) >= FEWEST)] = np.nan
+    level = noise(sample)
+    usable = (level > 0) & np.isfinite(step)
+    if not usable.any():
         return Grain(stated, 1.0)
-    std = min(stated, float(np.median(level[known])))
-    chance = _MARGIN * float(np.median(step[known])) / (np.sqrt(2.0 * np.pi) * std)
+    std = min(stated, float(np.median(level[usable])))
+    chance = _MARGIN * float(np.median(step[usable])) / (np.sqrt(2.0 * np.pi) * std)
     return Grain(std, chance if chance < _COARSE else 1.0)
 
 
@@ -275,16 +287,16 @@ def end_of(
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
-    there = counts == end if used is True else (counts == end) & valid
-    return end, counted(there)
+    at_end = counts == end if used is True else (counts == end) & valid
+    return end, counted(at_end)
 
 
-def counted(there: Mask) -> npt.NDArray[np.intp]:
+def counted(mask: Mask) -> npt.NDArray[np.intp]:
     """Number (pixel) of samples (time, pixel) that are true."""
     # Bytes, as many as cannot overflow, add up many times faster than truth values.
-    most, total = np.iinfo(np.uint8).max, np.zeros(there.shape[1], dtype=np.intp)
-    for start in range(0, len(there), most):
-        total += there[start : start + most].view(np.uint8).sum(axis=0, dtype=np.uint8)
+    longest, total = np.iinfo(np.uint8).max, np.zeros(mask.shape[1], dtype=np.intp)
+    for start in range(0, len(mask), longest):
+        total += mask[start : start + longest].view(np.uint8).sum(axis=0, dtype=np.uint8)
     return total
 
 
@@ -307,16 +319,16 @@ def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
 
 def repeated(counts: npt.NDArray[Any], valid: Mask) -> Mask:
     """Samples (time - 1, pixel) of counts (time, pixel) that repeat the one before."""
-    same = counts[1:] == counts[:-1]
-    return np.asarray(same if valid.all() else same & valid[1:] & valid[:-1])
+    equal = counts[1:] == counts[:-1]
+    return np.asarray(equal if valid.all() else equal & valid[1:] & valid[:-1])
 
 
-def frozen(same: Mask, chance: float) -> Mask:
+def frozen(repeats: Mask, chance: float) -> Mask:
     """Pixels (pixel) of which more `repeated` samples follow one another than noise makes."""
-    length = _needed(len(same) + 1, chance)
-    if length > len(same):
-        return np.zeros(same.shape[1], dtype=bool)
-    run, reach = same, 1
+    length = _needed(len(repeats) + 1, chance)
+    if length > len(repeats):
+        return np.zeros(repeats.shape[1], dtype=bool)
+    run, reach = repeats, 1
     while reach < length:
         shift = min(reach, length - reach)
         run = run[:-shift] & run[shift:]
@@ -324,15 +336,15 @@ def frozen(same: Mask, chance: float) -> Mask:
     return np.asarray(run.any(axis=0))
 
 
-def copies(same: Mask, chance: float, valid: Mask) -> Mask:
+def copies(repeats: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
     least = _needed(len(valid), chance)
     # Bytes add up faster than truth values; nearly always there are fewer.
-    if not np.any(same.view(np.uint8).sum(axis=1, dtype=np.uint32) >= least):
+    if not np.any(repeats.view(np.uint8).sum(axis=1, dtype=np.uint32) >= least):
         return np.zeros(len(valid), dtype=bool)
-    moving = ~same.all(axis=0)
-    both = moving if valid.all() else valid[1:] & valid[:-1] & moving
-    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= least)
+    moving = ~repeats.all(axis=0)
+    comparable = moving if valid.all() else valid[1:] & valid[:-1] & moving
+    copied = np.all(repeats | ~comparable, axis=1) & (comparable.sum(axis=-1) >= least)
     return np.concatenate([[False], copied])
 
 
@@ -342,3 +354,37 @@ def _needed(frames: int, chance: float) -> int:
         return np.iinfo(np.int32).max
     tiny = np.finfo(np.float64).tiny
     return max(FEWEST, int(np.ceil(np.log(_FALSE_ALARM / frames) / np.log(max(chance, tiny)))))
+
+
+def bridged(signal: Array, valid: Mask, time: Array) -> Array:
+    """Signal (time, ...) with its missing frames (time) on the line between the valid ones.
+
+    Before the first and behind the last valid frame it stays at their values.
+    """
+    if valid.all() or not valid.any():
+        return signal
+    # The valid frames on either side of each missing one, and the share of the later.
+    frames, missing = np.flatnonzero(valid), np.flatnonzero(~valid)
+    place = np.searchsorted(frames, missing)
+    before, after = (frames[np.clip(place + step, 0, frames.size - 1)] for step in (-1, 0))
+    gap = np.where(after > before, time[after] - time[before], 1.0)
+    share = ((time[missing] - time[before]) / gap).reshape(-1, *(1,) * (signal.ndim - 1))
+    share = np.where((after > before).reshape(share.shape), share, 0.0)
+    result = signal.copy()
+    result[missing] = (1.0 - share) * signal[before] + share * signal[after]
+    return result
+
+
+def neighbour_mean(
+    values: npt.NDArray[np.floating], weight: npt.NDArray[np.floating], width: float
+) -> Array:
+    """Weighted mean (..., y, x) of the pixels around each, by a Gaussian of a width [pixel].
+
+    Pixels of weight 0 do not count, whatever their value; NaN where no pixel counts.
+    """
+    sums = [
+        gaussian_filter(part, width, mode="constant", axes=(-2, -1))
+        for part in (np.where(weight > 0, weight * values, 0.0), weight * 1.0)
+    ]
+    empty = np.full(sums[0].shape, np.nan)
+    return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))

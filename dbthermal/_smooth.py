@@ -65,10 +65,10 @@ class Subspace:
 
 def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
-    some = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
-    if len(some) < some.shape[1]:
-        return np.asarray(np.linalg.svd(some, full_matrices=False)[2][:count].T)
-    return np.asarray(np.linalg.eigh(some.T @ some)[1][:, : -count - 1 : -1])
+    sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
+    if len(sample) < sample.shape[1]:
+        return np.asarray(np.linalg.svd(sample, full_matrices=False)[2][:count].T)
+    return np.asarray(np.linalg.eigh(sample.T @ sample)[1][:, : -count - 1 : -1])
 
 
 def subspace(
@@ -127,20 +127,20 @@ def piecewise(
         # steps C. What P leaves of these, C - P P^T C = S R, lies in the pieces with an event. The
         # object's part of S is that less the camera's, S - C R^-1.
         uneven = np.flatnonzero(events)
-        inside = slice(edges[uneven[0]], edges[uneven[-1] + 1])
+        span = slice(edges[uneven[0]], edges[uneven[-1] + 1])
         places = np.append(0, np.cumsum(counts))
-        plain = functions[inside, places[uneven[0]] : places[uneven[-1] + 1]]
+        plain = functions[span, places[uneven[0]] : places[uneven[-1] + 1]]
         camera = np.stack(steps)
-        rest = camera[:, inside].T - plain @ (plain.T @ camera[:, inside].T)
-        rest -= plain @ (plain.T @ rest)  # once more, against rounding
-        own, triangle = np.linalg.qr(rest)
-        together[size:, inside] = own.T
+        remainder = camera[:, span].T - plain @ (plain.T @ camera[:, span].T)
+        remainder -= plain @ (plain.T @ remainder)  # once more, against rounding
+        basis, triangle = np.linalg.qr(remainder)
+        together[size:, span] = basis.T
         with_object = together.copy()
         with_object[size:] -= np.linalg.solve(triangle.T, camera)
         leverage += chosen * (with_object[size:].T ** 2).sum(axis=1, keepdims=True)
         # Four columns are taken together, from the first one's begin to the last one's end.
-        spans[size:, 0], last = inside.start, spans[max(size - 3, 0) :]
-        last[:, 0], last[:, 1] = np.minimum(last[:, 0], inside.start), time.size
+        spans[size:, 0], last = span.start, spans[max(size - 3, 0) :]
+        last[:, 0], last[:, 1] = np.minimum(last[:, 0], span.start), time.size
         object_part = with_object.T
     return Subspace(functions, object_part, len(together) - 1, rising, spans, leverage)
 
@@ -148,21 +148,21 @@ def piecewise(
 @compiled
 def _make_orthonormal(columns: Array, degree: int, start: int, stop: int) -> None:
     """Make a column (column, time) orthogonal to those before it and of length 1, in place."""
-    own = columns[degree, start:stop]
+    column = columns[degree, start:stop]
     for _ in range(2):  # once more, against rounding
         for k in range(degree):
-            other = columns[k, start:stop]
+            previous = columns[k, start:stop]
             product = 0.0
-            for t in range(own.size):
-                product += other[t] * own[t]
-            for t in range(own.size):
-                own[t] -= product * other[t]
+            for t in range(column.size):
+                product += previous[t] * column[t]
+            for t in range(column.size):
+                column[t] -= product * previous[t]
     square = 0.0
-    for t in range(own.size):
-        square += own[t] ** 2
+    for t in range(column.size):
+        square += column[t] ** 2
     length = np.sqrt(square)
-    for t in range(own.size):
-        own[t] /= length
+    for t in range(column.size):
+        column[t] /= length
 
 
 @compiled
@@ -190,13 +190,13 @@ def _polynomials(
         at, over = time[start:stop], leverage[start:stop, 0]
         over[:] = 0.0
         for degree in range(count):
-            own = columns[column + degree, start:stop]
+            polynomial = columns[column + degree, start:stop]
             before = columns[column + max(degree - 1, 0), start:stop]
-            for t in range(own.size):
-                own[t] = (at[t] - middle) * before[t] if degree > 0 else 1.0
+            for t in range(polynomial.size):
+                polynomial[t] = (at[t] - middle) * before[t] if degree > 0 else 1.0
             _make_orthonormal(columns[column:], degree, start, stop)
-            for t in range(own.size):
-                over[t] += factor * own[t] ** 2
+            for t in range(polynomial.size):
+                over[t] += factor * polynomial[t] ** 2
             spans[column + degree, 0], spans[column + degree, 1] = start, stop
         column += count
 
@@ -205,7 +205,7 @@ def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:
     """Steps (time,) of the camera, one for each shutter event between the frames."""
     if segment is None:
         return []
-    return [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
+    return [np.where(segment >= number, 1.0, 0.0) for number in np.unique(segment)[1:]]
 
 
 def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Array, Array]:
@@ -254,7 +254,7 @@ def _arnoldi(position: Array, order: int) -> Array:
     for degree in range(1, order):
         following = position * columns[:, degree - 1]
         for _ in range(2):  # once more, against rounding
-            known = columns[:, :degree]
-            following = following - known @ (known.T @ following)
+            previous = columns[:, :degree]
+            following = following - previous @ (previous.T @ following)
         columns[:, degree] = following / np.linalg.norm(following)
     return columns

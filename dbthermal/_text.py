@@ -73,9 +73,9 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LI
         byte = f"0x{content[error.start]:02x}"
         raise ValueError(f"{place}: Invalid byte {byte}. Must be text in {encoding}.") from error
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    if found := _CONTROL.search(text):
-        place = _after(os.fspath(path), text[: found.start()])
-        raise ValueError(f"{place}: Invalid control character {found.group()!r}. Must be text.")
+    if control := _CONTROL.search(text):
+        place = _after(os.fspath(path), text[: control.start()])
+        raise ValueError(f"{place}: Invalid control character {control.group()!r}. Must be text.")
     return text
 
 
@@ -134,9 +134,9 @@ def table_rows(text: str, source: str, *, comment: str | None = None) -> list[Ro
 
 def whole_lines(text: str, source: str) -> list[str]:
     """Lines of a text; ValueError if the last one has no end."""
-    *lines, rest = text.split("\n")
-    if rest:
-        message = f"Truncated line {shown(rest)}. Must end with a line end."
+    *lines, remainder = text.split("\n")
+    if remainder:
+        message = f"Truncated line {shown(remainder)}. Must end with a line end."
         raise ValueError(f"{at(source, len(lines) + 1)}: {message}")
     return lines
 
@@ -266,11 +266,11 @@ class _Document:
             return self._plain(event) if event.implicit[0] else event.value
         if depth >= _DEPTH:
             self._refuse(event, f"Invalid nesting deeper than {_DEPTH}. Must be less deep")
-        inside = takewhile(lambda e: not isinstance(e, self.yaml.CollectionEndEvent), self.events)
+        entries = takewhile(lambda e: not isinstance(e, self.yaml.CollectionEndEvent), self.events)
         if isinstance(event, self.yaml.SequenceStartEvent):
-            return [self._value(entry, depth + 1) for entry in inside]
+            return [self._value(entry, depth + 1) for entry in entries]
         pairs: dict[str, tuple[Any, Any]] = {}  # by the key as text: 1 and "1" are the same
-        for entry in inside:
+        for entry in entries:
             key = self._value(entry, depth + 1)
             if isinstance(key, bool) or not isinstance(key, str | int | float):
                 self._refuse(entry, f"Invalid key {shown(key)}. Must be text or a number")

@@ -1,4 +1,4 @@
-"""Sentences on what speaks against data that pass, which stay with these."""
+"""Warnings that are also stored in a dataset's attributes."""
 
 import warnings
 from typing import Final
@@ -13,5 +13,5 @@ def warned(dataset: xr.Dataset, *sentences: str) -> xr.Dataset:
     """Dataset with sentences in its attribute ``warnings``; each is a UserWarning, too."""
     for sentence in dict.fromkeys(sentences):
         warnings.warn(sentence, stacklevel=3)
-    known = dict.fromkeys([*dataset.attrs.get(NAME, []), *sentences])
-    return dataset.assign_attrs({NAME: [*known]}) if known else dataset
+    notes = dict.fromkeys([*dataset.attrs.get(NAME, []), *sentences])
+    return dataset.assign_attrs({NAME: [*notes]}) if notes else dataset

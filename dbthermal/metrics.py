@@ -47,11 +47,11 @@ def correlation(
             raise ValueError(f"Invalid dims {values.dims} of {label}. Must hold y and x.")
     _require_dims(*sorted((second, first), key=lambda maps: maps.ndim))
     first, second = xr.broadcast(first, laid_on(second, first, "the second map", "the first"))
-    left, right = (_centred(values, mask) for values in (first, second))
-    norm = np.linalg.norm(left, axis=-1) * np.linalg.norm(right, axis=-1)
+    signal, partner = (_centred(values, mask) for values in (first, second))
+    norm = np.linalg.norm(signal, axis=-1) * np.linalg.norm(partner, axis=-1)
     if np.any(norm <= 0):
         raise ValueError(f"Constant map in {np.sum(norm <= 0)} of {norm.size} frames. Must vary.")
-    result = first.isel(y=0, x=0, drop=True).copy(data=np.sum(left * right, axis=-1) / norm)
+    result = first.isel(y=0, x=0, drop=True).copy(data=np.sum(signal * partner, axis=-1) / norm)
     attrs = {"long_name": "correlation of the maps", "units": "1"}
     return result.drop_attrs(deep=False).rename("correlation").assign_attrs(attrs)
 
@@ -92,10 +92,12 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     return bare.assign_attrs(long_name=label, units="percent")
 
 
-def _require_dims(few: xr.DataArray, many: xr.DataArray) -> None:
+def _require_dims(reference: xr.DataArray, values: xr.DataArray) -> None:
     """Refuse a reference with a dim that the other array lacks, which would multiply its pixels."""
-    if not {*few.dims} <= {*many.dims}:
-        raise ValueError(f"Invalid dims {few.dims} of the reference. Must be among {many.dims}.")
+    if not {*reference.dims} <= {*values.dims}:
+        raise ValueError(
+            f"Invalid dims {reference.dims} of the reference. Must be among {values.dims}."
+        )
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:

@@ -101,10 +101,10 @@ def condition_number(emissivity: npt.ArrayLike) -> Array:
     rows = matrix(emissivity)
     if rows.ndim < 2 or rows.shape[-2] < 2:
         raise ValueError(f"Invalid shape {rows.shape[:-1]} of emissivities. Must have two bands.")
-    known = np.all(np.isfinite(rows), axis=(-2, -1))
-    singular = np.linalg.svd(np.where(known[..., None, None], rows, 0.5), compute_uv=False)
+    finite = np.all(np.isfinite(rows), axis=(-2, -1))
+    singular = np.linalg.svd(np.where(finite[..., None, None], rows, 0.5), compute_uv=False)
     largest, smallest = singular[..., 0], singular[..., -1]
     infinite = np.full_like(largest, np.inf)
     regular = smallest > 4 * np.finfo(np.float64).eps * largest
     np.divide(largest, smallest, out=infinite, where=regular)
-    return np.where(known, infinite, np.nan)
+    return np.where(finite, infinite, np.nan)

@@ -102,10 +102,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     >>> np.allclose(estimate(first, second, time), [0.05, 0.15], rtol=0.1)  # [K]
     True
     """
-    first, second = (_numbers.real_numbers("signal", one) for one in (first, second))
+    first, second = (_numbers.real_numbers("signal", signal) for signal in (first, second))
     if first.ndim != 2 or first.shape != second.shape:
-        found = f"shapes {first.shape} and {second.shape} of the signals"
-        raise ValueError(f"Invalid {found}. Must be (time, pixel), and equal.")
+        label = f"shapes {first.shape} and {second.shape} of the signals"
+        raise ValueError(f"Invalid {label}. Must be (time, pixel), and equal.")
     frames, pixels = first.shape
     if frames < MINIMUM_FRAMES or pixels == 0:
         raise ValueError(
@@ -120,21 +120,21 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
     remaining = 1.0 - functions.shape[1] / frames
-    differences = [second_difference(part, time) for part in rapid]
+    differences = [second_difference(residual, time) for residual in rapid]
     auto_first, cross, auto_second = (
-        part / remaining for part in _trimmed_covariance(*differences)
+        moment / remaining for moment in _trimmed_covariance(*differences)
     )
-    one, other = rapid
-    lagged = (one[1:] * other[:-1] + one[:-1] * other[1:]).sum(axis=0)
+    signal, partner = rapid
+    lagged = (signal[1:] * partner[:-1] + signal[:-1] * partner[1:]).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = lagged / (2.0 * (one[1:] * one[:-1]).sum(axis=0))  # (pixel), one frame apart
+        ratio = lagged / (2.0 * (signal[1:] * signal[:-1]).sum(axis=0))  # (pixel), one frame apart
         correlation = np.nan_to_num(cross / np.sqrt(auto_first * auto_second)).sum()
         # With y2 = ratio y1: var_1 = s_1^2 + v, var_2 = s_2^2 + ratio^2 v, cov = ratio v. Too small
         # to be seen in a pixel, v is still a bias of all: they are judged together.
-        part = np.array([cross / ratio, ratio * cross])
+        shared_variance = np.array([cross / ratio, ratio * cross])
         shared = correlation > _SIGNIFICANCE * _CORRELATION_STD * np.sqrt(pixels / frames)
-        part[:, ~np.isfinite(part).all(axis=0) | ~shared] = 0.0
-    variances = np.array([auto_first, auto_second]) - part
+        shared_variance[:, ~np.isfinite(shared_variance).all(axis=0) | ~shared] = 0.0
+    variances = np.array([auto_first, auto_second]) - shared_variance
     result = [float(np.median(variance)) for variance in variances]
     if not min(result) > 0:
         raise ValueError(
@@ -158,13 +158,13 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     """
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))
-    rough = [np.median(np.abs(second_difference(part, time))) for part in signals]
+    rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
     quiet = int(np.argmin(rough))
-    others = [band for band in range(len(signals)) if band != quiet]
-    pairs = [estimate(signals[quiet], signals[band], time) for band in others]
+    further = [band for band in range(len(signals)) if band != quiet]
+    pairs = [estimate(signals[quiet], signals[band], time) for band in further]
     result = np.empty(len(signals))
     result[quiet] = np.median([pair[0] for pair in pairs])
-    result[others] = [pair[1] for pair in pairs]
+    result[further] = [pair[1] for pair in pairs]
     return result
 
 
@@ -175,17 +175,20 @@ def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Arra
     factor: a cut of each band alone would reduce the covariance more than the variances, whose
     small difference is the noise.
     """
-    scales = [MAD * np.median(np.abs(part), axis=0) for part in (first, second)]
-    one, other = (
-        np.divide(part, std, out=np.zeros_like(part), where=std > 0)
-        for part, std in zip((first, second), scales, strict=True)
+    scales = [MAD * np.median(np.abs(difference), axis=0) for difference in (first, second)]
+    first_scaled, second_scaled = (
+        np.divide(difference, std, out=np.zeros_like(difference), where=std > 0)
+        for difference, std in zip((first, second), scales, strict=True)
     )
     # Robust correlation (Gnanadesikan, Kettenring 1972, doi:10.2307/2528963).
-    plus, minus = (np.median(np.abs(part), axis=0) ** 2 for part in (one + other, one - other))
+    plus, minus = (
+        np.median(np.abs(difference), axis=0) ** 2
+        for difference in (first_scaled + second_scaled, first_scaled - second_scaled)
+    )
     correlation = np.divide(
         plus - minus, plus + minus, out=np.zeros_like(plus), where=plus + minus > 0
     )
-    distance = one**2 - 2.0 * correlation * one * other + other**2
+    distance = first_scaled**2 - 2.0 * correlation * first_scaled * second_scaled + second_scaled**2
     # Squared Mahalanobis distance: (a^2 - 2 r a b + b^2) / (1 - r^2).
     keep = distance <= _TRIM * (1.0 - correlation**2)
     count = keep.sum(axis=0) * _TRIMMED_VARIANCE

@@ -97,8 +97,8 @@ class Curve:
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature [K] of a blackbody of given counts; NaN at and below the offset."""
         excess = np.asarray(counts, dtype=np.float64) - self.offset
-        known = (excess > 0) & np.isfinite(excess)
-        ratio = self.amplitude / np.where(known, excess, np.nan)
+        invertible = (excess > 0) & np.isfinite(excess)
+        ratio = self.amplitude / np.where(invertible, excess, np.nan)
         scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio)
         return (scale - self.shift) / self.wavelength
 
@@ -232,8 +232,8 @@ def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
     common = (number["reference_temperature"], number["temperature_min"], number["temperature_max"])
     reference, lowest, highest = common
     if not (0 < lowest < highest and lowest - _MARGIN <= reference <= highest + _MARGIN):
-        found = f"Invalid range {lowest} to {highest} K of the response, reference {reference} K"
-        raise ValueError(f"{found}. Must increase, be positive, and within {_MARGIN} K of it.")
+        label = f"Invalid range {lowest} to {highest} K of the response, reference {reference} K"
+        raise ValueError(f"{label}. Must increase, be positive, and within {_MARGIN} K of it.")
     if kind == "linear":
         slope, intercept = number["linear_slope"], number["linear_intercept"]
         result: Curve = LinearCurve(band, slope, 0.0, 0.0, intercept, *common)
@@ -267,8 +267,8 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     values = np.asarray(response["noise"].values[places], dtype=np.float64)
     bad = ~((values > 0) & np.isfinite(values))
     if np.any(bad):
-        found = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
-        raise ValueError(f"{found}. Must be finite and positive.")
+        label = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
+        raise ValueError(f"{label}. Must be finite and positive.")
     return values
 
 
@@ -319,7 +319,7 @@ def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataA
     if counts.dims[:1] != ("band",):
         raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
-    both = zip(curves(response, names), counts.values, strict=True)
-    values = [one.inverse(part) for one, part in both]
+    pairs = zip(curves(response, names), counts.values, strict=True)
+    values = [band_curve.inverse(band_counts) for band_curve, band_counts in pairs]
     result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
     return result.assign_attrs(units="K", long_name="apparent temperature")

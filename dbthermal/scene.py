@@ -127,8 +127,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
                 separating=separating,
             )
             blocks = _rows.blocks(result["object_temperature"].shape)
-            parts = (_let_go(result.isel(y=rows)) for rows in blocks)
-            store.save_rows(parts, target, provenance or store.provenance({}))
+            results = (_let_go(result.isel(y=rows)) for rows in blocks)
+            store.save_rows(results, target, provenance or store.provenance({}))
         return store.open_dataset(target)
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
@@ -144,29 +144,33 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 
 
 def _check_options(step: Callable[..., Any], options: Any) -> None:
-    """Refuse what is no mapping of options that a step has by name, and is not given here."""
+    """Refuse options that are no mapping, or that a step does not take by name."""
     name = step.__name__
     if not isinstance(options, Mapping):
         kind = type(options).__name__
         raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
-    by_name = [one for one in signature(step).parameters.values() if one.kind is one.KEYWORD_ONLY]
+    by_name = [
+        parameter
+        for parameter in signature(step).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    ]
     hidden = {"lazy", "reflection_shift"} if step is align else {"lazy"}
-    known = [one.name for one in by_name if one.name not in hidden]
+    names = [parameter.name for parameter in by_name if parameter.name not in hidden]
     for option in options:
-        if option not in known:
-            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {known}.")
+        if option not in names:
+            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {names}.")
 
 
-def _let_go(part: xr.Dataset) -> xr.Dataset:
-    """Rows of a result, when those before need no more memory."""
+def _let_go(rows: xr.Dataset) -> xr.Dataset:
+    """Free the memory of the rows before; return these."""
     release()
-    return part
+    return rows
 
 
 def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Capture on one clock, and the shift of its reflections; None where they are not apart."""
+    """Synchronise the bands; return the capture, and the reflection shift or None."""
     options = {name: value for name, value in options.items() if value is not None}
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))

@@ -228,10 +228,12 @@ def check(
     optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
     for name in names or (*STAGES[stage], *optional):
         if name not in dataset:
-            fitting = [one for one in STAGES if STAGES[one].keys() <= set(dataset)]
-            most = max(fitting, key=lambda one: len(STAGES[one]), default="")
-            found = f"{sorted(map(str, dataset))}" + (f", as has a {most}" if most else "")
-            raise ValueError(f"Missing variable '{name}' in {label}. Has {found}.")
+            fitting = [
+                stage_name for stage_name in STAGES if STAGES[stage_name].keys() <= set(dataset)
+            ]
+            nearest = max(fitting, key=lambda stage_name: len(STAGES[stage_name]), default="")
+            present = f"{sorted(map(str, dataset))}" + (f", as has a {nearest}" if nearest else "")
+            raise ValueError(f"Missing variable '{name}' in {label}. Has {present}.")
         variable = STAGES[stage].get(name) or OPTIONAL[stage][name]
         check_variable(dataset[name], variable, f"'{name}' of {label}")
     return dataset
@@ -368,15 +370,18 @@ def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     values : mapping
         Values by name.
     """
-    known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
-    return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
+    documented = {**STAGES[stage], **OPTIONAL.get(stage, {})}
+    return {
+        name: (documented[name].dims, value, documented[name].attrs)
+        for name, value in values.items()
+    }
 
 
 def _require(data: object, kind: type, label: str) -> None:
     """Refuse what is of another type."""
     if not isinstance(data, kind):
-        found = f"Invalid {label.removeprefix('the ')} of type {type(data).__name__}"
-        raise TypeError(f"{found}. Must be a {kind.__name__}.")
+        message = f"Invalid {label.removeprefix('the ')} of type {type(data).__name__}"
+        raise TypeError(f"{message}. Must be a {kind.__name__}.")
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

@@ -396,11 +396,11 @@ plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 info a.tif -> Missing --unit: 'a.tif' does not tell
-seperate a b -> Did you mean 'separate'
-align a.zarr --ofset 0 -o x.zarr -> Did you mean '--offset'
-align a.zarr --register homograph -o x.zarr -> Did you mean 'homography'
-export result.zarr --variable emisivity -o x.tif -> Did you mean 'emissivity'
-plan plate_window_glas --noise 0.03 -> Did you mean 'plate window glass'
+seperate a b -> invalid choice: 'seperate' .choose from
+align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset
+align a.zarr --register homograph -o x.zarr -> 'homograph' .choose from .*homography
+export result.zarr --variable emisivity -o x.tif -> 'emisivity' for .tif. Must be one of
+plan plate_window_glas --noise 0.03 -> 'plate_window_glas'. Must be one of
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C
 calibrate --at 5c a.tif b.tif -o a.zarr -> temperature '5c'. Must be a number, with a decimal point
@@ -421,7 +421,7 @@ calibrate --maker a --correction-output y -o x -> correction-output --maker
 calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
-separate aligned.zarr response.zarr --method naive --workers 2 -o x -> workers --met
+separate aligned.zarr response.zarr --method dbvt --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc
@@ -442,7 +442,7 @@ def mistaken(results: Path) -> Path:
 
 @pytest.mark.parametrize("row", ROWS.splitlines())
 def test_mistakes_are_explained_in_words_of_the_commands(mistaken: Path, row: str) -> None:
-    """What is wrong with files, stores, options and names is one line; a misspelling is known."""
+    """What is wrong with files, stores, options and names is one line, with names to choose."""
     commands, _, reason = row.partition(" -> ")
     for command in commands.split("; "):
         with warnings.catch_warnings(action="always"):

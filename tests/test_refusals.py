@@ -122,13 +122,9 @@ SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
     (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
     (separation.CalibratedSettings, {"smooth": "false"}, "smooth 'false' of method"),
-    (separation.BcpSettings, {"patch": "15"}, "patch '15' of method"),
-    (separation.BcpSettings, {"patch": 15.0}, "whole number"),
-    (separation.NaiveSettings, {"starts": 2.5}, "starts 2.5 of method"),
-    (separation.NaiveSettings, {"starts": True}, "starts True of method"),
+    (separation.DbvtSettings, {"steps": True}, "steps True of method"),
     (separation.DbvtSettings, {"batch": 2.5}, "whole number"),
     (separation.DbvtSettings, {"start": None}, "start None of method"),
-    (separation.RatioSettings, {"order": 2.5}, "order 2.5 of method"),
 ]
 CASES: list[tuple[Call, str]] = [
     (lambda: calibration.Bias(air_temperature=22.0), r"air_temperature \[K\] 22.0.*in kelvin"),

@@ -22,7 +22,7 @@ from dbthermal import (
     separation,
     simulation,
 )
-from reproduction import scales
+from reproduction import methods, scales
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -99,7 +99,9 @@ def measured(capture: xr.Dataset) -> xr.Dataset:
 def solved(method: str, capture: xr.Dataset) -> None:
     """Separate by a method, without a known noise."""
     known = GLASS if method == "calibrated" else None
-    separation.solve(capture, CAMERA.drop_vars("noise"), method=method, emissivity=known)
+    separation.solve(
+        capture, CAMERA.drop_vars("noise"), method=methods.get_method(method), emissivity=known
+    )
 
 
 def separated(capture: xr.Dataset) -> None:

@@ -9,8 +9,8 @@ PLUS: Final = Path("+")  # between the files of two cameras
 
 def leaves(value: Any) -> Iterator[Any]:
     """Yield the values of an argument, whose lists may hold lists."""
-    for one in value if isinstance(value, list) else [value]:
-        yield from leaves(one) if isinstance(one, list) else [one]
+    for entry in value if isinstance(value, list) else [value]:
+        yield from leaves(entry) if isinstance(entry, list) else [entry]
 
 
 def is_source(name: str, value: Any) -> bool:

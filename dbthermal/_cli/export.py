@@ -1,4 +1,4 @@
-"""Results as other programs read them: curves, films, pictures, NetCDF."""
+"""Results for other programs: curves, films, pictures, NetCDF; reports and explorers."""
 
 import argparse
 import json
@@ -31,78 +31,79 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     if options.variable not in names:
         kind = f"variable '{options.variable}' for {suffix}"
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
+    # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
     if suffix in (".tif", *_PICTURES) and "status" in result and options.variable != "status":
         outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
-    said = {}
+    summary = {}
     for path, options.variable in outputs.items():
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
         with store.whole(path, suffix) as part:
-            said[str(path)] = _WRITERS[suffix](result, part, options)
-    return said
+            summary[str(path)] = _WRITERS[suffix](result, part, options)
+    return summary
 
 
 def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Mean, extremes, deviation, number of pixels and status of each place over time.
 
-    Without a place of the image. Pixels that are named one by one count with their flags, which
-    are named; of a region only those that are measured, without one.
+    Without a place, of the image. A single pixel counts with its flags, which a column names; in a
+    region the measured pixels count, which have none.
     """
     view, columns = explorer.View(result), dict[str, xr.DataArray]()
     height, width = view.shape
     boxes = [(y, y + 1, x, x + 1) for y, x in options.pixel] + [*map(tuple, options.region)]
     for top, bottom, left, right in boxes or [(0, height, 0, width)]:
         ((label, region),) = _regions(result, [(top, bottom, left, right)]).items()
-        one = bottom - top == right - left == 1
-        curve = view.curve(options.variable, region, pixels="all" if one else "measured")
-        where = f"pixel {top} {left}" if one else f"{label}, measured"
+        single = bottom - top == right - left == 1
+        curve = view.curve(options.variable, region, pixels="all" if single else "measured")
+        place = f"pixel {top} {left}" if single else f"{label}, measured"
         for name, values in curve.items():
-            columns[f"{where} {name} [{values.attrs.get('units', '1')}]"] = values
-        bits = schema.Status(int(view.status[top, left]) if one else 0)
+            columns[f"{place} {name} [{values.attrs.get('units', '1')}]"] = values
+        bits = schema.Status(int(view.status[top, left]) if single else 0)
         flags = " ".join(bit.label for bit in bits) or "no_flag"
         flags = flags if "status" in view.panes else "unknown"
-        columns[f"{where} status"] = xr.full_like(curve["mean"], flags, dtype=object)
+        columns[f"{place} status"] = xr.full_like(curve["mean"], flags, dtype=object)
     xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
 
 
 def _regions(result: xr.Dataset, boxes: Iterable[Sequence[int]]) -> dict[str, explorer.Region]:
-    """Rectangles y0 y1 x0 x1 by their names, which must lie in the image."""
-    found, height, width = {}, result.sizes["y"], result.sizes["x"]
+    """Rectangles y0 y1 x0 x1 by their names; they must lie in the image."""
+    regions, height, width = {}, result.sizes["y"], result.sizes["x"]
     for top, bottom, left, right in boxes:
         label = f"rows {top} to {bottom}, columns {left} to {right}"
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
             raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
-        found[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
-    return found
+        regions[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
+    return regions
 
 
 def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Write all frames of a variable as a TIFF stack, with its provenance as JSON."""
     import tifffile  # noqa: PLC0415 - optional
 
-    one = result[options.variable]
-    about = {"variable": one.name, "units": one.attrs.get("units"), **provenance(options)}
-    values = one.values.astype(np.float32) if one.dtype.kind == "f" else one.values
+    array = result[options.variable]
+    about = {"variable": array.name, "units": array.attrs.get("units"), **provenance(options)}
+    values = array.values.astype(np.float32) if array.dtype.kind == "f" else array.values
     tifffile.imwrite(path, values, photometric="minisblack", description=json.dumps(about))
     return {"shape": list(values.shape), "dtype": str(values.dtype), "units": about["units"]}
 
 
 def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Variable at the last time, in degrees Celsius if it is a temperature."""
+    """Draw a variable at the last time, in degrees Celsius if it is a temperature."""
     from dbthermal import figures  # noqa: PLC0415 - optional
     from dbthermal.figures import drawing  # noqa: PLC0415 - optional
 
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
-    one = result[options.variable]
-    image = one.isel({dim: -1 for dim in one.dims if dim not in ("y", "x")})
-    unit = one.attrs.get("units", "1")
-    if unit == "K" and not str(one.name).endswith("_std"):
+    array = result[options.variable]
+    image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
+    unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")
+    if unit == "K" and not label.endswith(" std"):
         image, unit = image - zero_Celsius, "\N{DEGREE SIGN}C"
     figure, axes = drawing.canvas(1, 1, (6.4, 4.8))
-    label = str(one.name).replace("_", " ")
     drawing.draw_image(figure, axes[0, 0], image, label, f"{label} [{unit}]")
     figure.suptitle(drawing.provenance_note(result).removeprefix(", "))
     store.save_figure(figure, path, provenance(options))
@@ -113,21 +114,21 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
 
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
-    """Everything in format 3, which holds neither mappings nor truth values as attributes."""
+    """Write everything in format 3, with what its attributes cannot hold as JSON."""
     plain = result.drop_encoding()
-    for attrs in (plain.attrs, *(one.attrs for one in plain.variables.values())):
-        long = {name: one for name, one in attrs.items() if isinstance(one, dict | bool | None)}
-        long |= {name: attrs[name] for name in ("warnings",) if name in attrs}
-        attrs.update({name: json.dumps(one) for name, one in long.items()})
+    for attrs in (plain.attrs, *(variable.attrs for variable in plain.variables.values())):
+        for name, value in attrs.items():
+            if name == "warnings" or isinstance(value, dict | bool | None):
+                attrs[name] = json.dumps(value)
     plain.to_netcdf(path, engine="scipy")
     return {"variables": sorted(map(str, result.data_vars))}
 
 
 def _shown(options: argparse.Namespace, stages: str) -> list[xr.Dataset]:
-    """Result, and its capture and the cameras' response, as far as they are to be shown beside."""
+    """Result of a stage, with its capture and the cameras' response if they are named."""
     if len(options.shown) > 2:
-        found = f"{len(options.shown)} stores beside '{options.result}'"
-        raise ValueError(f"Invalid {found}. Must be its capture, and the cameras' response.")
+        label = f"{len(options.shown)} stores beside '{options.result}'"
+        raise ValueError(f"Invalid {label}. Must be its capture, and the cameras' response.")
     return [*staged(options, result=stages), *map(opened, options.shown)]
 
 
@@ -142,7 +143,7 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
 
 def explore(options: argparse.Namespace) -> dict[str, Any]:
     """Command `explore`: a notebook of one cell, which JupyterLab opens."""
-    explorer.View(*_shown(options, "separated|corrected|capture"))  # or the notebook cannot
+    explorer.View(*_shown(options, "separated|corrected|capture"))  # refuses what cannot be shown
     paths = ", ".join(repr(str(path.resolve())) for path in [options.result, *options.shown])
     cell: dict[str, Any] = {"id": "explore", "cell_type": "code", "metadata": {}, "outputs": []}
     cell |= {"execution_count": None, "source": f"import dbthermal\n\ndbthermal.explore({paths})"}
@@ -150,10 +151,10 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
     with store.whole(options.output, ".ipynb") as part:
         part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
-    before = ""
-    if any(find_spec(one) is None for one in ("anywidget", "jupyterlab")):
-        before = "python -m pip install 'dbthermal[explorer]' jupyterlab; "
-    return {str(options.output): f"opened by: {before}jupyter lab {options.output}"}
+    install = ""
+    if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
+        install = "python -m pip install 'dbthermal[explorer]' jupyterlab; "
+    return {str(options.output): f"opened by: {install}jupyter lab {options.output}"}
 
 
 _PICTURES = (".png", ".pdf", ".svg")

@@ -1,4 +1,4 @@
-"""Stores and files that commands read, the stores that they write, and what these are."""
+"""Stores and files of the commands: read, written, and summarised."""
 
 import argparse
 import sys
@@ -37,12 +37,12 @@ def opened(path: Path) -> xr.Dataset:
 def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
     """Stores that arguments name, each of a stage of `schema`, or of one of several: ``a|b``."""
     datasets = {name: opened(getattr(options, name)) for name in stages}
-    found = {name: _stage(dataset) for name, dataset in datasets.items()}
     for name, wanted in stages.items():
-        if found[name] not in wanted.split("|"):
-            others = [one for one in stages if found[name] in stages[one].split("|")]
-            hint = f" Exchanged with the {others[0]}?" if others else ""
-            label = f"{name} '{getattr(options, name)}' of stage '{found[name]}'"
+        actual = _stage(datasets[name])
+        if actual not in wanted.split("|"):
+            fitting = [argument for argument in stages if actual in stages[argument].split("|")]
+            hint = f" Exchanged with the {fitting[0]}?" if fitting else ""
+            label = f"{name} '{getattr(options, name)}' of stage '{actual}'"
             stage = wanted.partition("|")[0]
             rule = f"Must be of stage '{stage}', as from: dbthermal {_MADE_BY[stage]}"
             raise ValueError(f"Invalid {label}. {rule}.{hint}")
@@ -51,8 +51,8 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
     """Recording of one camera, with its origin."""
-    made = _read(paths, options)
-    return made.assign_attrs(origin="simulated") if options.simulated else made
+    movie = _read(paths, options)
+    return movie.assign_attrs(origin="simulated") if options.simulated else movie
 
 
 def _read(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
@@ -88,36 +88,35 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
         paths = [paths[0], PLUS, paths[1]]
     place = paths.index(PLUS) if PLUS in paths else 0
     if paths.count(PLUS) != 1 or place in {0, len(paths) - 1}:
-        found = f"{len(paths)} files: which are of the second camera is not clear"
-        raise ValueError(f"Invalid {found}. Must be one of each, or: a*.tif + b*.tif.")
+        label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
+        raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name both, such as: --bands 8-14 9.5.")
-    first, second = options.bands
-    both = [recording(part, options) for part in (paths[:place], paths[place + 1 :])]
-    return readers.two_bands(*both, bands=(first, second), offset=offset)
+    first, second = (recording(files, options) for files in (paths[:place], paths[place + 1 :]))
+    return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
 
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     """Command `import`."""
     from dbthermal import separation  # noqa: PLC0415 - takes long
 
-    made = capture(options.files, options, options.offset)
+    scene = capture(options.files, options, options.offset)
     fewest = separation.get_method("subspace").minimum_frames
-    if (frames := made.sizes["time"]) < fewest:
+    if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
-        made = warned(made, f"The capture has {frames} frames. {rule}.")
-    return saved(made, options)
+        scene = warned(scene, f"The capture has {frames} frames. {rule}.")
+    return saved(scene, options)
 
 
 def saved(
     result: xr.Dataset, options: argparse.Namespace, path: Path | None = None
 ) -> dict[str, Any]:
     """Save a result with its provenance, a capture by rows, which may be lazy, and describe it."""
-    path, parts = path or options.output, [slice(None)]
+    path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
-        parts = [*_rows.blocks(result["counts"].shape)]
-    shown = tqdm(parts, desc=options.command, unit="block", disable=not sys.stderr.isatty())
-    rows = (result.isel(y=one, missing_dims="ignore") for one in shown)
+        blocks = [*_rows.blocks(result["counts"].shape)]
+    bar = tqdm(blocks, desc=options.command, unit="block", disable=not sys.stderr.isatty())
+    rows = (result.isel(y=block, missing_dims="ignore") for block in bar)
     store.save_rows(rows, path, provenance(options))
     return described(path)
 
@@ -131,10 +130,9 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
     """Provenance of a command: its options, and the checksums of what it reads."""
     parameters, inputs = dict[str, Any](), dict[str, Path]()
     for name, value in vars(options).items():
-        parts = [*leaves(value)]
-        sources = [one for one in parts if is_source(name, one)]
+        sources = [leaf for leaf in leaves(value) if is_source(name, leaf)]
         inputs |= {f"{name} {number}": path for number, path in enumerate(sources)}
-        plain = [one for one in parts if one is not None and not isinstance(one, Path)]
+        plain = [leaf for leaf in leaves(value) if leaf is not None and not isinstance(leaf, Path)]
         if plain and name not in _NOT_RECORDED:
             parameters[name] = plain if isinstance(value, list) else value
     return store.provenance(parameters, inputs)
@@ -150,48 +148,50 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
 
 def outline(dataset: xr.Dataset) -> dict[str, Any]:
     """Stage, sizes, bands and clock of a dataset."""
-    said: dict[str, Any] = {"stage": _stage(dataset), "sizes": dict(dataset.sizes)}
+    lines: dict[str, Any] = {"stage": _stage(dataset), "sizes": dict(dataset.sizes)}
     if "band" in dataset.coords:
-        said["bands"] = [str(band) for band in np.atleast_1d(dataset["band"].values)]
+        lines["bands"] = [str(band) for band in np.atleast_1d(dataset["band"].values)]
     if dataset.sizes.get("time", 0) > 1 and "time" in dataset.coords:
         time = dataset["time"].values
-        said["seconds"] = round(float(time[-1] - time[0]), 6)
-        said["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
-    return said
+        lines["seconds"] = round(float(time[-1] - time[0]), 6)
+        lines["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
+    return lines
 
 
 def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
-    """Outline and flags of a dataset; and everything else, if that is wanted."""
-    said = outline(dataset)
+    """Outline, flags, clocks, views and medians of a dataset; with everything its attributes."""
+    lines, attrs = outline(dataset), dataset.attrs
+    # Shares of the flags, and frames that were lost or bridged.
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
-            said[f"{name}_shares"] = _shares(dataset[name])
+            lines[f"{name}_shares"] = _shares(dataset[name])
     frames = ("frames_missing", "frames_bridged")
-    said |= {name: round(dataset.attrs[name], 1) for name in frames if name in dataset.attrs}
-    found = {name: dataset.attrs.get(name) for name in ("time_offset", "time_offset_std")}
-    said |= {
-        f"{name}_s": np.round(one, 6).tolist() for name, one in found.items() if one is not None
-    }
-    said |= {"frames_lost": dataset.attrs["frames_lost"]} if "frames_lost" in dataset.attrs else {}
-    views = len(dataset.attrs.get("transform", ())) / 9  # a matrix each
+    lines |= {name: round(attrs[name], 1) for name in frames if name in attrs}
+    # The offset of the clocks, and that of the views: a matrix for each band.
+    for name in ("time_offset", "time_offset_std"):
+        if attrs.get(name) is not None:
+            lines[f"{name}_s"] = np.round(attrs[name], 6).tolist()
+    lines |= {name: attrs[name] for name in ("frames_lost",) if name in attrs}
+    views = len(attrs.get("transform", ())) / 9
     if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
-        said["view_shift_pixel"] = _view_shifts(dataset)
+        lines["view_shift_pixel"] = _view_shifts(dataset)
+    # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
-            values = [one[np.isfinite(one)] for one in np.atleast_1d(good.values)]
-            if all(one.size for one in values):  # of no pixel without a flag there is none
-                medians = [round(float(np.median(one)), 4) for one in values]
-                said[f"median_{name}{unit}"] = dict(zip(said["bands"], medians, strict=True))
+            values = [pixels[np.isfinite(pixels)] for pixels in np.atleast_1d(good.values)]
+            if all(pixels.size for pixels in values):
+                medians = [round(float(np.median(pixels)), 4) for pixels in values]
+                lines[f"median_{name}{unit}"] = dict(zip(lines["bands"], medians, strict=True))
     if not everything:
-        return said
-    said["variables"] = {
-        str(name): f"{one.dtype} {one.dims} [{one.attrs.get('units', '-')}]"
-        for name, one in dataset.data_vars.items()
+        return lines
+    lines["variables"] = {
+        str(name): f"{array.dtype} {array.dims} [{array.attrs.get('units', '-')}]"
+        for name, array in dataset.data_vars.items()
     }
     long = ("provenance", "files", "transform")
-    said["attributes"] = {name: dataset.attrs[name] for name in dataset.attrs if name not in long}
-    return said | {name: dataset.attrs.get(name, {}) for name in long[:2]}
+    lines["attributes"] = {name: value for name, value in attrs.items() if name not in long}
+    return lines | {name: attrs.get(name, {}) for name in long[:2]}
 
 
 def _stage(dataset: xr.Dataset) -> str:
@@ -199,7 +199,7 @@ def _stage(dataset: xr.Dataset) -> str:
     if "counts" in dataset and dataset["counts"].dims == ("time", "y", "x"):
         return "recording of one band"
     fitting = ["other"]
-    for stage, variables in sorted(schema.STAGES.items(), key=lambda one: len(one[1])):
+    for stage, variables in sorted(schema.STAGES.items(), key=lambda stage: len(stage[1])):
         try:
             schema.check(dataset, stage)
         except (TypeError, ValueError):

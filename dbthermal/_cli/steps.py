@@ -1,4 +1,4 @@
-"""Steps from a capture to a result, the plan of a capture, and the data of the package."""
+"""Steps from a capture to a result; the plan of a capture; the data of the package."""
 
 import argparse
 import math
@@ -50,13 +50,14 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
     counts = blackbody["counts"] if fitted is None else fitted["level"]
     response = calibration.fit_response(counts, blackbody.get("noise"))
-    parts = leaves([options.at, options.blackbody, options.sweep])
-    files = [str(one) for one in parts if isinstance(one, str | Path) and one != PLUS]
+    # The response names the files that it was fitted to.
+    named = leaves([options.at, options.blackbody, options.sweep])
+    files = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
     response.attrs["blackbody"] += f"; of {', '.join(files)}"
-    said = saved(response, options)
+    summary = saved(response, options)
     if fitted is not None and options.correction_output:
-        said |= saved(fitted, options, options.correction_output)
-    return said
+        summary |= saved(fitted, options, options.correction_output)
+    return summary
 
 
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
@@ -73,13 +74,14 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        one = capture(paths, options, offset=0.0)  # of what rests
-        good = np.arange(one.sizes["time"])
-        if "exposure_time" in one:  # frames that are padded, or damaged, have none
-            good = np.flatnonzero(one["exposure_time"].notnull().all("band"))
-        frames = one["counts"].isel(time=good[: options.frames]).load()
+        still = capture(paths, options, offset=0.0)  # nothing moves: any offset will do
+        good = np.arange(still.sizes["time"])
+        if "exposure_time" in still:  # padded and damaged frames have none
+            good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
+        frames = still["counts"].isel(time=good[: options.frames]).load()
         movie = frames.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
+    # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)
     counts = xr.concat([movie.isel(frame=slice(number)) for movie in movies], dim="temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
@@ -88,22 +90,28 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
 
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
-    given = {"correction": "correction"} if options.correction else {}
-    raw, *fitted = staged(options, capture="capture|corrected", **given)
+    stages = {"correction": "correction"} if options.correction else {}
+    raw, *fitted = staged(options, capture="capture|corrected", **stages)
     by_camera = options.corrected_by_camera
     files = raw.attrs.get("files", {}).values()
-    # A maker's Planck constants hold for all pixels alike.
-    of_maker = bool(files) and all("file_planck_R1" in one for one in files)
-    if by_camera == bool(options.correction) and (by_camera or not of_maker):
-        found = "both a file and --corrected-by-camera" if by_camera else "neither"
+    # Planck constants of the maker hold for all pixels: such a camera has corrected its offsets.
+    by_maker = bool(files) and all("file_planck_R1" in attrs for attrs in files)
+    if by_camera == bool(options.correction) and (by_camera or not by_maker):
+        sources = "both a file and --corrected-by-camera" if by_camera else "neither"
         raise ValueError(
-            f"Invalid correction of gain and offset: {found}. Must be the file of 'dbthermal "
+            f"Invalid correction of gain and offset: {sources}. Must be the file of 'dbthermal "
             "calibrate --correction-output nuc.zarr' or, only if the cameras correct gain and "
             "offset themselves, --corrected-by-camera."
         )
     gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
-    chosen = {"shutter": not options.no_shutter, "time_constant": options.time_constant}
-    return saved(correction.correct_capture(raw, gain, lazy=True, **chosen), options)
+    corrected = correction.correct_capture(
+        raw,
+        gain,
+        lazy=True,
+        shutter=not options.no_shutter,
+        time_constant=options.time_constant,
+    )
+    return saved(corrected, options)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
@@ -112,8 +120,14 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     options.register = options.register or "homography"
     if options.register != "none":
         transform = alignment.register(corrected, model=options.register)
-    chosen = {"offset": options.offset, "search": options.search, "clock": options.reference}
-    aligned = alignment.align(corrected, transform=transform, lazy=True, **chosen)
+    aligned = alignment.align(
+        corrected,
+        transform=transform,
+        lazy=True,
+        offset=options.offset,
+        search=options.search,
+        clock=options.reference,
+    )
     return saved(aligned, options)
 
 
@@ -124,10 +138,10 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
     source, response, *fitted = staged(options, **stages)
-    tell_of_compiling()
+    announce_compiling()
     response.load()
-    known, shown = _known(options), sys.stderr.isatty()
-    if options.correction:
+    completing, progress = _completing(options), sys.stderr.isatty()
+    if options.correction:  # all steps of a raw capture, by rows
         offset = {} if options.offset is None else {"offset": options.offset}
         scene.separate_capture(
             source,
@@ -135,16 +149,15 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             response,
             registration=None if options.register == "none" else options.register,
             aligning=offset,
-            separating={**known, "progress": shown},
+            separating={**completing, "progress": progress},
             target=options.output,
             provenance=provenance(options),
         )
-    elif options.method is None:
-        doubts = [one for data in (source, response) for one in data.attrs.get("warnings", [])]
-        result = separation.separate(source.load(), response, **known, progress=shown)
-        result = warned(result, *doubts, *hardly_measured(result))
-        return saved(result, options)
-    else:
+    elif options.method is None:  # the default call, in memory
+        notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
+        result = separation.separate(source.load(), response, **completing, progress=progress)
+        return saved(warned(result, *notes, *hardly_measured(result)), options)
+    else:  # a single method, by rows
         emissivities = None
         if options.emissivity:
             axis = {"band": source["band"].values}
@@ -159,13 +172,13 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             options.method,
             emissivity=emissivities,
             provenance=provenance(options),
-            progress=shown,
+            progress=progress,
         )
     return described(options.output)
 
 
-def tell_of_compiling() -> None:
-    """Say from now on, once, that the separation is compiled, if no earlier run left it so."""
+def announce_compiling() -> None:
+    """Announce the first compilation of the separation, once."""
     from numba.core import event  # noqa: PLC0415 - takes long
 
     class CompilerListener(event.Listener):
@@ -180,12 +193,12 @@ def tell_of_compiling() -> None:
             self.announced = True
 
         def on_end(self, _: event.Event) -> None:
-            """Say nothing more: a listener must have it."""
+            """Stay silent: a listener must have this function."""
 
     event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
 
 
-def _known(options: argparse.Namespace) -> dict[str, Any]:
+def _completing(options: argparse.Namespace) -> dict[str, Any]:
     """Options of the completion, and the number of threads."""
     return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
 
@@ -194,9 +207,9 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (one.load() for one in staged(options, **stages))
-    tell_of_compiling()
+    announce_compiling()
     completed = separation.complete(
-        result, source, response, result.get("material"), **_known(options)
+        result, source, response, result.get("material"), **_completing(options)
     )
     return saved(completed, options)
 
@@ -205,48 +218,45 @@ def foreseen(
     options: argparse.Namespace, sources: list[Path], targets: list[Path]
 ) -> dict[str, Any]:
     """Inputs and outputs of a command, and the memory that a separation takes at most."""
-    read = dict[str, Any]()
+    inputs = dict[str, Any]()
     for path in sources:
-        inside = [one for one in (path, *path.rglob("*")) if one.is_file()]
-        read[str(path)] = {"bytes": sum(one.stat().st_size for one in inside)}
+        files = [file for file in (path, *path.rglob("*")) if file.is_file()]
+        inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in files)}
         if (path / "zarr.json").is_file():
-            read[str(path)] |= outline(opened(path))
-    said = {"would_read": read, "would_write": [*map(str, targets)]}
+            inputs[str(path)] |= outline(opened(path))
+    summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        said["would_be"] = outline(capture(options.files, options, options.offset))
+        summary["would_be"] = outline(capture(options.files, options, options.offset))
     if options.command == "separate":
-        sizes = read[str(options.capture)].get("sizes", {})
-        byte = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
+        sizes = inputs[str(options.capture)].get("sizes", {})
+        memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
         most = 3e9 if options.correction else 2e9 if options.method else math.inf  # by rows
-        said["memory_at_most_GB"] = round(min(byte, most) / 1e9, 1)
-    return said
+        summary["memory_at_most_GB"] = round(min(memory, most) / 1e9, 1)
+    return summary
 
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:
     """Command `plan`."""
     table = emissivity.embedded_table()
     if options.materials:
-        known = table["material"].values.tolist()
+        names = table["material"].values.tolist()
         for name in options.materials:
-            if name not in known:
-                raise ValueError(f"Unknown material '{name}'. Must be one of {known}.")
+            if name not in names:
+                raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
     numbers = {name: getattr(options, name) for name in ("seconds", "rate", "span", "amplitude")}
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
-    expected = limits.plan(table, noise, limits.CaptureDesign(**numbers))
-    names = [str(name) for name in expected["filter"].values]
-    rows = zip(
-        expected["material"].values,
-        expected["best"].values,
-        expected["object_temperature_std"].values.round(4).tolist(),
-        strict=True,
-    )
+    plans = limits.plan(table, noise, limits.CaptureDesign(**numbers))
+    filters = plans["filter"].values.tolist()
+    by_material = {str(name): plans.sel(material=name) for name in plans["material"].values}
     return {
-        str(material): {
-            "best_filter": str(best),
-            "object_temperature_std_K": dict(zip(names, stds, strict=True)),
+        name: {
+            "best_filter": str(plan["best"].values),
+            "object_temperature_std_K": dict(
+                zip(filters, plan["object_temperature_std"].values.round(4).tolist(), strict=True)
+            ),
         }
-        for material, best, stds in rows
+        for name, plan in by_material.items()
     }
 
 
@@ -259,10 +269,10 @@ def data(_: argparse.Namespace) -> dict[str, Any]:
             for name, band in bands.FILTERS.items()
         },
         "emissivity": {
-            str(one["material"].values): dict(
-                zip(table["band"].values.tolist(), one.values.round(3).tolist(), strict=True)
+            str(row["material"].values): dict(
+                zip(table["band"].values.tolist(), row.values.round(3).tolist(), strict=True)
             )
-            for one in table
+            for row in table
         },
         "outside_files": "listed by data_manifest.yaml of a clone, and fetched there by: make data",
     }

@@ -1,4 +1,4 @@
-"""Options that another one, or the kind of what is read or written, leaves without effect."""
+"""Options without effect, because of another option or of the kind of a file."""
 
 import argparse
 from collections.abc import Sequence
@@ -21,18 +21,18 @@ _FORM: Final = {
 
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file, by its name; others are raw if a shape is stated, else FLIR's."""
+    """Kind of a recording's file by its suffix; without a known one raw if a shape is stated."""
     kinds = [kind for kind, suffixes in _KINDS.items() if path.suffix.lower() in suffixes]
     return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
 
 
 def refuse(options: argparse.Namespace, arguments: Sequence[str]) -> None:
-    """Refuse an option that is stated, and has no effect."""
-    stated = {one.partition("=")[0] for one in arguments}
-    for why, names in _unused(options).items():
+    """Refuse an option that is stated and has no effect."""
+    stated = {argument.partition("=")[0] for argument in arguments}
+    for reason, names in _unused(options).items():
         for flag in (f"--{name.replace('_', '-')}" for name in names.split()):
             if flag in stated:
-                raise ValueError(f"Unused option {flag}. Must be left out {why}.")
+                raise ValueError(f"Unused option {flag}. Must be left out {reason}.")
 
 
 def _unused(options: argparse.Namespace) -> dict[str, str]:
@@ -42,30 +42,32 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
     if options.command == "align" and options.offset is not None:
         return {"with --offset": "search"}
     if options.command == "export" and options.output.suffix != ".csv":
-        all_of_it = " variable" if options.output.suffix == ".nc" else ""
-        return {f"with {options.output.suffix}": f"pixel region{all_of_it}"}
+        suffix = options.output.suffix
+        return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":
         return {}
     if options.correction:
         return {"with --correction": "method emissivity"}
-    whole = {"with --method: 'dbthermal complete'": "surroundings prior workers"}
-    apart = {"without --correction, for the capture is aligned": "register offset"}
-    return apart | (whole if options.method else {"without --method": "emissivity"})
+    aligned = {"without --correction, for the capture is aligned": "register offset"}
+    completing = {"with --method: 'dbthermal complete'": "surroundings prior workers"}
+    return aligned | (completing if options.method else {"without --method": "emissivity"})
 
 
 def _of_files(options: argparse.Namespace) -> dict[str, str]:
-    """Options that none of the files of a command takes, nor its other source."""
+    """Options that neither the files of a command nor its other source take."""
+    # Kinds of the files; a folder alone is a store, unless it is read as another program's.
     kinds, foreign = set[str](), options.command == "info" and options.unit is not None
     for group in options.at if options.command == "calibrate" else [options.files]:
-        paths = [one for one in leaves(group) if isinstance(one, Path) and one != PLUS]
-        if foreign or len(paths) != 1 or not paths[0].is_dir():  # a folder alone is a store
+        paths = [leaf for leaf in leaves(group) if isinstance(leaf, Path) and leaf != PLUS]
+        if foreign or len(paths) != 1 or not paths[0].is_dir():
             kinds |= {kind_of(path, options) for path in paths}
+    # Sources of a calibration in place of files, and what each leaves without effect.
     sources = {"blackbody": "frames", "sweep": "", "maker": "frames correction_output"}
-    stated = [one for one in sources if vars(options).get(one)]
+    stated = [source for source in sources if vars(options).get(source)]
     if options.command == "calibrate" and not (options.at or stated):
         return {}
     taken = " ".join(_FORM[kind] for kind in kinds).split()
-    names = [one for one in " ".join(_FORM.values()).split() if one not in taken]
+    names = [name for name in " ".join(_FORM.values()).split() if name not in taken]
     names += sources[stated[0]].split() if stated and not kinds else []
-    why = " and ".join([*(f"--{one}" for one in stated), *sorted(kinds)]) or "a store"
-    return {f"with {why}": " ".join(names)}
+    reason = " and ".join([*(f"--{source}" for source in stated), *sorted(kinds)]) or "a store"
+    return {f"with {reason}": " ".join(names)}

@@ -149,11 +149,13 @@ class _Signals(NamedTuple):
         The covariance is diagonal but for the few common errors F (term, n), which the Woodbury
         identity inverts: (D + F'F)^-1 v = v/D - (F/D)' (1 + F (F/D)')^-1 F (v/D).
         """
-        rest = 1.0 - emissivity
+        reflectivity = 1.0 - emissivity
         # D = s_I^2 + e^2 s_o^2 + (1 - e)^2 s_b^2.
-        readings = (emissivity * self.emitted.std) ** 2 + (rest * self.reflected.std) ** 2
+        readings = (emissivity * self.emitted.std) ** 2 + (reflectivity * self.reflected.std) ** 2
         variance = self.noise**2 + readings
-        common = np.concatenate([emissivity * self.emitted.bias, rest * self.reflected.bias])
+        common = np.concatenate(
+            [emissivity * self.emitted.bias, reflectivity * self.reflected.bias]
+        )
         inner = np.eye(len(common)) + common @ (common / variance).T
         scaled = values / variance
         return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
@@ -353,11 +355,13 @@ def _require_contrast(difference: Array, stds: Array, beside: str) -> None:
 def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
     """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
     fits = [_fit_band(band, name) for name, band in signals.items()]
-    *values, residual = (np.array(part) for part in zip(*fits, strict=True))
+    *values, residual = (np.array(column) for column in zip(*fits, strict=True))
     names = ("emissivity", "emissivity_std", "reduced_chi2")
-    parts = {name: ("band", one, {"units": "1"}) for name, one in zip(names, values, strict=True)}
+    variables = {
+        name: ("band", value, {"units": "1"}) for name, value in zip(names, values, strict=True)
+    }
     residuals = (("band", "measurement"), residual, {"units": "count"})
-    return xr.Dataset({**parts, "residual": residuals}, {"band": list(signals)})
+    return xr.Dataset({**variables, "residual": residuals}, {"band": list(signals)})
 
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:

@@ -147,7 +147,7 @@ def fit_response(
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
         fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
-    celsius = ", ".join(f"{one - zero_Celsius:.2f}" for one in temperature)
+    celsius = ", ".join(f"{kelvin - zero_Celsius:.2f}" for kelvin in temperature)
     stated = f"standard deviation of a reading {temperature_std:g} K"
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
     if noise is None:
@@ -159,18 +159,18 @@ def fit_response(
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
     """Sentences on bands that are much quieter than one that contains them."""
-    known = [name for name in netd if name in bands.FILTERS]
-    found = []
-    for inner, outer in permutations(known, 2):
-        part, whole = bands.get(inner), bands.get(outer)
-        within = whole.lower <= part.lower and part.upper <= whole.upper
+    filters = [name for name in netd if name in bands.FILTERS]
+    pairs = []
+    for inner, outer in permutations(filters, 2):
+        narrow, wide = bands.get(inner), bands.get(outer)
+        within = wide.lower <= narrow.lower and narrow.upper <= wide.upper
         if within and netd[inner] < _QUIETER * netd[outer]:
-            found.append(
+            pairs.append(
                 f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in "
                 f"'{outer}', which contains it. A filter must raise the noise: are the names of "
                 "the bands, or the files of the blackbody, exchanged?"
             )
-    return found
+    return pairs
 
 
 def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
@@ -221,11 +221,11 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     """
     if not files:
         raise ValueError("Empty mapping of files. Must have the attributes of one band at least.")
-    given: Any = files
-    for part in (given, *(given.values() if isinstance(given, Mapping) else ())):
-        if not isinstance(part, Mapping):
+    listing: Any = files
+    for entry in (listing, *(listing.values() if isinstance(listing, Mapping) else ())):
+        if not isinstance(entry, Mapping):
             rule = "Must be a mapping: attributes by band"
-            raise TypeError(f"Invalid files of type {type(part).__name__}. {rule}.")
+            raise TypeError(f"Invalid files of type {type(entry).__name__}. {rule}.")
     ranges = [
         [_constant(attrs, f"range_{end}", band) for end in ("min", "max")]
         for band, attrs in files.items()
@@ -315,11 +315,11 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     explained = f"noise and blackbody explain {std:.3g} count"
     fitting = []
     for place in range(counts.size):
-        rest = np.arange(counts.size) != place
-        others = fit_band(band, temperature[rest], counts[rest])
-        beside = counts - others.counts(temperature)
-        if np.sum(beside[rest] ** 2) <= std**2 * chdtri(counts.size - 3, _FALSE_ALARM):
-            fitting.append((place, beside[place]))
+        remaining = np.arange(counts.size) != place
+        refitted = fit_band(band, temperature[remaining], counts[remaining])
+        residual = counts - refitted.counts(temperature)
+        if np.sum(residual[remaining] ** 2) <= std**2 * chdtri(counts.size - 3, _FALSE_ALARM):
+            fitting.append((place, residual[place]))
     if len(fitting) == 1:
         ((place, distance),) = fitting
         raise ValueError(
@@ -338,10 +338,10 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
 
 def _wavelengths(band: str) -> tuple[float, float]:
     """Least and greatest mean wavelength [m] of a response in a band, by its name."""
-    known = bands.FILTERS.get(band)
-    if known is None:
+    passband = bands.FILTERS.get(band)
+    if passband is None:
         return _THERMAL.lower, _THERMAL.upper
-    return known.lower / _WAVELENGTH_MARGIN, known.upper * _WAVELENGTH_MARGIN
+    return passband.lower / _WAVELENGTH_MARGIN, passband.upper * _WAVELENGTH_MARGIN
 
 
 def fit_band(band: str, temperature: Array, counts: Array) -> Curve:

@@ -141,9 +141,11 @@ def correct_capture(
 
     def measured(rows: slice) -> xr.Dataset:
         """Steps of some rows that need no others."""
-        part = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
-        part = _without_damaged(part if events is None else mark_shutter(part, events))
-        return part if time_constant is None else undo_lag(part, time_constant)
+        corrected = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
+        corrected = _without_damaged(
+            corrected if events is None else mark_shutter(corrected, events)
+        )
+        return corrected if time_constant is None else undo_lag(corrected, time_constant)
 
     result = _by_rows(measured, capture["counts"]) if lazy else measured(slice(None))
     result = mark_repeats(result, capture["counts"], shutter=shutter)
@@ -157,17 +159,17 @@ def correct_capture(
 
 def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
     """All rows of a function of some, block by block; the counts are left to be computed."""
-    parts = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
+    blocks = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
-    whole = xr.concat(parts, "y", combine_attrs="override", **rule)
+    whole = xr.concat(blocks, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
-        squares = np.array([part["pattern_std"].values ** 2 for part in parts])
-        known = squares[np.isfinite(squares).all(axis=1)]  # not of a border without a good pixel
-        if len(known):
-            whole["pattern_std"].values[:] = np.sqrt(np.mean(known, axis=0))
+        squares = np.array([block["pattern_std"].values ** 2 for block in blocks])
+        finite = squares[np.isfinite(squares).all(axis=1)]  # not of a border without a good pixel
+        if len(finite):
+            whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
     counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
-    dead = sum(part.attrs["dead_pixels"] for part in parts)
+    dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
 
 

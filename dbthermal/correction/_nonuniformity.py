@@ -14,6 +14,7 @@ from scipy.special import chdtri
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._samples import stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
@@ -165,13 +166,13 @@ def fit_correction(
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = (counts.sizes["y"], counts.sizes["x"])
-    parts = []
+    fits = []
     for band in counts:
         frames = band.values.astype(np.float64).reshape(-1, image[0] * image[1])
-        parts.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
-    gain, offset, bad, residual, level = (np.stack(part) for part in zip(*parts, strict=True))
+        fits.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
+    gain, offset, bad, residual, level = (np.stack(values) for values in zip(*fits, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
-    values = {name: part.reshape(-1, *image) for name, part in maps.items()}
+    values = {name: values.reshape(-1, *image) for name, values in maps.items()}
     values |= {"residual": residual, "level": level} | _residual_pattern(residual, level, blackbody)
     coords = {name: counts.coords[name] for name in counts.dims if name in counts.coords}
     attrs: dict[str, Any] = {"threshold": threshold, "detector_maximum": maximum}
@@ -212,9 +213,11 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     good = ~correction["bad"].values
     if not np.all(schema.measured(flat.values[good])):
         raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
-    seen = correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
-    level = np.mean(seen, axis=(1, 2), where=good, keepdims=True)
-    offset = np.where(good, correction["offset"].values - (seen - level), 0.0)
+    corrected = (
+        correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
+    )
+    level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
+    offset = np.where(good, correction["offset"].values - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
     if correction.keys() >= _PATTERN and "level" in correction:
         # The offset has the image's error, v, instead of that of n images, v / n.
@@ -311,12 +314,12 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     offset, gain, centre = (
         correction[name].values[places] for name in ("offset_std", "gain_std", "centre")
     )
-    step = max(1, int(np.cbrt(counts[0].size / _LEVELS)))
-    some = counts[:, ::step, ::step, ::step].values.astype(np.float64)
-    some = some[:, :, good[::step, ::step]]
-    level = np.full(len(some), np.nan)
-    if some.size:
-        level = np.square(some - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
+    step = stride(counts.shape[1:], _LEVELS)
+    sample = counts[:, ::step, ::step, ::step].values.astype(np.float64)
+    sample = sample[:, :, good[::step, ::step]]
+    level = np.full(len(sample), np.nan)
+    if sample.size:
+        level = np.square(sample - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
     std = np.sqrt(offset**2 + gain**2 * level)
     return xr.DataArray(std, dims="band", attrs=schema.PATTERN_STD.attrs)
 
@@ -396,6 +399,6 @@ def _require_rising(maps: xr.Dataset) -> xr.Dataset:
     """Refuse gains and offsets that are not finite, and gains of good pixels not positive."""
     for name, holds in {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}.items():
         if not np.all(schema.measured(maps[name]) & holds):
-            found = f"Invalid {name} of the correction: not finite, or not positive"
-            raise ValueError(f"{found}. Must be finite, and a gain positive.")
+            label = f"Invalid {name} of the correction: not finite, or not positive"
+            raise ValueError(f"{label}. Must be finite, and a gain positive.")
     return maps.drop_vars(["y", "x"], errors="ignore")

@@ -118,22 +118,22 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
-        part = np.zeros(frames.size) if segment is None else segment[frames]
-        movie, stepped = movie.isel(time=frames), np.diff(part) != 0
-        segments = np.unique(part)
+        segment_numbers = np.zeros(frames.size) if segment is None else segment[frames]
+        movie, stepped = movie.isel(time=frames), np.diff(segment_numbers) != 0
+        segments = np.unique(segment_numbers)
         level, still = np.empty(image), np.empty((segments.size, *image))
         for rows in _rows.blocks(movie.shape, _BLOCK):
             block = _samples(movie, rows)
             level[rows] = samples.noise(block)
-            still[:, rows] = [_mean(block[part == one]) for one in segments]
-        known = np.isfinite(level)
-        if not known.any():
+            still[:, rows] = [_mean(block[segment_numbers == number]) for number in segments]
+        judged = np.isfinite(level)
+        if not judged.any():
             raise ValueError(
                 f"Invalid band '{movie['band'].item()}': no pixel has "
                 f"{MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
             )
-        unjudged |= ~known
-        usual = np.where(known, level, np.median(level[known]))
+        unjudged |= ~judged
+        usual = np.where(judged, level, np.median(level[judged]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
         noise = float(np.median(usual))  # none in counts without noise, in units of which it is
         patterns.append(min(map(_pattern, still)) / noise if noise > 0.0 else 0.0)
@@ -142,8 +142,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
     names = corrected["band"].values
-    found = [f"{one:.3g} in band '{name}'" for name, one in zip(names, patterns, strict=True)]
-    strong = [one for one, ratio in zip(found, patterns, strict=True) if ratio > _PATTERN]
+    labels = [
+        f"{pattern:.3g} in band '{name}'" for name, pattern in zip(names, patterns, strict=True)
+    ]
+    strong = [label for label, ratio in zip(labels, patterns, strict=True) if ratio > _PATTERN]
     return warned(
         corrected.assign(status=(("y", "x"), status, schema.status_attrs())),
         *([_UNCORRECTED.format(", ".join(strong))] if strong else []),
@@ -152,7 +154,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         jumping_pixels=int(jumping.sum()),
         unjudged_pixels=int(unjudged.sum()),
         bad_threshold=threshold,
-        fixed_pattern=[round(one, 3) for one in patterns],
+        fixed_pattern=[round(pattern, 3) for pattern in patterns],
     )
 
 
@@ -216,8 +218,8 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
         frozen[rows] = still.reshape(-1, image[1])
         for highest in (False, True):
             end, number = samples.end_of(counts, valid, highest=highest)
-            parts = (end, number, samples.near_end(counts, valid, end, grain))
-            ends[int(highest), :, rows] = np.reshape(parts, (3, -1, image[1]))
+            statistics = (end, number, samples.near_end(counts, valid, end, grain))
+            ends[int(highest), :, rows] = np.reshape(statistics, (3, -1, image[1]))
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
         clipped |= moving & samples.is_heap(number, near, grain)
@@ -269,10 +271,10 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
         changes = _changes(_samples(movie, slice(top, bottom)), stepped)
-        here = slice(rows.start - top, rows.stop - top)
+        inner = slice(rows.start - top, rows.stop - top)
         for sign in (1.0, -1.0):
-            change, seen = (np.float32(sign) * part for part in changes)
-            jumping[rows] |= _alone(change, seen, limit[top:bottom], reach)[here]
+            change, total = (np.float32(sign) * difference for difference in changes)
+            jumping[rows] |= _alone(change, total, limit[top:bottom], reach)[inner]
     return jumping
 
 
@@ -287,19 +289,19 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
     last = np.maximum.accumulate(np.where(valid, places, 0), axis=0)[:-1]
     with np.errstate(invalid="ignore"):
         change = signal[1:] - np.take_along_axis(signal, last, axis=0)
-    part = np.concatenate([[0], np.cumsum(stepped)])
-    change[(part[places[1:]] != part[last]) | ~np.isfinite(change)] = 0.0
+    segment = np.concatenate([[0], np.cumsum(stepped)])
+    change[(segment[places[1:]] != segment[last]) | ~np.isfinite(change)] = 0.0
     gap = (places[1:] - last).astype(np.float32)
     return np.where(gap > _LONGEST_GAP + 1, np.float32(0.0), change / gap), change
 
 
-def _alone(change: Single, seen: Single, limit: Array, reach: int) -> Mask:
+def _alone(change: Single, total: Single, limit: Array, reach: int) -> Mask:
     """Pixels (y, x) that jump by more than their limit in a frame in which no neighbour does."""
     shape = limit.shape
-    nearby = maximum_filter1d(seen, 2 * reach + 1, axis=0, mode="constant")
+    nearby = maximum_filter1d(total, 2 * reach + 1, axis=0, mode="constant")
     nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))
-    around = np.zeros_like(change)
+    strongest = np.zeros_like(change)
     for y, x in _NEIGHBOURS:
-        np.maximum(around, nearby[:, y : y + shape[0], x : x + shape[1]], out=around)
-    alone = (change > limit) & (around < _SHARED * change)
-    return np.asarray(np.any(alone[reach:-reach], axis=0))
+        np.maximum(strongest, nearby[:, y : y + shape[0], x : x + shape[1]], out=strongest)
+    single = (change > limit) & (strongest < _SHARED * change)
+    return np.asarray(np.any(single[reach:-reach], axis=0))

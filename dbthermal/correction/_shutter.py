@@ -15,6 +15,7 @@ import xarray as xr
 from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._samples import stride
 
 Integers = npt.NDArray[np.int64]
 
@@ -76,13 +77,13 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     [21, 5, 2.1, 2.5, True]
     """
     counts = schema.check(corrected, "corrected")["counts"]
-    known = _closed_frames(counts, closed)
+    shut = _closed_frames(counts, closed)
     runs = []
     for index, name in enumerate(counts["band"].values):
-        marked = known[index] | _copies(counts.isel(band=index))
+        marked = shut[index] | _copies(counts.isel(band=index))
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
-            renewed = bool(known[index, first:after].any()) or after - first >= FEWEST_COPIES
+            renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     return _events(runs, counts["time"].values.astype(np.float64))
 
@@ -132,8 +133,8 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     for band, start, stop in zip(bands, first, after, strict=True):
         marked[band, start:stop] = True
     renewed = events["renewed"].values.astype(bool)
-    inside = renewed & (first > 0) & (after < frames)
-    changes = _changes(first[inside], after[inside])
+    within = renewed & (first > 0) & (after < frames)
+    changes = _changes(first[within], after[within])
     segment = np.searchsorted(changes, np.arange(frames), side="right").astype(np.int32)
     kept = xr.DataArray(~marked, dims=("band", "time"), coords={"band": counts["band"]})
     result = corrected.assign(
@@ -163,7 +164,7 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
 
 def _copies(counts: xr.DataArray) -> Mask:
     """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / _SAMPLE)))
+    step = stride((counts.sizes["y"], counts.sizes["x"]), _SAMPLE)
     sample = counts.isel(y=slice(None, None, step), x=slice(None, None, step)).values
     changed, valid = _changed(sample[:-1], sample[1:])
     moving = changed.any(axis=0)
@@ -177,10 +178,10 @@ def _copies(counts: xr.DataArray) -> Mask:
     if candidates.size:  # the whole of their images
         copies[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
-        here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
+        after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
         for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
             block = counts.isel(time=needed, y=rows).values
-            copies[candidates] &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
+            copies[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
     return copies
 
 

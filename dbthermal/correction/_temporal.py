@@ -141,12 +141,12 @@ def undo_drift(
             f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
         )
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
-    curves = np.stack([_smooth_change(part, segment, order) for part in level])
+    curves = np.stack([_smooth_change(band, segment, order) for band in level])
 
-    def undone(part: slice) -> npt.NDArray[np.floating]:
+    def undone(window: slice) -> npt.NDArray[np.floating]:
         """Counts of some rows without the drift."""
-        seen = counts.isel(y=part).values
-        return np.asarray(seen - curves[..., np.newaxis, np.newaxis], dtype=seen.dtype)
+        values = counts.isel(y=window).values
+        return np.asarray(values - curves[..., np.newaxis, np.newaxis], dtype=values.dtype)
 
     undo = _rows.lazy(undone, counts) if lazy else counts.copy(data=undone(slice(None)))
     drift = schema.variables("corrected", {"drift": curves})
@@ -183,10 +183,10 @@ def _smooth_change(level: xr.DataArray, segment: npt.NDArray[np.generic], order:
     """Smooth change (time) of a level (time) since the first frame of each segment."""
     values, time = level.values, level["time"].values.astype(np.float64)
     curve = np.full(values.shape, np.nan)
-    for part in np.unique(segment):
-        here = (segment == part) & np.isfinite(values)
-        if here.any():
-            functions = smooth.polynomial_basis(time[here], min(order, int(here.sum())))
-            fitted = functions @ (functions.T @ values[here])
-            curve[here] = fitted - fitted[0]
+    for number in np.unique(segment):
+        frames = (segment == number) & np.isfinite(values)
+        if frames.any():
+            functions = smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
+            fitted = functions @ (functions.T @ values[frames])
+            curve[frames] = fitted - fitted[0]
     return curve

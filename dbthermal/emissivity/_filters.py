@@ -72,15 +72,15 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     schema.check_variable(numbers, _NUMBERS, "the condition numbers")
     finite = numbers.copy(data=np.isfinite(numbers.values))
     mean = numbers.where(finite).mean("material").fillna(np.inf)
-    parts = {
+    statistics = {
         "median": (numbers.median("material", skipna=False), "condition number, median"),
         "mean": (mean, "its finite mean"),
         "finite": (finite.sum("material"), "materials with a finite condition number"),
     }
     return xr.Dataset(
         {
-            name: part.assign_attrs(units="1", long_name=meaning)
-            for name, (part, meaning) in parts.items()
+            name: values.assign_attrs(units="1", long_name=meaning)
+            for name, (values, meaning) in statistics.items()
         }
     )
 
@@ -187,8 +187,8 @@ def rank_filters(
 def _emissivities(table: xr.Dataset) -> xr.DataArray:
     """Checked emissivity (material, band) of a table; averages of measured spectra may exceed 1."""
     values = schema.check(table, "emissivity_table")["emissivity"]
-    known = values.values[~np.isnan(values.values)]
-    _numbers.real_numbers("emissivity of the table", known, within=schema.EMISSIVITY_LIMITS)
+    tabulated = values.values[~np.isnan(values.values)]
+    _numbers.real_numbers("emissivity of the table", tabulated, within=schema.EMISSIVITY_LIMITS)
     return values
 
 
@@ -204,14 +204,17 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     if beside not in names or len(names) < 2:
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
-    others = [name for name in names if name != beside]
-    camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values
-    noises = std[names.index(beside)], std[[names.index(name) for name in others]]
+    filters = [name for name in names if name != beside]
+    camera, filtered = (
+        values.sel(band=beside).values[:, np.newaxis],
+        values.sel(band=filters).values,
+    )
+    noises = std[names.index(beside)], std[[names.index(name) for name in filters]]
     error = np.hypot((1 - filtered) * noises[0], (1 - camera) * noises[1])
     contrast = np.abs(camera - filtered)
     return xr.DataArray(
         np.divide(error, contrast, out=np.full_like(error, np.inf), where=contrast > 0),
-        coords={"material": values["material"].values, "band": others},
+        coords={"material": values["material"].values, "band": filters},
         dims=("material", "band"),
         name="object_temperature_std",
         attrs={"units": "K", "long_name": "standard deviation of the object temperature"},

@@ -191,11 +191,11 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     wide = std**2 * (shared + (1.0 - shared) * np.eye(len(names)))
     means = values[:, 1 : 1 + count][:, places]
     weight = np.append(values[:, 0] / values[:, 0].sum() * (1.0 - share), share)
-    known = covariance[:, places][:, :, places]
+    chosen = covariance[:, places][:, :, places]
     variables = {
         "weight": ("component", weight),
         "mean": (("component", "band"), np.vstack([means, np.full(len(names), mean)])),
-        "covariance": (("component", "band", "other"), np.concatenate([known, wide[np.newaxis]])),
+        "covariance": (("component", "band", "other"), np.concatenate([chosen, wide[np.newaxis]])),
     }
     return xr.Dataset(variables, {"band": names, "other": names})
 
@@ -236,8 +236,8 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
     within = (emissivity >= lowest) & (emissivity <= highest)
     for bad, rule in ((~np.isfinite(emissivity), "be finite"), (~within, limits)):
         if bad.any():
-            found = f"{emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m"
-            raise ValueError(f"Invalid emissivity {found}. Must {rule}.")
+            label = f"{emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m"
+            raise ValueError(f"Invalid emissivity {label}. Must {rule}.")
     return wavelength, emissivity
 
 
@@ -252,8 +252,8 @@ def _average(
     upper = min(band.upper, float(wavelength[-1]))
     if upper <= lower:
         return np.nan, 0.0
-    inside = wavelength[(wavelength > lower) & (wavelength < upper)]
-    knots = np.union1d(np.linspace(lower, upper, _STEPS + 1), inside)
+    nodes_inside = wavelength[(wavelength > lower) & (wavelength < upper)]
+    knots = np.union1d(np.linspace(lower, upper, _STEPS + 1), nodes_inside)
     half = 0.5 * np.diff(knots)[:, np.newaxis]
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)

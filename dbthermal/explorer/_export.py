@@ -96,10 +96,10 @@ def curves(
     """Curves of some regions, `View.curve`, over (region, time)."""
     if not regions:
         raise ValueError("Invalid export without a region. Must have one: draw it first.")
-    parts = [view.curve(name, region, pixels=pixels) for region in regions.values()]
+    curves_of_regions = [view.curve(name, region, pixels=pixels) for region in regions.values()]
     names = xr.DataArray(list(regions), dims="region", name="region")
-    result = xr.concat([part.drop_attrs(deep=False) for part in parts], dim=names)
-    outlines = [part.attrs["region"] for part in parts]
+    result = xr.concat([curve.drop_attrs(deep=False) for curve in curves_of_regions], dim=names)
+    outlines = [curve.attrs["region"] for curve in curves_of_regions]
     return result.assign(outline=("region", outlines)).assign_attrs(pane=name, selection=pixels)
 
 
@@ -114,8 +114,8 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
         raise ValueError(f"Invalid path '{path}'. Must end in one of {list(SUFFIXES)}.")
     what = {"pane": name, "frame": index, "sources": view.sources}
     if path.suffix == ".csv":
-        found = curves(view, name, shown.regions, shown.pixels)
-        path.write_text(_table(view, found, celsius=shown.celsius))
+        lines = curves(view, name, shown.regions, shown.pixels)
+        path.write_text(_table(view, lines, celsius=shown.celsius))
     elif path.suffix == ".png":
         store.save_figure(figure(view, shown), path, store.provenance(what))
     elif path.suffix == ".tiff":
@@ -126,25 +126,25 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
         )
     else:
         result = xr.Dataset(attrs={"time": float(view.time[index])})
-        for one in shown.names:
-            units = {"units": view.panes[one].units}
-            result[one.replace(" ", "_")] = (("y", "x"), view.frame(one, index), units)
+        for pane_name in shown.names:
+            units = {"units": view.panes[pane_name].units}
+            result[pane_name.replace(" ", "_")] = (("y", "x"), view.frame(pane_name, index), units)
         if shown.regions and view.panes[name].kind != "status":
-            found = curves(view, name, shown.regions, shown.pixels)
-            result = result.merge(found, combine_attrs="no_conflicts")
+            lines = curves(view, name, shown.regions, shown.pixels)
+            result = result.merge(lines, combine_attrs="no_conflicts")
         result.to_netcdf(path, engine="scipy")
 
 
-def _table(view: View, found: xr.Dataset, *, celsius: bool) -> str:
+def _table(view: View, lines: xr.Dataset, *, celsius: bool) -> str:
     """Curves as comma-separated values, a row a time, with names and units in the first."""
-    units, offset = view.panes[found.attrs["pane"]].unit(celsius=celsius)
+    units, offset = view.panes[lines.attrs["pane"]].unit(celsius=celsius)
     names = [("mean", offset), ("minimum", offset), ("maximum", offset), ("std", 0.0)]
-    columns = {"time [s]": found["time"].values} if "time" in found.coords else {}
-    for region in map(str, found["region"].values):
-        one = found.sel(region=region)
+    columns = {"time [s]": lines["time"].values} if "time" in lines.coords else {}
+    for region in map(str, lines["region"].values):
+        line = lines.sel(region=region)
         for name, zero in names:
             of = "K" if name == "std" and zero != offset else units
-            columns[f"{region} {name} [{of}]"] = np.atleast_1d(one[name].values - zero)
-        columns[f"{region} pixels"] = np.atleast_1d(one["pixels"].values)
+            columns[f"{region} {name} [{of}]"] = np.atleast_1d(line[name].values - zero)
+        columns[f"{region} pixels"] = np.atleast_1d(line["pixels"].values)
     rows = xr.Dataset({name: ("row", values) for name, values in columns.items()}).to_dataframe()
     return str(rows.to_csv(index=False, float_format="%.6g", na_rep="nan"))

@@ -84,10 +84,10 @@ class Pane:
     ) -> Values:
         """Values (time, y, x) of some frames, of a map its one; float32."""
         self.stage()
-        part = self._source[frames if self.array.ndim == 3 else slice(None), rows, columns]
+        values = self._source[frames if self.array.ndim == 3 else slice(None), rows, columns]
         if self.curve is not None:
-            return np.asarray(self.curve.inverse(part), dtype=np.float32)
-        return np.asarray(part, dtype=np.float32)
+            return np.asarray(self.curve.inverse(values), dtype=np.float32)
+        return np.asarray(values, dtype=np.float32)
 
 
 def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
@@ -104,17 +104,17 @@ def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
 
 def marks(capture: xr.Dataset, time: Array) -> dict[str, float]:
     """Shutter events of a capture, and where a run of flagged frames begins, by name [s]."""
-    found: dict[str, Mask] = {}
+    marked: dict[str, Mask] = {}
     if "segment" in capture:
-        found["shutter event"] = np.asarray(np.diff(capture["segment"].values, prepend=0) > 0)
+        marked["shutter event"] = np.asarray(np.diff(capture["segment"].values, prepend=0) > 0)
     if "frame_flags" in capture:
         flags = capture["frame_flags"]
         for name in str(flags.attrs.get("flag_meanings", "")).split():
-            found[name.replace("_", " ")] = np.asarray(
+            marked[name.replace("_", " ")] = np.asarray(
                 schema.has_flag(flags, name).any([dim for dim in flags.dims if dim != "time"])
             )
     events = {}
-    for name, where in found.items():
+    for name, where in marked.items():
         begins = np.flatnonzero(where & ~np.roll(np.append(where, False), 1)[:-1])
         events.update({f"{name} {i}": float(time[at]) for i, at in enumerate(begins, 1)})
     return events

@@ -54,11 +54,11 @@ class Region:
             raise ValueError(
                 f"Invalid points {self.points!r} of a {self.kind}. Must be pairs (row, column)."
             ) from error
-        least, most = _LEAST[self.kind]
-        if not least <= len(points) <= max(least, most):
-            count = least if self.kind != "polygon" else f"{least} to {most}"
+        least, limit = _LEAST[self.kind]
+        if not least <= len(points) <= max(least, limit):
+            count = least if self.kind != "polygon" else f"{least} to {limit}"
             raise ValueError(f"Invalid {len(points)} points of a {self.kind}. Must be {count}.")
-        if not all(math.isfinite(one) for point in points for one in point):
+        if not all(math.isfinite(value) for point in points for value in point):
             raise ValueError(f"Invalid points {points} of a {self.kind}. Must be finite.")
         object.__setattr__(self, "points", points)
 
@@ -70,13 +70,13 @@ class Region:
             return _inside(outline, rows, columns)
         (top, left), (bottom, right) = outline.min(axis=0), outline.max(axis=0)
         if self.kind == "rectangle":
-            inside = (top <= rows) & (rows < bottom) & (left <= columns) & (columns < right)
+            within = (top <= rows) & (rows < bottom) & (left <= columns) & (columns < right)
         elif top == bottom or left == right:
-            inside = np.zeros(shape, dtype=bool)
+            within = np.zeros(shape, dtype=bool)
         else:
             down = (2.0 * rows - top - bottom) / (bottom - top)
-            inside = down**2 + ((2.0 * columns - left - right) / (right - left)) ** 2 <= 1.0
-        return np.asarray(inside)
+            within = down**2 + ((2.0 * columns - left - right) / (right - left)) ** 2 <= 1.0
+        return np.asarray(within)
 
 
 def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
@@ -111,13 +111,13 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     material that differs from pixel to pixel by more than the deviations allow. Gains are NaN where
     the emissivities are.
     """
-    known = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
+    finite = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
     apart = np.linspace(0.4, 0.6, len(emissivity))[:, np.newaxis, np.newaxis]
-    value = np.where(known, emissivity, apart)
+    value = np.where(finite, emissivity, apart)
     system = np.moveaxis(np.stack([value, 1.0 - value], axis=-1), 0, 2)  # (y, x, band, 2)
     inverse = np.linalg.pinv(system)  # (y, x, 2, band)
     variance = np.einsum("yxib,bcyx,yxic->iyx", inverse, covariance, inverse)
-    variance = np.where(known, np.maximum(variance, 0.0), np.nan)
+    variance = np.where(finite, np.maximum(variance, 0.0), np.nan)
     ratios = []
     for axis in (0, 1):
         first, second = np.delete(inverse, -1, axis), np.delete(inverse, 0, axis)
@@ -126,10 +126,10 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
         ratios.append(np.reshape(step**2 / total, (2, -1)))
     pairs = np.concatenate(ratios, axis=1)
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
-    own = np.zeros(2)
+    residual_share = np.zeros(2)
     if pairs.shape[1] >= _LEAST_PAIRS:
-        own = np.median(pairs, axis=1) / chdtri(1, 0.5)
-    shared = np.where(own < _MOST_OWN, 1.0 - np.minimum(own, 1.0), 1.0)
+        residual_share = np.median(pairs, axis=1) / chdtri(1, 0.5)
+    shared = np.where(residual_share < _MOST_OWN, 1.0 - np.minimum(residual_share, 1.0), 1.0)
     return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 
 
@@ -139,10 +139,10 @@ def mean_std(std: Array, common: Array) -> Array:
     The common part c is at most all of a pixel's s, and all of it where it is NaN. A pixel whose
     deviation is NaN does not count.
     """
-    part = np.where(np.isfinite(common), np.minimum(common, std), std)
+    shared = np.where(np.isfinite(common), np.minimum(common, std), std)
     number = np.maximum(np.isfinite(std).sum(axis=-1), 1)
-    own = np.nansum(std**2 - part**2, axis=-1) / number**2
-    result = np.sqrt((np.nansum(part, axis=-1) / number) ** 2 + own)
+    independent = np.nansum(std**2 - shared**2, axis=-1) / number**2
+    result = np.sqrt((np.nansum(shared, axis=-1) / number) ** 2 + independent)
     return np.asarray(np.where(np.isfinite(std).any(axis=-1), result, np.nan))
 
 
@@ -151,10 +151,10 @@ def statistics(values: npt.NDArray[np.floating]) -> dict[str, Array]:
     finite = np.isfinite(values)
     number = finite.sum(axis=-1)
     total = np.sum(values, axis=-1, where=finite, dtype=np.float64)
-    some = number > 0
+    counted = number > 0
     return {
-        "mean": np.divide(total, number, out=np.full(len(values), np.nan), where=some),
-        "minimum": np.where(some, values.min(axis=-1, initial=np.inf, where=finite), np.nan),
-        "maximum": np.where(some, values.max(axis=-1, initial=-np.inf, where=finite), np.nan),
+        "mean": np.divide(total, number, out=np.full(len(values), np.nan), where=counted),
+        "minimum": np.where(counted, values.min(axis=-1, initial=np.inf, where=finite), np.nan),
+        "maximum": np.where(counted, values.max(axis=-1, initial=-np.inf, where=finite), np.nan),
         "pixels": number,
     }

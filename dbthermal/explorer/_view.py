@@ -13,6 +13,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._samples import stride
 from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
@@ -88,40 +89,40 @@ class View:
     ) -> None:
         self.progress: Progress | None = None
         self.data = opened(data, "data")
-        alone = "object_temperature" not in self.data and "counts" in self.data
+        is_capture = "object_temperature" not in self.data and "counts" in self.data
         self.capture = None if capture is None else opened(capture, "capture")
         self.response = None if response is None else opened(response, "response")
-        given = {"result": data, "capture": capture, "response": response}
-        if alone:
+        sources = {"result": data, "capture": capture, "response": response}
+        if is_capture:
             if capture is not None:
                 raise ValueError(
                     "Invalid second capture. The data are a capture: must be a result."
                 )
-            self.capture, given = self.data, {"capture": data, "response": response}
+            self.capture, sources = self.data, {"capture": data, "response": response}
         self.sources = {
-            name: repr(str(one)) if isinstance(one, str | Path) else name
-            for name, one in given.items()
-            if one is not None
+            name: repr(str(source)) if isinstance(source, str | Path) else name
+            for name, source in sources.items()
+            if source is not None
         }
-        self.panes = {pane.name: pane for pane in self._panes(alone=alone)}
+        self.panes = {pane.name: pane for pane in self._panes(is_capture=is_capture)}
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
         self.events = {
             **marks(shown, self.time),
-            **{name: float(one) for name, one in events.items()},
+            **{name: float(moment) for name, moment in events.items()},
         }
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
-    def _panes(self, *, alone: bool) -> Iterator[Pane]:
+    def _panes(self, *, is_capture: bool) -> Iterator[Pane]:
         """Yield what can be shown, in the order in which it is."""
         if self.capture is not None:
-            reference = self.data if alone else self.data.get("object_temperature")
+            reference = self.data if is_capture else self.data.get("object_temperature")
             yield from self._inputs(self.capture, reference)
-        if alone:
+        if is_capture:
             return
         data = self.data
         if "object_temperature" not in data:
@@ -129,9 +130,9 @@ class View:
                 f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}. Must be a "
                 "result of separation, or a capture with 'counts'."
             )
-        known = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
-        for name in (name for name in known if name in data):
-            schema.check_variable(data[name], known[name], f"'{name}' of the result")
+        variables = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+        for name in (name for name in variables if name in data):
+            schema.check_variable(data[name], variables[name], f"'{name}' of the result")
             laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
         missing = str(data.attrs.get("not_estimated", "")).split()
         shown = [name for name in (*FILMS, "emissivity") if name in data and name not in missing]
@@ -152,9 +153,9 @@ class View:
             yield Pane(name, words, "K", array, absolute=name == base, std=std)
             return
         for place, band in enumerate(map(str, array["band"].values)):
-            own = f"{std} {band}" if std else ""
+            std_name = f"{std} {band}" if std else ""
             title = f"{band} \N{MICRO SIGN}m {words}"
-            yield Pane(f"{name} {band}", title, "1", array.isel(band=place), std=own)
+            yield Pane(f"{name} {band}", title, "1", array.isel(band=place), std=std_name)
 
     def _inputs(
         self, capture: xr.Dataset, reference: xr.Dataset | xr.DataArray | None
@@ -168,12 +169,12 @@ class View:
         if reference is not None and reference is not capture:
             counts = laid_on(counts, reference, "the capture", "the result")
         for place, band in enumerate(map(str, counts["band"].values)):
-            one, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
+            film, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
             if self.response is None:
-                yield Pane(f"input {band}", label, "count", one)
+                yield Pane(f"input {band}", label, "count", film)
             else:
                 curve = responses.curve(self.response, band)
-                yield Pane(f"input {band}", label, "K", one, absolute=True, curve=curve)
+                yield Pane(f"input {band}", label, "K", film, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
         """Pane of a name, read so far that a frame of it is quick; ValueError for another name."""
@@ -233,11 +234,10 @@ class View:
         """
         pane, (frames, pixels) = self.pane(name), _LOOKED_AT
         times = slice(0, None, -(-self.time.size // frames))
-        step = max(1, int(np.sqrt(np.prod(self.shape) / pixels)))
-        some = slice(0, None, step)
-        values, good = pane.read(times, some, some), self.counted("measured")[some, some]
-        for part in (values[:, good], values):
-            finite = part[np.isfinite(part)]
+        every = slice(0, None, stride(self.shape, pixels))
+        values, good = pane.read(times, every, every), self.counted("measured")[every, every]
+        for shown in (values[:, good], values):
+            finite = shown[np.isfinite(shown)]
             if finite.size:
                 low, high = np.percentile(finite, [1, 99])
                 low = 0.0 if "_std" in name else low
@@ -284,23 +284,26 @@ class View:
         (`SubspaceSettings.background_drift`), which all pixels share: where nothing drifts, the
         mean is much closer.
         """
-        pane, inside = self.pane(name), region.mask(self.shape)
+        pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
-        if not inside.any():
+        if not mask.any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
-        box = tuple(slice(one.min(), one.max() + 1) for one in np.nonzero(inside))
-        where = (inside & self.counted(pixels))[box]
+        box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
+        where = (mask & self.counted(pixels))[box]
         gain = self._common(pane, box, where)
         count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
         at_once = [slice(at, at + count) for at in starts]
         measured = pixels == "measured"
-        parts = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
-        values = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        chunks = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
+        values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
         units = {"units": pane.units}
         result = xr.Dataset(
-            {key: ("time", one, {} if key == "pixels" else units) for key, one in values.items()},
+            {
+                key: ("time", array, {} if key == "pixels" else units)
+                for key, array in values.items()
+            },
             attrs={"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels},
         )
         if pane.kind == "map":
@@ -356,7 +359,10 @@ class View:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
         assert self.capture is not None
         holders = (self.response, self.data)
-        noise = next((one["noise"] for one in holders if one is not None and "noise" in one), None)
+        noise = next(
+            (holder["noise"] for holder in holders if holder is not None and "noise" in holder),
+            None,
+        )
         if noise is None:
             return np.full(values.shape, np.nan)
         band = pane.name.removeprefix("input ")
@@ -388,9 +394,9 @@ class View:
         self, name: str, index: int, regions: Mapping[str, Region], pixels: Pixels = "unflagged"
     ) -> str:
         """Python that gives the same frame and curves again, with the names `View` and `Region`."""
-        (_, first), *rest = self.sources.items()
-        arguments = ", ".join([first, *(f"{key}={one}" for key, one in rest)])
-        free = [key for key, one in self.sources.items() if key == one]
+        (_, first), *further = self.sources.items()
+        arguments = ", ".join([first, *(f"{key}={value}" for key, value in further)])
+        free = [key for key, value in self.sources.items() if key == value]
         lines = [f"# {', '.join(free)}: the data that were explored"] if free else []
         lines += [
             "from dbthermal.explorer import Region, View",
@@ -401,7 +407,8 @@ class View:
         if name != "status" and regions:
             lines.append("regions = {")
             lines += [
-                f"    {key!r}: Region({one.kind!r}, {one.points})," for key, one in regions.items()
+                f"    {key!r}: Region({region.kind!r}, {region.points}),"
+                for key, region in regions.items()
             ]
             lines += [
                 "}",

@@ -79,7 +79,7 @@ class Explorer(anywidget.AnyWidget):
         return _export.curves(self.view, name, self.regions, self._state["pixels"])
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """Widget for who has one, and a picture for who has none."""
+        """Show the widget, or a static picture where widgets are not available."""
         bundle = super()._repr_mimebundle_(**options)
         data = bundle[0] if isinstance(bundle, tuple) else bundle
         if data is not None:
@@ -105,7 +105,7 @@ class Explorer(anywidget.AnyWidget):
         return self._limits[name]
 
     def _on_message(self, _: object, content: dict[str, Any], __: Sequence[object]) -> None:
-        """Answer a question of a page, which waits for it; an error is an answer, too."""
+        """Answer a request of the page; an error is an answer, too."""
         key = {name: content.get(name) for name in ("page", "kind")}
         self.view.progress = lambda text, share: self.send(
             {**key, "progress": f"{text}: {100 * share:.0f} %"}
@@ -116,7 +116,7 @@ class Explorer(anywidget.AnyWidget):
             answer, buffers = {"error": f"{error}"}, []
         finally:
             self.view.progress = None
-        self.send({**answer, **key}, [np.asarray(one).tobytes() for one in buffers])
+        self.send({**answer, **key}, [np.asarray(buffer).tobytes() for buffer in buffers])
 
     def _answer_start(self, _: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes, times, events and legend; palettes and classes of pixels."""
@@ -138,72 +138,73 @@ class Explorer(anywidget.AnyWidget):
         return {
             "panes": panes,
             "shape": view.shape,
-            "time": [round(float(one), 6) for one in view.time],
+            "time": [round(float(entry), 6) for entry in view.time],
             "events": view.events,
             "legend": legend,
             "palettes": PALETTES,
             "colors": drawing.COLORS,
             "celsius": self._celsius,
             "index": self._state["index"],
-            "regions": [[name, one.kind, one.points] for name, one in self.regions.items()],
+            "regions": [[name, entry.kind, entry.points] for name, entry in self.regions.items()],
             "note": drawing.provenance_note(view.data).strip(" ()"),
         }, [classes.astype(np.uint8), codes, *palettes]
 
-    def _answer_frames(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_frames(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes at a frame, and on which side of an isotherm their pixels are."""
-        names, level = asked["panes"], asked["isotherm"]
-        frames = {name: self.view.frame(name, asked["index"]) for name in names}
-        limits = zip(names, asked["limits"], strict=True)
+        names, level = request["panes"], request["isotherm"]
+        frames = {name: self.view.frame(name, request["index"]) for name in names}
+        limits = zip(names, request["limits"], strict=True)
         ranges = {name: limit or self._range(name) for name, limit in limits}
         lined = [name for name in names if level is not None and self.view.panes[name].absolute]
         sides = [
             np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
             for name in lined
         ]
-        self._state["index"] = asked["index"]
-        answer = {"index": asked["index"], "panes": names, "lined": lined}
+        self._state["index"] = request["index"]
+        answer = {"index": request["index"], "panes": names, "lined": lined}
         codes = [quantised(frames[name], *ranges[name]) for name in names]
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
-    def _answer_probe(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_probe(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer values and flags of a pixel."""
-        place = [asked[name] for name in ("index", "row", "column")]
-        return {**self.view.probe(asked["panes"], *place), "at": place}, []
+        place = [request[name] for name in ("index", "row", "column")]
+        return {**self.view.probe(request["panes"], *place), "at": place}, []
 
-    def _answer_curves(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_curves(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the curves of all regions in a pane."""
-        points = {name: (kind, points) for name, kind, points in asked["regions"]}
+        points = {name: (kind, points) for name, kind, points in request["regions"]}
         self.regions = {
-            name: Region(kind, tuple(map(tuple, one))) for name, (kind, one) in points.items()
+            name: Region(kind, tuple(map(tuple, outline)))
+            for name, (kind, outline) in points.items()
         }
-        self._state |= {"pixels": asked["pixels"], "pane": asked["pane"]}
+        self._state |= {"pixels": request["pixels"], "pane": request["pane"]}
         buffers, counts = [], []
         for region in self.regions.values():
-            found = self.view.curve(asked["pane"], region, pixels=asked["pixels"])
-            values = [np.atleast_1d(found[name]) for name in ("mean", "minimum", "maximum", "std")]
+            curve = self.view.curve(request["pane"], region, pixels=request["pixels"])
+            values = [np.atleast_1d(curve[name]) for name in ("mean", "minimum", "maximum", "std")]
             buffers.append(np.array(values, dtype=np.float32))
-            counts.append((int(region.mask(self.view.shape).sum()), int(found["pixels"].max())))
-        return {"pane": asked["pane"], "names": list(self.regions), "counts": counts}, buffers
+            counts.append((int(region.mask(self.view.shape).sum()), int(curve["pixels"].max())))
+        return {"pane": request["pane"], "names": list(self.regions), "counts": counts}, buffers
 
-    def _answer_event(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_event(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the events, with a new one."""
-        self.view.events[str(asked["name"])] = float(asked["time"])
+        self.view.events[str(request["name"])] = float(request["time"])
         return {"events": self.view.events}, []
 
-    def _answer_code(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_code(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer Python that gives the frame and the curves again."""
-        place = asked["panes"][0], asked["index"]
-        return {"text": self.view.code(*place, self.regions, asked["pixels"])}, []
+        place = request["panes"][0], request["index"]
+        return {"text": self.view.code(*place, self.regions, request["pixels"])}, []
 
-    def _answer_export(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+    def _answer_export(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer a file of what is seen."""
         shown = _export.Shown(
-            names=asked["panes"],
+            names=request["panes"],
             regions=self.regions,
-            limits={name: tuple(pair) for name, pair in asked["limits"].items()},
-            **{name: asked[name] for name in ("index", "celsius", "pixels", "palette")},
+            limits={name: tuple(pair) for name, pair in request["limits"].items()},
+            **{name: request[name] for name in ("index", "celsius", "pixels", "palette")},
         )
         with TemporaryDirectory() as folder:
-            path = Path(folder) / f"explored{asked['suffix']}"
+            path = Path(folder) / f"explored{request['suffix']}"
             _export.save(self.view, path, shown)
             return {"name": path.name}, [np.frombuffer(path.read_bytes(), dtype=np.uint8)]

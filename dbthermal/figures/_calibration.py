@@ -24,12 +24,12 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
     for row, band in zip(axes, bands, strict=True):
-        here = correction.sel(band=band)
-        good = ~here["bad"]
-        bad = np.argwhere(here["bad"].values)
-        parts = (("gain", "gain [1]", "viridis"), ("offset", "offset [count]", "cividis"))
-        for axis, (name, label, cmap) in zip(row, parts, strict=True):
-            image = here[name].where(good)
+        fitted = correction.sel(band=band)
+        good = ~fitted["bad"]
+        bad = np.argwhere(fitted["bad"].values)
+        maps = (("gain", "gain [1]", "viridis"), ("offset", "offset [count]", "cividis"))
+        for axis, (name, label, cmap) in zip(row, maps, strict=True):
+            image = fitted[name].where(good)
             title = f"{band_label(band)}: {name}, {len(bad)} bad pixels"
             draw_image(figure, axis, image, title, label, cmap=cmap, limits=limits_of(image))
             axis.plot(bad[:, 1], bad[:, 0], "x", color="red", markersize=3)
@@ -56,22 +56,24 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
     celsius = response["temperature"] - zero_Celsius
     for column, band in enumerate(bands):
-        here, (top, middle, bottom) = response.sel(band=band), axes[:, column]
+        curve, (top, middle, bottom) = response.sel(band=band), axes[:, column]
         top.plot(fine["temperature"] - zero_Celsius, fine.sel(band=band), color=COLORS[0])
-        line = here["linear_slope"] * fine["temperature"] + here["linear_intercept"]
+        line = curve["linear_slope"] * fine["temperature"] + curve["linear_intercept"]
         top.plot(fine["temperature"] - zero_Celsius, line, "--", color=COLORS[2])
-        top.plot(celsius, here["counts"], ".", color=COLORS[1])
+        top.plot(celsius, curve["counts"], ".", color=COLORS[1])
         top.set(title=band_label(band), ylabel="signal [count]")
         top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False, fontsize=8)
-        kelvin = 1.0 / here["linear_slope"]
-        middle.plot(celsius, here["linear_residual"] * kelvin, "s--", color=COLORS[2], markersize=3)
+        kelvin = 1.0 / curve["linear_slope"]
+        middle.plot(
+            celsius, curve["linear_residual"] * kelvin, "s--", color=COLORS[2], markersize=3
+        )
         middle.set(ylabel="residual of the line\n[K]")
-        millikelvin = 1e3 * here["residual"] * kelvin
+        millikelvin = 1e3 * curve["residual"] * kelvin
         bottom.plot(celsius, millikelvin, "o-", color=COLORS[0], markersize=3)
         bottom.set(ylabel="residual of the curve\n[mK]")
         bottom.set_xlabel("blackbody temperature [\N{DEGREE SIGN}C]")
-        if "noise" in here:
-            noise = 1e3 * float(here["noise"] * kelvin)
+        if "noise" in curve:
+            noise = 1e3 * float(curve["noise"] * kelvin)
             bottom.set_title(f"noise of one pixel and frame: {noise:.0f} mK", fontsize=8)
         for axis in (middle, bottom):
             axis.axhline(0.0, color="0.7", linewidth=0.8)
@@ -118,11 +120,11 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
     place = np.arange(measured.sizes["material"])
     bands = measured["band"].values
     for index, band in enumerate(bands):
-        here = measured.sel(band=band)
+        series = measured.sel(band=band)
         shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
         style: dict[str, Any] = {"fmt": "o", "markersize": 4, "capsize": 3, "color": COLORS[index]}
         style["label"] = band_label(band)
-        axis.errorbar(shifted, here["emissivity"], here["emissivity_std"], **style)
+        axis.errorbar(shifted, series["emissivity"], series["emissivity_std"], **style)
         if table is not None:
             label = "table" if index == 0 else None
             axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)

@@ -37,26 +37,26 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     """
     std = expected["object_temperature_std"]
     size = (7.8 + 0.75 * std.sizes["filter"], max(4.2, 0.24 * std.sizes["material"] + 1.9))
-    figure, ((left, right),) = canvas(1, 2, size)
-    drawn = _map(left, std, expected["best"])
-    bar = figure.colorbar(drawn, ax=left, label="expected std [K]", shrink=0.8, extend="both")
+    figure, ((map_axis, bar_axis),) = canvas(1, 2, size)
+    drawn = _map(map_axis, std, expected["best"])
+    bar = figure.colorbar(drawn, ax=map_axis, label="expected std [K]", shrink=0.8, extend="both")
     plain_decades(bar.ax)
-    left.set_xlabel(f"filter beside {expected.attrs['beside']} [{_MICRO}]")
+    map_axis.set_xlabel(f"filter beside {expected.attrs['beside']} [{_MICRO}]")
     best = expected["best"].sel(material=list(materials))
-    known = best[np.isin(best.values, std["filter"].values)]
-    for index, name in enumerate(known["material"].values):
-        chosen = str(known.sel(material=name).item())
-        right.loglog(
+    filtered = best[np.isin(best.values, std["filter"].values)]
+    for index, name in enumerate(filtered["material"].values):
+        chosen = str(filtered.sel(material=name).item())
+        bar_axis.loglog(
             durations["seconds"],
             durations["object_temperature_std"].sel(material=name, filter=chosen),
             label=f"{name}, {chosen} {_MICRO}",
             **drawing.marked_line(index),
         )
-    drawing.plain_ticks(right, durations["seconds"])
-    plain_decades(right)
-    right.set(xlabel="length of the film [s]", ylabel="expected std [K]")
-    if known.size:
-        right.legend(frameon=False, fontsize=8, loc="upper right")
+    drawing.plain_ticks(bar_axis, durations["seconds"])
+    plain_decades(bar_axis)
+    bar_axis.set(xlabel="length of the film [s]", ylabel="expected std [K]")
+    if filtered.size:
+        bar_axis.legend(frameon=False, fontsize=8, loc="upper right")
     title = "Object temperature of one pixel, expected standard deviation"
     figure.suptitle(title + drawing.provenance_note(expected))
     return figure

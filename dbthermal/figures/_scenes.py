@@ -38,8 +38,8 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         Row and column.
     """
     names = ("object_temperature", "background_temperature")
-    for part, label in ((truth, "the truth"), (result, "the result")):
-        schema.check(part, "separated", names, label)
+    for dataset, label in ((truth, "the truth"), (result, "the result")):
+        schema.check(dataset, "separated", names, label)
     figure, axes = canvas(2, 1, (7.4, 5.6))
     truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
     place = {"y": pixel[0], "x": pixel[1]}
@@ -149,8 +149,8 @@ def reflection_shift(field: xr.Dataset) -> Figure:
     figure, axes = canvas(2, 2, (7.4, 5.6))
     extrapolated = field["shift"].isel(axis=0).notnull() & ~field["known"]
     for row, axis, side in zip(axes, field["axis"].values, ("down", "right"), strict=True):
-        parts = {"shift": f"shift {side}", "shift_std": "standard deviation"}
-        for place, (name, title) in zip(row, parts.items(), strict=True):
+        titles = {"shift": f"shift {side}", "shift_std": "standard deviation"}
+        for place, (name, title) in zip(row, titles.items(), strict=True):
             image = field[name].sel(axis=axis)
             scale = limits_of(image) if name == "shift" else (0.0, limits_of(image)[1])
             label = f"{title} [pixel]"

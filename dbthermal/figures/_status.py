@@ -75,17 +75,19 @@ def status(result: xr.Dataset) -> Figure:
         image[first == name] = to_rgb(REASONS.get(name, _GOOD)[1])
     height = 5.2 * first.shape[0] / first.shape[1]
     figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
-    left, right = axes[0]
-    left.get_gridspec().set_width_ratios([1.3, 1.0])
-    left.imshow(image, interpolation="nearest")
-    left.set(xticks=[], yticks=[])
-    right.set_axis_off()
+    map_axis, legend_axis = axes[0]
+    map_axis.get_gridspec().set_width_ratios([1.3, 1.0])
+    map_axis.imshow(image, interpolation="nearest")
+    map_axis.set(xticks=[], yticks=[])
+    legend_axis.set_axis_off()
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
         for name, share in shown.items()
         for words, color in [REASONS.get(name, _GOOD)]
     ]
-    right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
+    legend_axis.legend(
+        handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
+    )
     completed = sum(share for name, share in shares.items() if name.startswith("completed"))
     good = f"{percent(shares[''])} of the pixels have no flag"
     good += f", {percent(completed)} are completed" if completed else ""

@@ -155,8 +155,8 @@ def bounds(
     [[0.04, inf]]
     """
     if real_number("emissivity_std", emissivity_std) != 0 and not emissivity_std >= _LEAST_STD:
-        found = f"Invalid emissivity_std {emissivity_std}"
-        raise ValueError(f"{found}. Must be 0, or at least {_LEAST_STD}.")
+        label = f"Invalid emissivity_std {emissivity_std}"
+        raise ValueError(f"{label}. Must be 0, or at least {_LEAST_STD}.")
     if not isinstance(resting, bool | np.bool_):
         raise TypeError(f"Invalid resting {resting!r}. Must be True or False.")
     truth = _truth(scene, resting=resting)
@@ -207,9 +207,9 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
 
     # A pixel rests at its most frequent temperature, the lowest of several, if frames share one.
     level, frames = mode(background, axis=0)
-    rest = (background == level) & (frames > 1) & resting
+    still = (background == level) & (frames > 1) & resting
     time = scene["time"].values.astype(np.float64)
-    return Truth(time, temperature, background, emissivity, rest)
+    return Truth(time, temperature, background, emissivity, still)
 
 
 def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:
@@ -239,9 +239,9 @@ def _dataset(scene: xr.Dataset, stds: dict[str, Array], maps: dict[str, Any]) ->
         rows = "time" if "temperature" in name else "band"
         variables[f"{name}_std"] = ((rows, "y", "x"), values.reshape(-1, *image), attrs)
     leading = {"resting": ("time",), "identifiable": ("quantity",)}
-    for name, part in maps.items():
+    for name, values in maps.items():
         dims = (*leading.get(name, ()), "y", "x")
-        variables[name] = (dims, part.reshape(*part.shape[:-1], *image), {"units": "1"})
+        variables[name] = (dims, values.reshape(*values.shape[:-1], *image), {"units": "1"})
     coords = {name: scene[name] for name in ("band", "time", "y", "x") if name in scene.coords}
     origin = {name: scene.attrs[name] for name in ("origin",) if name in scene.attrs}
     return xr.Dataset(variables, {**coords, "quantity": list(QUANTITIES)}, origin)

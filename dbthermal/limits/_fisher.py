@@ -127,8 +127,10 @@ def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
     functions = smooth.polynomial_basis(truth.time, highest)
     order = np.full(truth.object_temperature.shape[1], highest + 1, dtype=np.intp)
     for pixels in _blocks(np.arange(order.size)):
-        part = sensitivity.select(pixels)
-        weight = np.einsum("itp,ijtp,jtp->tp", part.emission, part.projection(), part.emission)
+        selected = sensitivity.select(pixels)
+        weight = np.einsum(
+            "itp,ijtp,jtp->tp", selected.emission, selected.projection(), selected.emission
+        )
         residual = truth.object_temperature[:, pixels]
         for count, function in enumerate(functions.T, start=1):
             residual = residual - np.outer(function, function @ residual)
@@ -158,18 +160,18 @@ def deviations(
     """
     frames, pixels = sensitivity.resting.shape
     bands = len(sensitivity.emissivity)
-    known = emissivity_std == 0
-    if known:
+    is_known = emissivity_std == 0
+    if is_known:
         sensitivity = replace(sensitivity, contrast=np.zeros_like(sensitivity.contrast))
-    prior = 1.0 if known else 1.0 / emissivity_std**2
+    prior = 1.0 if is_known else 1.0 / emissivity_std**2
     rows = {name: frames if "temperature" in name else bands for name in QUANTITIES}
     result = {name: np.zeros((size, pixels)) for name, size in rows.items()}
     for count in np.unique(order):
         functions = smooth.polynomial_basis(time, int(count))
         for block in _blocks(np.flatnonzero(order == count)):
-            part = _deviations(sensitivity.select(block), functions, reference, prior)
-            for name, values in part.items():
-                if "temperature" in name or not known:
+            stds = _deviations(sensitivity.select(block), functions, reference, prior)
+            for name, values in stds.items():
+                if "temperature" in name or not is_known:
                     result[name][:, block] = values
     return result
 
@@ -214,12 +216,12 @@ def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Arra
     energy = np.sum(sensitivity.reflection**2, axis=0)
     along = sensitivity.reflection * ~sensitivity.resting / energy
     of_object = np.sum(along * sensitivity.emission, axis=0)
-    parts = [
+    derivatives = [
         -np.moveaxis(along * sensitivity.contrast, 0, -1),
         -of_object[..., np.newaxis] * functions[:, np.newaxis],
         sensitivity.resting[..., np.newaxis],
     ]
-    gradient = np.concatenate(parts, axis=-1)
+    gradient = np.concatenate(derivatives, axis=-1)
     return np.swapaxes(gradient, 0, 1), (~sensitivity.resting / energy).T
 
 
@@ -267,10 +269,10 @@ def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.
     ce, le, lc = (np.swapaxes(block, 1, 2) for block in (ec, el, cl))
     information = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
     # Information about each unknown, were it the only one: no background to eliminate.
-    alone = np.concatenate(
+    diagonal = np.concatenate(
         [np.sum(g**2, axis=1).T + prior, np.sum(p**2, axis=0).T @ functions**2, ll[..., 0]], axis=1
     )
-    scale = np.sqrt(np.divide(1.0, alone, out=np.ones_like(alone), where=alone > 0))
+    scale = np.sqrt(np.divide(1.0, diagonal, out=np.ones_like(diagonal), where=diagonal > 0))
     scaled = information * scale[:, np.newaxis] * scale[..., np.newaxis]
     eigenvalues, directions = np.linalg.eigh(scaled)
     return FisherInverse(scale, directions, eigenvalues)

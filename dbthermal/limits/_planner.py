@@ -132,18 +132,18 @@ def plan(
     names = [str(name) for name in table["band"].values]
     if beside not in names:
         raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
-    others = [place for place, name in enumerate(names) if name != beside]
-    together = _numbers.whole_number("together", together, (1, len(others)))
-    sets = [[names.index(beside), *chosen] for chosen in combinations(others, together)]
+    filters = [place for place, name in enumerate(names) if name != beside]
+    together = _numbers.whole_number("together", together, (1, len(filters)))
+    sets = [[names.index(beside), *chosen] for chosen in combinations(filters, together)]
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     bodies = [TopHat(bands.get(name), temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
-    parts = [
+    cases = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
         for truth, chosen in zip(truths, sets, strict=True)
     ]
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
-    result = _dataset(table, labels, parts, sets)
+    result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
     uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
     best = [
@@ -196,7 +196,7 @@ def plan_durations(
         raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
     plans = [plan(table, noise, replace(design, seconds=float(length))) for length in lengths]
     coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})
-    without_noise = [one.drop_vars("noise") for one in plans]
+    without_noise = [expected.drop_vars("noise") for expected in plans]
     result = xr.concat(without_noise, dim=coordinate, combine_attrs="drop_conflicts")
     return result.assign(noise=plans[0]["noise"])
 
@@ -243,22 +243,22 @@ def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str,
 
 
 def _dataset(
-    table: xr.Dataset, labels: list[str], parts: list[dict[str, Array]], sets: list[list[int]]
+    table: xr.Dataset, labels: list[str], cases: list[dict[str, Array]], sets: list[list[int]]
 ) -> xr.Dataset:
     """Deviations of all combinations, side by side."""
     size = (table.sizes["material"], len(labels))
     variables = {}
-    for quantity in parts[0]:
+    for quantity in cases[0]:
         name = quantity if quantity == "condition_number" else f"{quantity}_std"
         units = "K" if quantity in TEMPERATURES else "1"
         attrs = {"units": units, "long_name": f"expected {name.replace('_', ' ')}"}
         dims = ["material", "filter"]
-        if parts[0][quantity].ndim == 1:
-            values = np.stack([part[quantity] for part in parts], axis=1)
+        if cases[0][quantity].ndim == 1:
+            values = np.stack([case[quantity] for case in cases], axis=1)
         else:
             dims, values = [*dims, "band"], np.full((*size, table.sizes["band"]), np.nan)
-            for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
-                values[:, place, chosen] = part[quantity].T
+            for place, (case, chosen) in enumerate(zip(cases, sets, strict=True)):
+                values[:, place, chosen] = case[quantity].T
         variables[name] = (dims, values, attrs)
     coords = {"material": table["material"].values, "filter": labels, "band": table["band"].values}
     return xr.Dataset(variables, coords)

@@ -31,8 +31,8 @@ def kind_of(path: Path) -> str:
 def dims_of(values: Any) -> list[Any]:
     """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty of one that has none."""
     if isinstance(values, zarr.Array):
-        own: Any = values.attrs.get("_ARRAY_DIMENSIONS", ())
-        return [*(getattr(values.metadata, "dimension_names", None) or own)]
+        stored: Any = values.attrs.get("_ARRAY_DIMENSIONS", ())
+        return [*(getattr(values.metadata, "dimension_names", None) or stored)]
     dims = getattr(values, "dims", getattr(values, "dimensions", ()))
     if not hasattr(values, "is_virtual"):
         return [*dims]
@@ -56,11 +56,11 @@ def read(
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
-        found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
-        films = [key for key, one in found.items() if one.ndim == 3]
+        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
+        films = [key for key, array in arrays.items() if array.ndim == 3]
         name = recordings.array_name(films, name, path)
-        values, dims = found[name], dims_of(found[name])
-        times = found.get("/".join([*name.split("/")[:-1], *map(str, dims[:1])]))
+        values, dims = arrays[name], dims_of(arrays[name])
+        times = arrays.get("/".join([*name.split("/")[:-1], *map(str, dims[:1])]))
         if isinstance(times, zarr.Array):
             _check_chunks(times, path)
         check(values, dims, times if times is not None and times.ndim == 1 else None)
@@ -72,29 +72,31 @@ def read(
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
     h5py = recordings.optional("h5py", "recordings")
     file = stack.enter_context(h5py.File(path, "r"))
-    found, headers = dict[str, Any](), [8]
+    arrays, headers = dict[str, Any](), [8]
 
-    def visit(name: str, one: Any) -> None:
-        headers.append(h5py.h5o.get_info(one.id).addr)
-        if isinstance(one, h5py.Dataset) and _NO_VARIABLE not in str(one.attrs.get("NAME")):
-            found.update({name: one} if one.ndim == 3 or are_times(name, one) else {})
+    def visit(name: str, array: Any) -> None:
+        headers.append(h5py.h5o.get_info(array.id).addr)
+        if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(array.attrs.get("NAME")):
+            arrays.update({name: array} if array.ndim == 3 or are_times(name, array) else {})
 
     file.visititems(visit)  # follows no link to another file
-    for name, one in found.items():
-        if one.is_virtual or one.external:
+    for name, array in arrays.items():
+        if array.is_virtual or array.external:
             raise ValueError(f"Invalid '{name}' in other files. Must be in '{path.name}' itself.")
-        start = one.id.get_offset() if one.chunks is None else None
-        if start is not None and any(start <= place < start + one.nbytes for place in headers):
+        start = array.id.get_offset() if array.chunks is None else None
+        if start is not None and any(start <= place < start + array.nbytes for place in headers):
             raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-        if one.chunks is None and (stored := one.id.get_storage_size()) != one.nbytes:
+        if array.chunks is None and (stored := array.id.get_storage_size()) != array.nbytes:
             rule = f"Must be all of the {stored} bytes stored"
-            raise ValueError(f"Invalid shape {one.shape} of '{name}' of '{path.name}'. {rule}.")
-        pieces = zip(one.shape, one.chunks or one.shape, strict=True)
-        wanted = math.prod(-(-size // part) for size, part in pieces) if one.chunks else 0
-        chunks = [one.id.get_chunk_info(n) for n in range(one.id.get_num_chunks() if wanted else 0)]
+            raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
+        pieces = zip(array.shape, array.chunks or array.shape, strict=True)
+        wanted = math.prod(-(-size // piece) for size, piece in pieces) if array.chunks else 0
+        chunks = [
+            array.id.get_chunk_info(n) for n in range(array.id.get_num_chunks() if wanted else 0)
+        ]
         if len(chunks) != wanted or any(chunk.filter_mask for chunk in chunks):
             raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
-    return found
+    return arrays
 
 
 def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
@@ -111,33 +113,33 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
     if not opened.encoding.get("unlimited_dims"):  # else they lie frame by frame
         # One variable after another up to the end: a place in the header that is damaged shows.
         content = np.memmap(path, "u1", "r")
-        kinds = [one.encoding.get("dtype", one.dtype) for one in variables.values()]
+        kinds = [variable.encoding.get("dtype", variable.dtype) for variable in variables.values()]
         sizes = [
-            -(-one.size * kind.itemsize // 4) * 4
-            for one, kind in zip(variables.values(), kinds, strict=True)
+            -(-variable.size * kind.itemsize // 4) * 4
+            for variable, kind in zip(variables.values(), kinds, strict=True)
         ]
         start = len(content) - sum(sizes)
         for name, kind, size in zip(variables, kinds, sizes, strict=True):
-            one, start = variables[name], start + size
-            if one.ndim == 3 and one.dtype.kind == "u":
-                there = content[start - size :][: one[0].size * kind.itemsize].view(">u2")
-                if not np.array_equal(one[0].values.ravel(), there):
+            variable, start = variables[name], start + size
+            if variable.ndim == 3 and variable.dtype.kind == "u":
+                stored = content[start - size :][: variable[0].size * kind.itemsize].view(">u2")
+                if not np.array_equal(variable[0].values.ravel(), stored):
                     raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-    return {str(n): one for n, one in variables.items() if one.ndim == 3 or are_times(n, one)}
+    return {str(n): v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         root = zarr.open(str(path), mode="r")
-        found: dict[str, Any] = {path.stem: root}
+        members: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
-            found = dict(root.members(max_depth=None))
-    arrays = {n: one for n, one in found.items() if isinstance(one, zarr.Array)}
-    arrays = {n: one for n, one in arrays.items() if one.ndim == 3 or are_times(n, one)}
-    for name, one in arrays.items():
-        chunk = (1, 1, *(one.shards or one.chunks))[-3:]
+            members = dict(root.members(max_depth=None))
+    arrays = {n: array for n, array in members.items() if isinstance(array, zarr.Array)}
+    arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
+    for name, array in arrays.items():
+        chunk = (1, 1, *(array.shards or array.chunks))[-3:]
         recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
-        if one.ndim == 3 and (missing := one.nchunks - one.nchunks_initialized):
+        if array.ndim == 3 and (missing := array.nchunks - array.nchunks_initialized):
             raise ValueError(
                 f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
             )
@@ -147,9 +149,9 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
 def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     """Refuse chunks of a false size, and a shape that leaves a part of them out, as if damaged."""
     pieces = values.shards or values.chunks
-    grid = [-(-size // part) for size, part in zip(values.shape, pieces, strict=True)]
-    whole = tuple(number * part for number, part in zip(grid, pieces, strict=True))
-    keys = [one for one in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, one.name)]
+    grid = [-(-size // piece) for size, piece in zip(values.shape, pieces, strict=True)]
+    whole = tuple(number * piece for number, piece in zip(grid, pieces, strict=True))
+    keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
     if values.shards is None and "Blosc" in str(values.compressors[-1:]):
         for key in keys:  # Blosc reads as far as its header says, and past the end of the memory

@@ -141,18 +141,18 @@ def flir(
         form = _image(*listed[0])._replace(body=b"")
         recordings.check_memory((len(listed), *form.shape), memory, name)
         counts = np.empty((len(listed), *form.shape), dtype=np.uint16)
-        for number, found in enumerate(listed):
-            image = _image(*found)
+        for number, listing in enumerate(listed):
+            image = _image(*listing)
             if image._replace(body=b"") != form:
-                unlike = f"{image.shape}, {image.codec} of {found[-1]}"
+                unlike = f"{image.shape}, {image.codec} of {listing[-1]}"
                 raise ValueError(f"Invalid image {unlike}. Must be {form.shape}, {form.codec}.")
             if byte_order is not None and image.order:
                 image = image._replace(order=recordings.byte_order(name, byte_order))
-            counts[number] = _decoded(image, found[-1])
-        seconds, same, attrs = _cameras(listed)
+            counts[number] = _decoded(image, listing[-1])
+        seconds, same_number, attrs = _cameras(listed)
     order, by = _order(counts, form, byte_order, name)
-    flags = np.where(same, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
-    seconds = np.where(same, seconds, np.nan)
+    flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
+    seconds = np.where(same_number, seconds, np.nan)
     if clock is not None:
         seconds = recordings.stamps(clock, len(counts), name)
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
@@ -200,11 +200,11 @@ def _image(content: Content, records: Frame, place: str) -> _Image:
         image = image._replace(order="", codec="jpegls")
         stated = _jpegls_size(body, place)
     elif len(body) != 2 * width * height:
-        found = f"{len(body)} bytes of counts in {place}"
-        raise ValueError(f"Truncated or damaged {found}. Must be 2 x {width} x {height}.")
+        label = f"{len(body)} bytes of counts in {place}"
+        raise ValueError(f"Truncated or damaged {label}. Must be 2 x {width} x {height}.")
     if stated != (height, width, 16) or not width * height:
-        found = f"{stated[0]} x {stated[1]} pixels of {stated[2]} bits in {place}"
-        raise ValueError(f"Invalid {found}. Must be {height} x {width} of 16, as its header says.")
+        label = f"{stated[0]} x {stated[1]} pixels of {stated[2]} bits in {place}"
+        raise ValueError(f"Invalid {label}. Must be {height} x {width} of 16, as its header says.")
     return image
 
 
@@ -232,7 +232,7 @@ def _decoded(image: _Image, place: str) -> Counts:
         pictures = [*codec.decode(av.Packet(image.body)), *codec.decode(None)]
     except av.FFmpegError as error:
         raise ValueError(f"Damaged image in {place}: '{error}'. Must decode.") from error
-    sizes = [(one.height, one.width) for one in pictures if not one.is_corrupt]
+    sizes = [(picture.height, picture.width) for picture in pictures if not picture.is_corrupt]
     if sizes != [image.shape] or not pictures[0].format.name.startswith("gray16"):
         raise ValueError(f"Damaged image in {place}: {sizes}. Must be one of {image.shape}.")
     return np.asarray(pictures[0].to_ndarray(), dtype=np.uint16)
@@ -242,15 +242,15 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     """Byte order of the counts, which are swapped in place if need be, and what decided it."""
     if form.codec == "jpegls":
         return "none: numbers are coded", "codec"
-    found = recordings.smoother(counts)
-    if stated is None and (found < 0 if form.order else found == 0):
+    sign = recordings.smoother(counts)
+    if stated is None and (sign < 0 if form.order else sign == 0):
         raise ValueError(
             f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
             "as smooth. Must be stated: byte_order='little' or 'big'."
         )
     # Decoded as stated, or as PNG has it: its highest byte first.
     as_stated = bool(form.order) or stated is None or recordings.byte_order(name, stated) == ">"
-    if stated is not None and (found < 0 if as_stated else found > 0):
+    if stated is not None and (sign < 0 if as_stated else sign > 0):
         raise ValueError(
             f"Invalid byte_order '{stated}' for '{name}': its images are smoother with their bytes "
             "swapped. Must be the other one."
@@ -258,7 +258,7 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     if form.order:
         order = {"<": "little", ">": "big"}[form.order] if stated is None else stated
         return order, "caller" if stated else "header"
-    swap = found < 0 if stated is None else recordings.byte_order(name, stated) == "<"
+    swap = sign < 0 if stated is None else recordings.byte_order(name, stated) == "<"
     if swap:  # a PNG has its highest byte first
         counts.byteswap(inplace=True)
     return "little" if swap else "big", "caller" if stated else "smoothness"
@@ -270,18 +270,18 @@ def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
     Image and camera begin with the same 32 bytes, of which two number the frame: different ones
     mean that one of the two is of another frame. From frame to frame they may rise by any number.
     """
-    same = np.ones(len(listed), dtype=bool)
+    same_number = np.ones(len(listed), dtype=bool)
     milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
     for number, (content, records, place) in enumerate(listed):
         if container.CAMERA not in records:
             continue
         body = container.body(content, records[container.CAMERA], place)
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
-            found = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
-            raise ValueError(f"Damaged {found}. Must be {_CAMERA_SIZE} at least, and begin with 2.")
+            label = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
+            raise ValueError(f"Damaged {label}. Must be {_CAMERA_SIZE} at least, and begin with 2.")
         order = "<" if body[0] else ">"
         place_of = records[container.IMAGE].start + _NUMBER
-        same[number] = content[place_of : place_of + 2] == body[_NUMBER : _NUMBER + 2]
+        same_number[number] = content[place_of : place_of + 2] == body[_NUMBER : _NUMBER + 2]
         whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
@@ -295,9 +295,9 @@ def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
                 change = f"{key} {camera[key]:g} of {place}, {first[key]:g} before"
                 rule = "Must be one range of the camera: select its frames by frames="
                 raise ValueError(f"Invalid {change}. {rule}.")
-    known = milliseconds[np.isfinite(milliseconds)][:1]
-    attrs = _attrs(first, *known / 1000) if first else {"implausible": ""}
-    return (milliseconds - (known if known.size else 0)) / 1000, same, attrs
+    first_time = milliseconds[np.isfinite(milliseconds)][:1]
+    attrs = _attrs(first, *first_time / 1000) if first else {"implausible": ""}
+    return (milliseconds - (first_time if first_time.size else 0)) / 1000, same_number, attrs
 
 
 def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, Any]:

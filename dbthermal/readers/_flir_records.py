@@ -53,8 +53,8 @@ def body(content: Content, record: Record, place: str) -> bytes:
     """Bytes of a record, whose checksum, if it has one, must be right."""
     value = content[record.start : record.stop]
     if record.checksum and zlib.crc32(value) != record.checksum:
-        found = f"CRC-32 {zlib.crc32(value):08x} of a record of {place}"
-        raise ValueError(f"Damaged file: {found}. Must be {record.checksum:08x}, as listed.")
+        label = f"CRC-32 {zlib.crc32(value):08x} of a record of {place}"
+        raise ValueError(f"Damaged file: {label}. Must be {record.checksum:08x}, as listed.")
     return value
 
 
@@ -76,29 +76,29 @@ def segments(content: Content, name: str) -> Iterator[tuple[int, int, int]]:
 
 def of_jpeg(content: Content, name: str) -> bytes:
     """Container that the APP1 segments of a radiometric JPEG hold, joined."""
-    parts = [
+    payloads = [
         content[start:stop]
         for marker, start, stop in segments(content, name)
         if marker == 0xE1 and content[start : start + len(_SEGMENT)] == _SEGMENT
     ]
-    if not parts:
+    if not payloads:
         raise ValueError(
             f"No thermal data of FLIR in '{name}', an ordinary JPEG or one of another maker. Must "
             "be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff."
         )
-    numbers = [tuple(part[6:8]) for part in parts]
-    if numbers != [(i, numbers[0][-1]) for i in range(numbers[0][-1] + 1)] or len(parts[-1]) < 8:
-        found = f"FLIR segments {[i for i, *_ in numbers]}"
-        raise ValueError(f"Damaged JPEG '{name}': {found}. Must be whole and in order.")
-    return b"".join(part[8:] for part in parts)
+    numbers = [tuple(payload[6:8]) for payload in payloads]
+    if numbers != [(i, numbers[0][-1]) for i in range(numbers[0][-1] + 1)] or len(payloads[-1]) < 8:
+        label = f"FLIR segments {[i for i, *_ in numbers]}"
+        raise ValueError(f"Damaged JPEG '{name}': {label}. Must be whole and in order.")
+    return b"".join(payload[8:] for payload in payloads)
 
 
 def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     """Records of the frame that begins at a byte, and the byte after its last one."""
     size = len(content)
     if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:
-        other = "" if at else "; is it no recording of FLIR? Then export 16-bit counts as TIFF"
-        rule = f"Must be FLIR's: 'FFF' or 'AFF'{other}"
+        hint = "" if at else "; is it no recording of FLIR? Then export 16-bit counts as TIFF"
+        rule = f"Must be FLIR's: 'FFF' or 'AFF'{hint}"
         raise ValueError(f"Invalid header {mark!r} of {place}. {rule}.")
     orders = [o for o in "><" if 100 <= struct.unpack_from(f"{o}I", content, at + 20)[0] < 200]
     if not orders:
@@ -107,9 +107,9 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     directory, count = struct.unpack_from(f"{orders[0]}II", content, at + 24)
     listed = directory + _ENTRY * count
     if directory < _HEADER or count > _MOST_RECORDS or at + listed > size:
-        found = f"directory of {count} records at {directory} of {place}"
+        label = f"directory of {count} records at {directory} of {place}"
         rule = f"Must be in the file, and of {_MOST_RECORDS} at most"
-        raise ValueError(f"Damaged file: {found}. {rule}.")
+        raise ValueError(f"Damaged file: {label}. {rule}.")
     records, spans = {}, [(directory, listed)]
     for entry in range(directory, listed, _ENTRY):
         kind, *_, start, length, _, _, checksum = struct.unpack_from(
@@ -125,9 +125,9 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     stops = [_HEADER, *(stop for _, stop in spans)]
     for before, (start, stop) in zip(stops, spans, strict=False):
         if start < before or at + stop > size + _PADDING:
-            found = f"record from {start} to {stop} of {place}"
+            label = f"record from {start} to {stop} of {place}"
             rule = f"Must follow {before}, and end within the {size - at} bytes left"
-            raise ValueError(f"Truncated or damaged file: {found}. {rule}.")
+            raise ValueError(f"Truncated or damaged file: {label}. {rule}.")
     if IMAGE not in records:
         raise ValueError(f"Missing image in {place}. Has records {sorted(records)}.")
     return records, min(at + stops[-1], size)

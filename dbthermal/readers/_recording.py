@@ -57,25 +57,25 @@ class FileFlag(schema.Flags):
 
 def files(path: Paths) -> list[Path]:
     """Regular files of a recording, in the order of time; ValueError by what to do instead."""
-    several = path if isinstance(path, list | tuple) else [path]
-    paths = [texts.as_path(one) for one in several]
+    listed = path if isinstance(path, list | tuple) else [path]
+    paths = [texts.as_path(file) for file in listed]
     if not paths:
         raise ValueError("Empty list of files. Must name at least one.")
-    numbers = [[int(digits) for digits in re.findall("[0-9]+", one.stem)] for one in paths]
-    for before, after, one in zip(numbers, numbers[1:], paths[1:], strict=False):
+    numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
+    for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):
         if len(before) == len(after) and after <= before:
             rule = "Must rise: 'frame10' comes after 'frame9', which the order of text does not"
-            raise ValueError(f"Unordered files: the numbers of '{one.name}' do not rise. {rule}.")
-    for one in paths:
-        if one.suffix.lower() in _REFUSED:
-            raise ValueError(f"Refused '{one.name}': {_REFUSED[one.suffix.lower()]}.")
-        if texts.regular_file(one, _LARGEST).stat().st_size == 0:
-            raise ValueError(f"Empty file '{one.name}'. Must hold at least one frame.")
+            raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
+    for file in paths:
+        if file.suffix.lower() in _REFUSED:
+            raise ValueError(f"Refused '{file.name}': {_REFUSED[file.suffix.lower()]}.")
+        if texts.regular_file(file, _LARGEST).stat().st_size == 0:
+            raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
     return paths
 
 
 @contextmanager
-def damage_named(found: str, rule: str) -> Iterator[None]:
+def damage_named(label: str, rule: str) -> Iterator[None]:
     """Make one line of all that a library raises for a damaged file; what a reader says stays."""
     try:
         yield
@@ -83,7 +83,7 @@ def damage_named(found: str, rule: str) -> Iterator[None]:
         if isinstance(error, ValueError) and "Must " in str(error):
             raise
         message = " ".join(str(error).split())[:200]
-        raise ValueError(f"{found}: {message}. Must be {rule}.") from error
+        raise ValueError(f"{label}: {message}. Must be {rule}.") from error
 
 
 def check_number(value: Any, name: str, *, whole: bool = False) -> None:
@@ -115,10 +115,10 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
         )
 
 
-def smoother(counts: Counts, other: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:
+def smoother(counts: Counts, rearranged: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:
     """Form in which the first clear frame is smoother: 1 as it is, -1 the other, 0 unclear."""
     for frame in counts:
-        as_is, swapped = _roughness(frame), _roughness(other(frame))
+        as_is, swapped = _roughness(frame), _roughness(rearranged(frame))
         if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
             return sign
     return 0
@@ -129,17 +129,17 @@ def _roughness(frame: Counts) -> float:
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
 
-def array_name(found: Collection[str], name: str | None, path: Path) -> str:
+def array_name(names: Collection[str], name: str | None, path: Path) -> str:
     """Name of an array in a file, which may be left out if there is one alone."""
-    if name is None and len(found) == 1:
-        return next(iter(found))
-    if name in [*found]:
+    if name is None and len(names) == 1:
+        return next(iter(names))
+    if name in [*names]:
         return str(name)
-    if not found:
+    if not names:
         rule = "Must have one; a store of dbthermal that has two bands is a capture as it is"
         raise ValueError(f"Missing array (time, y, x) in '{path.name}'. {rule}.")
     wanted = "name of one of the arrays" if name is None else f"array '{name}'"
-    raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(found)}.")
+    raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(names)}.")
 
 
 def check_unit(unit: str, name: str) -> None:
@@ -173,8 +173,8 @@ def stamps(clock: Clock, frames: int, name: str) -> Array:
         or not np.all(np.isfinite(values))
         or (0 < np.ptp(values) * _FASTEST < frames - 1)
     ):
-        found = f"clock of shape {values.shape} for {frames} frames of '{name}'"
-        raise ValueError(f"Invalid {found}. {rule}.")
+        label = f"clock of shape {values.shape} for {frames} frames of '{name}'"
+        raise ValueError(f"Invalid {label}. {rule}.")
     return np.asarray(values - values[0])
 
 
@@ -192,34 +192,34 @@ def recording(
             f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
             "bits or with automatic gain. Must be 16-bit counts of the detector: record those."
         )
-    (known,) = np.nonzero(np.isfinite(seconds))
-    steps = np.diff(seconds[known])
+    (stamped,) = np.nonzero(np.isfinite(seconds))
+    steps = np.diff(seconds[stamped])
     if np.any(steps < 0):
-        place = known[1:][steps < 0][0]
-        found = f"frame {place} is {-steps[steps < 0][0]:.3f} s before the one that precedes it"
+        place = stamped[1:][steps < 0][0]
+        label = f"frame {place} is {-steps[steps < 0][0]:.3f} s before the one that precedes it"
         rule = "Must rise; else give the times as clock="
-        raise ValueError(f"Unordered times in '{name}': {found}. {rule}.")
-    known = np.delete(known, 1 + np.flatnonzero(steps == 0))
-    stands = ~np.isin(np.arange(seconds.size), known)
+        raise ValueError(f"Unordered times in '{name}': {label}. {rule}.")
+    stamped = np.delete(stamped, 1 + np.flatnonzero(steps == 0))
+    stands = ~np.isin(np.arange(seconds.size), stamped)
     exposed = np.where(stands, np.nan, seconds)
-    if known.size < min(2, seconds.size):
+    if stamped.size < min(2, seconds.size):
         raise ValueError(
-            f"Unknown times in '{name}': {known.size} of {seconds.size} frames have one. Must be "
+            f"Unknown times in '{name}': {stamped.size} of {seconds.size} frames have one. Must be "
             "given: clock= is the frame rate [Hz], or the time of each frame [s]."
         )
     flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
     flags[stands] |= FileFlag.TIME_STANDS.value
-    period = np.median(np.diff(exposed[known]) / np.diff(known)) if known.size > 1 else 1.0
-    late = np.diff(exposed[known]) > _GAP * period * np.diff(known)
-    flags[known[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
+    period = np.median(np.diff(exposed[stamped]) / np.diff(stamped)) if stamped.size > 1 else 1.0
+    late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
+    flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
     variables = {
         "counts": (("time", "y", "x"), counts, schema.STAGES["capture"]["counts"].attrs),
-        "exposure_time": ("time", exposed - exposed[known[0]], schema.EXPOSURE_TIME.attrs),
+        "exposure_time": ("time", exposed - exposed[stamped[0]], schema.EXPOSURE_TIME.attrs),
         "frame_flags": ("time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
     }
     slots = np.arange(exposed.size)  # unknown times on the line between their neighbours
-    outside = slots - np.clip(slots, known[0], known[-1])
-    time = np.interp(slots, known, exposed[known]) + period * outside
+    outside = slots - np.clip(slots, stamped[0], stamped[-1])
+    time = np.interp(slots, stamped, exposed[stamped]) + period * outside
     coordinate = ("time", time - time[0], schema.COORDINATES["time"].attrs)
     return xr.Dataset(variables, {"time": coordinate}, {"origin": schema.MEASURED, **attrs})
 

@@ -236,18 +236,18 @@ def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
 
 def _check_reach(wavelength: Array, reach: tuple[float, float], file: _File) -> None:
     """Raise ValueError if rows are missing, at the ends or between two others."""
-    (low, high), (least, most) = (wavelength.min(), wavelength.max()), reach
-    if low > least or high < most:
+    (low, high), (shortest, longest) = (wavelength.min(), wavelength.max()), reach
+    if low > shortest or high < longest:
         raise ValueError(
             f"Truncated '{file.name}': wavelengths from {low:g} to {high:g} micrometres. "
-            f"Must reach from {least:g} to {most:g}, or as far as you say by reach=."
+            f"Must reach from {shortest:g} to {longest:g}, or as far as you say by reach=."
         )
     steps = np.abs(np.diff(1 / wavelength))
     if steps.size < 3:
         return
     # A missing row makes a step twice as long as those beside it, whatever the grid.
-    beside = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
-    for i in np.flatnonzero(steps > 1.6 * beside) + 1:
+    neighbour = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
+    for i in np.flatnonzero(steps > 1.6 * neighbour) + 1:
         step = f"Uneven step to {wavelength[i]:g} micrometres, longer than those beside it"
         raise ValueError(f"{file.at(i)}: {step}. Must follow the row before: rows are missing.")
 
@@ -257,13 +257,13 @@ def _spectrum(
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS
-    for quantity, values, least, most in (
+    for quantity, values, lowest, highest in (
         ("wavelength", wavelength, 1e-3, 1e3),
         ("emissivity", emissivity, low, high),
     ):
-        for i in np.flatnonzero(~((values >= least) & (values <= most))):
+        for i in np.flatnonzero(~((values >= lowest) & (values <= highest))):
             message = f"Invalid {quantity} {values[i]:g} in {name}"
-            raise ValueError(f"{file.at(i)}: {message}. Must lie in [{least}, {most}].")
+            raise ValueError(f"{file.at(i)}: {message}. Must lie in [{lowest}, {highest}].")
     falling = wavelength[0] > wavelength[-1]
     for i in np.flatnonzero(np.diff(-wavelength if falling else wavelength) <= 0):
         message = f"{wavelength[i]:g} micrometres is followed by one not beyond it"

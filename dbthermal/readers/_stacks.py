@@ -96,11 +96,11 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     paths = recordings.files(path)
     name = recordings.label(paths)
     recordings.check_unit(unit, name)
-    pages = [page for one in paths for page in _pages(one)]
+    pages = [page for file in paths for page in _pages(file)]
     for page in pages:
         if page.shape != pages[0].shape:
-            found = f"Invalid page of {page.shape} in '{page.path.name}'"
-            raise ValueError(f"{found}. Must be {pages[0].shape}, as the first.")
+            label = f"Invalid page of {page.shape} in '{page.path.name}'"
+            raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
     shape = (sum(page.images for page in pages), *pages[0].shape)
     recordings.check_memory(shape, memory, name)
     counts, at = np.empty(shape, dtype=np.uint16), 0
@@ -157,8 +157,8 @@ def raw(
     >>> bool((capture.counts == frames).all())
     True
     """
-    (one,) = recordings.files([path])
-    name = one.name
+    (file,) = recordings.files([path])
+    name = file.name
     recordings.check_unit(unit, name)
     order = recordings.byte_order(name, byte_order)
     for label, value in {"header": header, "frame_header": frame_header}.items():
@@ -170,14 +170,14 @@ def raw(
         rule = "Must be rows and columns, two whole numbers"
         raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
     frame = frame_header + 2 * shape[0] * shape[1]
-    frames, rest = divmod(one.stat().st_size - header, frame)
-    if frames < 1 or rest:
-        found = f"{one.stat().st_size} bytes of '{name}': {frames} frames and {rest} bytes"
+    frames, remainder = divmod(file.stat().st_size - header, frame)
+    if frames < 1 or remainder:
+        label = f"{file.stat().st_size} bytes of '{name}': {frames} frames and {remainder} bytes"
         rule = f"Must be {header} + a whole number of {frame}, as shape and headers state"
-        raise ValueError(f"Invalid size {found}. {rule}.")
+        raise ValueError(f"Invalid size {label}. {rule}.")
     recordings.check_memory((frames, *shape), memory, name)
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = np.memmap(one, form, "r", offset=header)["counts"].astype(np.uint16)
+    counts = np.memmap(file, form, "r", offset=header)["counts"].astype(np.uint16)
     if recordings.smoother(counts) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
@@ -228,14 +228,14 @@ def _pages(path: Path) -> list[_Page]:
     finally:
         log.removeHandler(handler)
     if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
-        (start, length), *others = pages[0].spans
-        if others or start + stated * length > size:
-            found = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
-            raise ValueError(f"{found}. Must end within its {size}.")
+        (start, length), *further = pages[0].spans
+        if further or start + stated * length > size:
+            label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
+            raise ValueError(f"{label}. Must end within its {size}.")
         return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
     if stated not in {0, len(pages)}:
-        found = f"Truncated TIFF '{path.name}': {len(pages)} pages"
-        raise ValueError(f"{found}. Must be the {stated} that its description states.")
+        label = f"Truncated TIFF '{path.name}': {len(pages)} pages"
+        raise ValueError(f"{label}. Must be the {stated} that its description states.")
     return pages
 
 
@@ -265,15 +265,15 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         rule = "Must be 16-bit counts, not temperatures: record or export those"
         raise ValueError(f"Invalid values of page {number}, {page.dtype}{span}. {rule}.")
     for key, label, value, rule in _FORM:
-        found = page.tags.valueof(key, 1) if isinstance(key, int) else getattr(page, key)
-        if found != value:
-            raise ValueError(f"Invalid {label} {found} of page {number}. Must be {rule}.")
+        actual = page.tags.valueof(key, 1) if isinstance(key, int) else getattr(page, key)
+        if actual != value:
+            raise ValueError(f"Invalid {label} {actual} of page {number}. Must be {rule}.")
     shape = (int(page.imagelength), int(page.imagewidth))
     spans = list[tuple[int, int]]()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
         if start < 8 or length < 1 or length % 2 or start + length > path.stat().st_size:
-            found = f"{length} bytes at {start} of page {number}"
-            raise ValueError(f"Truncated: {found}. Must be within {path.stat().st_size}.")
+            label = f"{length} bytes at {start} of page {number}"
+            raise ValueError(f"Truncated: {label}. Must be within {path.stat().st_size}.")
         begun, before = spans.pop() if spans and sum(spans[-1]) == start else (start, 0)
         spans.append((int(begun), int(before + length)))
     total = sum(length for _, length in spans)
@@ -285,9 +285,9 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
 def _no_data(page: Any, number: int) -> list[float]:
     """Values of missing counts, by GDAL's tags of a page, which must say that it is not scaled."""
     for role, text in _SCALING.findall(str(page.tags.valueof(_METADATA, ""))):
-        if float(text) != (none := float(role == "scale")):
-            found = f"GDAL {role} {text} of page {number}"
-            raise ValueError(f"Invalid {found}. Must be {none:g}: counts as measured.")
+        if float(text) != (neutral := float(role == "scale")):
+            label = f"GDAL {role} {text} of page {number}"
+            raise ValueError(f"Invalid {label}. Must be {neutral:g}: counts as measured.")
     return [float(text) for text in str(page.tags.valueof(_NO_DATA, "")).strip("\0").split()]
 
 
@@ -301,14 +301,14 @@ def _stated(description: str) -> int:
         about = json.loads(description)
         shape = about["shape"]
         axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
-        every = str(about.get("axes", "YX"))
-        named = zip(every[:-2], shape, strict=False)
-        names = "".join(name for name, size in named if size != 1) + every[-2:]
+        dims = str(about.get("axes", "YX"))
+        named = zip(dims[:-2], shape, strict=False)
+        names = "".join(name for name, size in named if size != 1) + dims[-2:]
     if sum(size > 1 for size in axes) > 1:
         raise ValueError(f"Invalid axes of {axes} images. Must be one, time: a band is a file.")
     if not _OVER_TIME.fullmatch(names):
         rule = "Must be TYX, time, rows and columns: a band is a file"
         raise ValueError(f"Invalid axes {names} of the images. {rule}.")
-    if found := _IMAGEJ.match(description):
-        return int(found.group(1))
+    if match := _IMAGEJ.match(description):
+        return int(match.group(1))
     return math.prod(axes) if shaped else 0

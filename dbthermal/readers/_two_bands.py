@@ -68,19 +68,19 @@ def two_bands(
     >>> import numpy as np
     >>> from dbthermal import readers
     >>> counts = np.arange(18000, 18060, dtype=np.uint16).reshape(5, 3, 4)
-    >>> one = readers.array(counts, unit="count", clock=30.0)
-    >>> other = readers.array(counts[:4] + 900, unit="count", clock=30.0)
-    >>> capture = two_bands(one, other, bands=("8-14", "9.5"), offset=0.01)
+    >>> first = readers.array(counts, unit="count", clock=30.0)
+    >>> second = readers.array(counts[:4] + 900, unit="count", clock=30.0)
+    >>> capture = two_bands(first, second, bands=("8-14", "9.5"), offset=0.01)
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
     pair = (first, second)
     names = _names(bands)
-    for name, one in zip(names, pair, strict=True):
-        _check(one, name)
+    for name, recording in zip(names, pair, strict=True):
+        _check(recording, name)
     if offset is not None:
         recordings.check_number(offset, "offset")
-    shapes = [(one.sizes["y"], one.sizes["x"]) for one in pair]
+    shapes = [(recording.sizes["y"], recording.sizes["x"]) for recording in pair]
     if shapes[0] != shapes[1]:
         raise ValueError(
             f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
@@ -88,35 +88,35 @@ def two_bands(
         )
     late = offset
     if late is None:
-        dates = [one.attrs.get("start") for one in pair]
+        dates = [recording.attrs.get("start") for recording in pair]
         if None in dates:
             raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
         begun, later = (datetime.fromisoformat(str(date)) for date in dates)
         late = (later - begun).total_seconds()
-    starts, stops = ([one["time"].values[place] for one in pair] for place in (0, -1))
+    starts, stops = ([recording["time"].values[place] for recording in pair] for place in (0, -1))
     overlap = np.minimum(stops[0], stops[1] + late) - np.maximum(starts[0], starts[1] + late)
-    if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:
+    if not overlap > 0 and max(recording.sizes["time"] for recording in pair) > 1:
         raise ValueError(
             f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
             "overlap. Must overlap; give offset= if a camera's clock is wrong."
         )
-    shared = min(one.sizes["time"] for one in pair)
-    parts = [one["counts"].values[:shared] for one in pair]
-    if np.array_equal(parts[0], parts[1]):
+    shared = min(recording.sizes["time"] for recording in pair)
+    overlapping = [recording["counts"].values[:shared] for recording in pair]
+    if np.array_equal(overlapping[0], overlapping[1]):
         raise ValueError(
             f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
             "is one file named twice?"
         )
-    frames = max(one.sizes["time"] for one in pair)
+    frames = max(recording.sizes["time"] for recording in pair)
     counts = np.empty((2, frames, *shapes[0]), dtype=np.uint16)
     times = np.full((2, frames), np.nan)
     flags = np.full((2, frames), FileFlag.PADDED.value, dtype=np.uint16)
-    for place, (one, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
-        own = one.sizes["time"]
-        counts[place, :own] = one["counts"].values
-        counts[place, own:] = one["counts"].values[-1]
-        times[place, :own] = one["exposure_time"].values + shift
-        flags[place, :own] = one["frame_flags"].values
+    for place, (recording, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
+        length = recording.sizes["time"]
+        counts[place, :length] = recording["counts"].values
+        counts[place, length:] = recording["counts"].values[-1]
+        times[place, :length] = recording["exposure_time"].values + shift
+        flags[place, :length] = recording["frame_flags"].values
     longer = int(second.sizes["time"] > first.sizes["time"])
     clock = pair[longer]["time"].values + (0.0, late)[longer]
     variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
@@ -124,67 +124,70 @@ def two_bands(
     time = ("time", clock, schema.COORDINATES["time"].attrs)
     attrs = {
         **schema.origin(first.attrs, second.attrs),
-        "source": " and ".join(str(one.attrs.get("source", "")) for one in pair),
+        "source": " and ".join(str(recording.attrs.get("source", "")) for recording in pair),
         "offset": late,
         "offset_by": "dates" if offset is None else "caller",
-        "files": {name: dict(one.attrs) for name, one in zip(names, pair, strict=True)},
+        "files": {name: dict(recording.attrs) for name, recording in zip(names, pair, strict=True)},
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
-    borders = [_border(part, name) for part, name in zip(parts, names, strict=True)]
-    return warned(capture, *_temperatures(parts), *filter(None, borders))
+    borders = map(_border, overlapping, names)
+    return warned(capture, *_temperatures(overlapping), *filter(None, borders))
 
 
 def _names(bands: Any) -> list[str]:
     """Names of two bands, which must be texts, and differ."""
-    several = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
-    names = [str(one) for one in bands if isinstance(one, str) and one.strip()] if several else []
+    is_pair = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
+    listed = bands if is_pair else []
+    names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if len({*names}) != 2:
         raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
     return names
 
 
-def _border(part: npt.NDArray[np.uint16], name: str) -> str:
+def _border(counts: npt.NDArray[np.uint16], name: str) -> str:
     """Sentence on rows and columns at the border of a band that have one value in all frames."""
-    some = part[:: 1 + len(part) // _FRAMES]
-    padded = (some == some[0, 0, 0]) | (some == some[0, -1, -1])
+    sample = counts[:: 1 + len(counts) // _FRAMES]
+    padded = (sample == sample[0, 0, 0]) | (sample == sample[0, -1, -1])
     rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
     if rows == padded.shape[1] or not rows + columns:
         return ""
-    found = f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
-    return f"{found}: a border, which is no measurement. Its pixels are flagged; better cropped."
+    label = f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
+    return f"{label}: a border, which is no measurement. Its pixels are flagged; better cropped."
 
 
-def _temperatures(parts: list[npt.NDArray[np.uint16]]) -> list[str]:
+def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
     """Sentence on counts of two cameras that read as the same temperatures in hundredths."""
-    some = [part[:: 1 + len(part) // _FRAMES].ravel() for part in parts]
-    low, middle, high = np.percentile(some, [1, 50, 99], axis=1)
+    samples = [counts[:: 1 + len(counts) // _FRAMES].ravel() for counts in films]
+    low, middle, high = np.percentile(samples, [1, 50, 99], axis=1)
     for zero, unit in ((0.0, "degC"), (zero_Celsius, "K")):
-        inside = np.all((low >= 100 * (zero + _SCENE[0])) & (high <= 100 * (zero + _SCENE[1])))
-        if inside and np.ptp(middle) < 100 * _ALIKE:
-            said = " and ".join(f"{one / 100:.1f}" for one in middle)
-            found = f"The medians of both bands, over 100, are temperatures: {said} {unit}"
+        plausible = np.all((low >= 100 * (zero + _SCENE[0])) & (high <= 100 * (zero + _SCENE[1])))
+        if plausible and np.ptp(middle) < 100 * _ALIKE:
+            medians = " and ".join(f"{median / 100:.1f}" for median in middle)
+            label = f"The medians of both bands, over 100, are temperatures: {medians} {unit}"
             rule = "Must be counts of the detector; should these be alike by chance, go on"
-            return [f"{found}. {rule}."]
+            return [f"{label}. {rule}."]
     return []
 
 
-def _check(one: xr.Dataset, name: str) -> None:
+def _check(recording: xr.Dataset, name: str) -> None:
     """Refuse what is no recording of counts in one band."""
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
-        if variable not in one or one[variable].dims != dims:
-            found = one[variable].dims if variable in one else "nothing"
+        if variable not in recording or recording[variable].dims != dims:
+            actual = recording[variable].dims if variable in recording else "nothing"
             raise ValueError(
-                f"Invalid recording of band '{name}': '{variable}' is {found}. Must be {dims}, as "
+                f"Invalid recording of band '{name}': '{variable}' is {actual}. Must be {dims}, as "
                 "from a reader of recordings."
             )
     for variable in ("time", "exposure_time"):
-        values = schema.check_numbers(one[variable], f"'{variable}' of band '{name}'", "s").values
-        known = values[~np.isnan(values)] if variable == "exposure_time" else values
-        if not known.size or not np.isfinite(known).all() or np.any(np.diff(known) <= 0):
+        values = schema.check_numbers(
+            recording[variable], f"'{variable}' of band '{name}'", "s"
+        ).values
+        valid = values[~np.isnan(values)] if variable == "exposure_time" else values
+        if not valid.size or not np.isfinite(valid).all() or np.any(np.diff(valid) <= 0):
             rule = "Must be known, finite and rise; an exposure time may be NaN, not all"
             raise ValueError(f"Invalid '{variable}' of band '{name}' {shown(values)}. {rule}.")
     for variable in ("counts", "frame_flags"):
-        if ((dtype := one[variable].dtype).kind, dtype.itemsize) != ("u", 2):
-            found = f"dtype {dtype} of the {variable} of band '{name}'"
-            raise TypeError(f"Invalid {found}. Must be uint16.")
+        if ((dtype := recording[variable].dtype).kind, dtype.itemsize) != ("u", 2):
+            actual = f"dtype {dtype} of the {variable} of band '{name}'"
+            raise TypeError(f"Invalid {actual}. Must be uint16.")

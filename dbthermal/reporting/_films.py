@@ -34,11 +34,11 @@ def _films(view: View) -> list[str]:
 
 def sampled(view: View, name: str, frames: int, samples: int) -> tuple[xr.DataArray, int]:
     """Film of a pane, of some of its frames and pixels, and the step between the pixels."""
-    every = slice(None, None, -(-view.time.size // frames))
-    time = view.time[every]
+    moments = slice(None, None, -(-view.time.size // frames))
+    time = view.time[moments]
     step = max(1, math.ceil(math.sqrt(np.prod(view.shape) * time.size / samples)))
-    some = slice(None, None, step)
-    values = view.pane(name).read(every, some, some)
+    pixels = slice(None, None, step)
+    values = view.pane(name).read(moments, pixels, pixels)
     return xr.DataArray(values, {"time": time}, ("time", "y", "x")), step
 
 
@@ -90,7 +90,7 @@ def viewer(view: View, *, celsius: bool) -> Markup:
                 "unit": unit,
                 "low": float(low),
                 "high": float(high),
-                "shown": [float(one - zero) for one in view.limits(name)],
+                "shown": [float(limit - zero) for limit in view.limits(name)],
                 "data": base64.b64encode(codes.tobytes()).decode(),
             }
         )
@@ -103,6 +103,6 @@ def viewer(view: View, *, celsius: bool) -> Markup:
         "palette": base64.b64encode(colors.tobytes()).decode(),
         "quantities": quantities,
     }
-    every = f"one row and column of {step}, " if step > 1 else ""
-    note = f"Click a pixel for its curve. Shown: {every}{time.size} of {view.time.size} frames."
+    share = f"one row and column of {step}, " if step > 1 else ""
+    note = f"Click a pixel for its curve. Shown: {share}{time.size} of {view.time.size} frames."
     return viewer_tag(content, note)

@@ -112,10 +112,10 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
     result = view.data
     shot = result if view.capture is None else view.capture
-    for name, one in regions.items():
-        if not isinstance(one, Region):
+    for name, region in regions.items():
+        if not isinstance(region, Region):
             raise TypeError(
-                f"Invalid region {name!r}, {one!r}. Must be an explorer.Region, such as "
+                f"Invalid region {name!r}, {region!r}. Must be an explorer.Region, such as "
                 'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
             )
     chosen = dict(regions) or {
@@ -123,7 +123,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
             "rectangle", ((0, 0), (view.shape[0], view.shape[1]))
         )
     }
-    shown = [one for one in view.panes if one in FILMS or one.startswith("emissivity ")]
+    shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
         name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
         for name, region in chosen.items()
@@ -170,10 +170,10 @@ def _regions(
     for axis, name in zip(axes[:, 0], names, strict=True):
         for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
             curve = curves[region][name]
-            mean, two = curve["mean"].values - zero, 2 * curve["std"].values
+            mean, interval = curve["mean"].values - zero, 2 * curve["std"].values
             axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
             axis.fill_between(
-                view.time, mean - two, mean + two, color=color, alpha=0.25, linewidth=0
+                view.time, mean - interval, mean + interval, color=color, alpha=0.25, linewidth=0
             )
         axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
@@ -210,7 +210,7 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
         if mask.all():
             continue
         axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
-        row, column = (float(one.mean()) for one in np.nonzero(mask))
+        row, column = (float(places.mean()) for places in np.nonzero(mask))
         label = axes[0, 0].text(column, row, name, color="white", ha="center", va="center")
         label.set_path_effects([withStroke(linewidth=2.5, foreground="black")])
     return figure
@@ -237,7 +237,9 @@ def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
     doubts = [*view.data.attrs.get("warnings", []), *hardly_measured(view.data)]
     if view.capture is not None and view.response is not None:
         doubts += against_response(view.capture, view.response)
-    yield from (Markup("<p><strong>{}</strong></p>").format(one) for one in dict.fromkeys(doubts))
+    yield from (
+        Markup("<p><strong>{}</strong></p>").format(doubt) for doubt in dict.fromkeys(doubts)
+    )
     if "status" not in view.panes:
         yield "The result has no status: nothing is said of what can be trusted."
         return
@@ -281,9 +283,9 @@ def _nearest(
     """Materials of a table by their distance from measured emissivities, in standard deviations."""
     if not set(bands) <= set(materials["band"].values) or not np.isfinite(values + stds).all():
         return []
-    known = materials["emissivity"].sel(band=bands)
+    library = materials["emissivity"].sel(band=bands)
     spread = np.hypot(stds, _SPREAD)
-    distance = np.sqrt(np.mean(((known.values - values) / spread) ** 2, axis=1))
+    distance = np.sqrt(np.mean(((library.values - values) / spread) ** 2, axis=1))
     order = np.argsort(distance)[:_NEAREST]
     names = materials["material"].values
     return [{"material": str(names[at]), "distance": float(distance[at])} for at in order]
@@ -291,15 +293,15 @@ def _nearest(
 
 def _emissivities(regions: Mapping[str, Mapping[str, Any]]) -> Iterator[Markup | str]:
     """Yield the emissivities of the regions beside the nearest materials of the table."""
-    known = {name: of for name, of in regions.items() if of.get("emissivity")}
-    if not known:
+    measured = {name: of for name, of in regions.items() if of.get("emissivity")}
+    if not measured:
         return
-    bands = list(next(iter(known.values()))["emissivity"])
+    bands = list(next(iter(measured.values()))["emissivity"])
     rows = []
-    for name, of in known.items():
+    for name, of in measured.items():
         pairs = [(of["emissivity"][band], of["emissivity_std"][band]) for band in bands]
-        cells = [f"{_text(one, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for one, std in pairs]
-        near = ", ".join(f"{one['material']} ({one['distance']:.1f})" for one in of["nearest"])
+        cells = [f"{_text(value, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for value, std in pairs]
+        near = ", ".join(f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"])
         rows.append([name, near or "-", *cells])
     head = ["region", "nearest materials of the table (distance)"]
     yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)

@@ -1,13 +1,15 @@
 """Separation of emission and reflection: one function, several methods of one signature.
 
 Begin with `solve(corrected, response)`; `METHODS` names the methods, and each method that has
-options takes them as its frozen record, such as `SubspaceSettings`.
+options takes them as its frozen record, such as `SubspaceSettings`. A `Method` of your code, a
+function of a `_tiles.Tile` that returns a `_tiles.Estimate`, is passed to `solve` like a name.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 from dbthermal.separation._completion.complete import complete
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change
 from dbthermal.separation._run import run
@@ -15,21 +17,16 @@ from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
-    from dbthermal.separation._baselines.bcp import BcpSettings
-    from dbthermal.separation._baselines.calibrated import CalibratedSettings
-    from dbthermal.separation._baselines.naive import NaiveSettings
-    from dbthermal.separation._baselines.pyrometry import RatioSettings
+    from dbthermal.separation._calibrated import CalibratedSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._streaming.stream import Stream
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
     "METHODS",
-    "BcpSettings",
     "CalibratedSettings",
     "DbvtSettings",
-    "NaiveSettings",
-    "RatioSettings",
+    "Method",
     "Stream",
     "SubspaceSettings",
     "complete",
@@ -44,11 +41,8 @@ __dir__ = __all__.copy
 
 # These are imported when they are first used: some compile.
 _LATER: Final = {
-    "BcpSettings": "_baselines.bcp",
-    "CalibratedSettings": "_baselines.calibrated",
+    "CalibratedSettings": "_calibrated",
     "DbvtSettings": "_dbvt",
-    "NaiveSettings": "_baselines.naive",
-    "RatioSettings": "_baselines.pyrometry",
     "Stream": "_streaming.stream",
     "SubspaceSettings": "_subspace.method",
 }

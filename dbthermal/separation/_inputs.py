@@ -41,20 +41,52 @@ _ROUNDED: Final = 1e-6
 
 @dataclass(frozen=True)
 class Method:
-    """A separation method: its functions of a tile, and its demands on the capture."""
+    """
+    A separation method: its functions of a tile, and its demands on the capture.
 
-    separate: Callable[..., Any]  # `Estimate` of a `Tile`, and of the settings where there are any
-    settings: type[Any] | None = None  # frozen dataclass; a field `batch` is a tile's pixels
+    Attributes
+    ----------
+    separate : callable
+        A `_tiles.Estimate` of a `_tiles.Tile`, and of the settings where the method has any.
+    settings : type, optional
+        Frozen dataclass of the method's options; a field `batch` is the pixels of a tile.
+    name : str
+        Name in errors and in the attribute `method` of a result.
+    minimum_frames : int
+        Shortest capture.
+    knows_emissivity : bool
+        The method needs known emissivities, and does not estimate them.
+    whole_image : bool
+        The method looks at a pixel's neighbours: a tile is the whole image.
+    every_frame : bool
+        The method does not solve a pixel that lacks a frame of the others.
+    even_times : bool
+        The method refuses frames at uneven times, by name.
+    survey : callable, optional
+        `Survey` of the same arguments, for pooling.
+    check_clock : callable, optional
+        Refuses times that are not of exposure.
+    any_bands : bool
+        The method takes more than two bands.
+    compiled : bool
+        The method is compiled, a pixel at a time.
+    not_estimated : tuple of str
+        Variables of the result that are NaN everywhere.
+    """
+
+    separate: Callable[..., Any]
+    settings: type[Any] | None = None
+    name: str = "outside"
     minimum_frames: int = 1
-    knows_emissivity: bool = False  # needs known emissivities, and does not estimate them
-    whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
-    every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
-    even_times: bool = False  # refuses frames at uneven times, by name
-    survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
-    check_clock: Callable[..., None] | None = None  # refuses times that are not of exposure
-    any_bands: bool = False  # takes more than two bands
-    compiled: bool = False  # compiled, a pixel at a time
-    not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
+    knows_emissivity: bool = False
+    whole_image: bool = False
+    every_frame: bool = False
+    even_times: bool = False
+    survey: Callable[..., Any] | None = None
+    check_clock: Callable[..., None] | None = None
+    any_bands: bool = False
+    compiled: bool = False
+    not_estimated: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from dbthermal import _numbers, store
 from dbthermal import _text as texts
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
-from dbthermal.separation._solve import get_method, require_seed, solve
+from dbthermal.separation._solve import METHODS, get_method, require_seed, solve
 from dbthermal.separation._tiles import largest
 from dbthermal.store._datasets import chunks_in_turn
 from dbthermal.store._integrity import last_sums
@@ -81,8 +81,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     response : Dataset
         As for `solve`.
     method : str
-        One of `METHODS` that takes each pixel alone: materials, and a shift of the reflections, are
-        of the whole image, see `scene.separate_capture`.
+        One of `METHODS`. Materials, and a shift of the reflections, are of the whole image, see
+        `scene.separate_capture`.
     settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
         As for `solve`, the same for all captures.
     executor : Executor, optional
@@ -100,7 +100,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     Raises
     ------
     TypeError, ValueError
-        As `solve` does; for a method of the whole image; if the memory is too small for a row, with
+        As `solve` does; if the memory is too small for a row, with
         the source's chunks; and if the parts at hand are of another run.
     ExceptionGroup
         Of several captures: what was raised, each with the name of its capture; all others are
@@ -121,8 +121,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     ...     store.open_dataset(f"{folder}/result.zarr").object_temperature.shape
     (200, 4, 6)
     """
-    if get_method(method).whole_image:
-        raise ValueError(f"Invalid method '{method}' for a run. Must take each pixel alone.")
+    if method not in METHODS:  # a process of an executor imports it by its name
+        raise ValueError(f"Unknown method {method!r} of a run. Must be one of {list(METHODS)}.")
     require_seed(seed)
     memory = _numbers.real_number("memory [byte]", memory, _numbers.POSITIVE)
     if not isinstance(provenance, Mapping):

@@ -24,25 +24,17 @@ from dbthermal.separation._pooling import pool as pooling
 from dbthermal.separation._tiles import Estimate, Mask, Material, Whole
 
 if TYPE_CHECKING:
-    from dbthermal import separation as one
+    from _typeshed import DataclassInstance  # settings of a method from outside
 
-    Settings: TypeAlias = (
-        one.SubspaceSettings
-        | one.CalibratedSettings
-        | one.DbvtSettings
-        | one.NaiveSettings
-        | one.RatioSettings
-        | one.BcpSettings
-    )
+    from dbthermal.separation import CalibratedSettings, DbvtSettings, SubspaceSettings
+
+    Settings: TypeAlias = SubspaceSettings | CalibratedSettings | DbvtSettings | DataclassInstance
 
 _MODULES: Final = {
-    "subspace": ("_subspace.method", "METHOD"),
-    "calibrated": ("_baselines.calibrated", "METHOD"),
-    "dbvt": ("_dbvt.method", "METHOD"),
-    "naive": ("_baselines.naive", "METHOD"),
-    "ratio": ("_baselines.pyrometry", "RATIO"),
-    "bcp": ("_baselines.bcp", "METHOD"),
-    "apparent": ("_baselines.pyrometry", "APPARENT"),
+    "subspace": "_subspace.method",
+    "calibrated": "_calibrated",
+    "dbvt": "_dbvt.method",
+    "apparent": "_apparent",
 }
 _COVARIANCE: Final = "emissivity_covariance"
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
@@ -53,7 +45,7 @@ METHODS: Final = tuple(_MODULES)
 def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by name
     corrected: xr.Dataset,
     response: xr.Dataset,
-    method: str = "subspace",
+    method: str | Method = "subspace",
     *,
     settings: "Settings | None" = None,
     emissivity: xr.DataArray | None = None,
@@ -89,10 +81,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture,
         unless the capture proves 1.4 times as much or more: then the capture's, with a warning.
         Without `noise` it is estimated from the capture. Attribute `noise_source` says which.
-    method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent"}
-        This project's separator; known emissivities; the paper's optimiser; and to compare with,
-        least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
-        own reading.
+    method : {"subspace", "calibrated", "dbvt", "apparent"} or Method
+        This project's separator; known emissivities; the paper's optimiser; the camera's reading;
+        or the record of a method that is not of this package, which all the checks here hold for.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
         "apparent" has none.
@@ -112,7 +103,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         From `alignment.reflection_shift`, for two cameras side by side: the reflection that all
         other bands, of the second camera, show at a pixel p is the one that the quietest band shows
         at :math:`p + d(p)`, `shift` (axis, y, x) [pixel]. The result is on the quietest band's
-        grid. For "subspace", "calibrated", "naive" and "dbvt".
+        grid. For "subspace", "calibrated", "dbvt", and a `Method` that works pixel by pixel.
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
@@ -187,11 +178,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     """
     require_workers(workers)
     require_seed(seed)
+    record = get_method(method)
     inputs = check(
         corrected,
         response,
-        get_method(method),
-        method,
+        record,
+        record.name,
         settings=settings,
         seed=seed,
         emissivity=emissivity,
@@ -289,14 +281,14 @@ def require_seed(seed: Any) -> None:
         raise ValueError(f"Invalid seed {seed!r}. Must be zero or positive, a whole number.")
 
 
-def get_method(name: str) -> Method:
+def get_method(name: str | Method) -> Method:
     """
     Record of a method: its functions, its settings, and its demands on the capture.
 
     Parameters
     ----------
-    name : str
-        One of `METHODS`.
+    name : str or Method
+        One of `METHODS`; a record of your code is returned as it is.
 
     Returns
     -------
@@ -315,11 +307,13 @@ def get_method(name: str) -> Method:
     >>> get_method("subspace").settings(background_drift=1.0)  # K
     SubspaceSettings(background_drift=1.0, device=None)
     """
+    if isinstance(name, Method):
+        return name
     if name not in METHODS:
-        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
-    module, record = _MODULES[name]
-    method: Method = getattr(importlib.import_module(f"dbthermal.separation.{module}"), record)
-    return method
+        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}, or a `Method`.")
+    module = importlib.import_module(f"dbthermal.separation.{_MODULES[name]}")
+    method: Method = module.METHOD
+    return replace(method, name=name)
 
 
 def _separate_all(

@@ -54,6 +54,11 @@ RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
 USELESS: Final = 1e6
 
+WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
+"""Variables that a method without standard deviations never estimates."""
+WITHOUT_BACKGROUND: Final = (*WITHOUT_STD, "background_temperature")
+"""Variables that a method which neglects the background never estimates."""
+
 
 @dataclass(frozen=True)
 class Pixels:
@@ -183,6 +188,30 @@ class Estimate(Pixels):
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+
+    @classmethod
+    def without_std(
+        cls,
+        tile: Tile,
+        object_temperature: Array,
+        status: Bits,
+        emissivity: Array | None = None,
+        background_temperature: Array | None = None,
+    ) -> "Estimate":
+        """Estimate without standard deviations; NaN for quantities that are not passed."""
+        missing = np.full_like(object_temperature, np.nan)
+        no_emissivity = np.full((len(tile.curves), status.size), np.nan)
+        return cls(
+            object_temperature=object_temperature,
+            object_temperature_std=missing,
+            background_temperature=(
+                missing if background_temperature is None else background_temperature
+            ),
+            background_temperature_std=missing,
+            emissivity=no_emissivity if emissivity is None else emissivity,
+            emissivity_std=no_emissivity,
+            status=status,
+        )
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""

@@ -84,7 +84,7 @@ class Rig:
         )
         noiseless = calibration.fit_response(counts)
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
-        slopes = [one.reference_slope for one in responses.curves(noiseless, self.bands)]
+        slopes = [curve.reference_slope for curve in responses.curves(noiseless, self.bands)]
         noise = xr.DataArray(np.array(self.noise) * slopes, {"band": list(self.bands)}, "band")
         return calibration.fit_response(counts, noise).assign_attrs(origin="simulated")
 
@@ -92,14 +92,14 @@ class Rig:
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
     """Counts of a blackbody in each band; a temperature may be one for each of the bands."""
     names = [str(name) for name in response["band"].values]
-    parts = [temperature] * len(names)
+    levels = [temperature] * len(names)
     if "band" in temperature.dims:
         places = schema.band_positions(temperature, names, str(temperature.name))
-        parts = [temperature.isel(band=place) for place in places]
+        levels = [temperature.isel(band=place) for place in places]
     curves = responses.curves(response, names)
     return [
-        curve.counts(require_range(part.values, curve, str(temperature.name)))
-        for part, curve in zip(parts, curves, strict=True)
+        curve.counts(require_range(level.values, curve, str(temperature.name)))
+        for level, curve in zip(levels, curves, strict=True)
     ]
 
 
@@ -184,7 +184,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
     gain = rig.gain_std * (rng.standard_normal(size) - vignette)
     offset = rig.offset_std * (rng.standard_normal(size) + 2.0 * vignette)
     mean_gain, mean_offset = (
-        np.mean(part, axis=(1, 2), where=~dead, keepdims=True) for part in (gain, offset)
+        np.mean(image, axis=(1, 2), where=~dead, keepdims=True) for image in (gain, offset)
     )
     dims = ("band", "y", "x")
     return xr.Dataset(

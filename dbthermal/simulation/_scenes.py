@@ -68,8 +68,8 @@ class Background:
             for pulse in range(self.count[1]):
                 start = rng.uniform(time[0], time[-1], pixels)
                 stop = start + rng.uniform(*self.duration, pixels)
-                inside = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
-                change += self.amplitude * (inside & (pulse < number))
+                active = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
+                change += self.amplitude * (active & (pulse < number))
         elif self.kind == "random walk":
             change = self._walk(time, pixels, rng)
         ramp = self.drift * (time - time[0]) / (time[-1] - time[0])
@@ -141,14 +141,14 @@ def scene(
     _numbers.real_numbers("emissivity", emissivity.values, (0.0, 1.0))
     height, width = object_temperature.shape[1:]
     values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
-    parts = {
+    films = {
         "object_temperature": object_temperature,
         "background_temperature": background_temperature,
         "emissivity": np.broadcast_to(values, (emissivity.shape[0], height, width)),
     }
     coords = {"time": ("time", time, {"units": "s"}), "y": np.arange(height), "x": np.arange(width)}
     return xr.Dataset(
-        schema.variables("separated", parts),
+        schema.variables("separated", films),
         {"band": emissivity["band"].values, **coords},
         {"origin": "simulated"},
     )
@@ -277,11 +277,11 @@ def walkers(
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
         half = 0.30  # of the body's width
-        seen = np.flatnonzero(np.abs(centre) < 1.0 + half)  # frames with the body in view
-        distance = columns - centre[seen, np.newaxis, np.newaxis]
+        visible = np.flatnonzero(np.abs(centre) < 1.0 + half)  # frames with the body in view
+        distance = columns - centre[visible, np.newaxis, np.newaxis]
         body = (distance / half) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
         head = (distance / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
-        cold[seen] = np.where(body | head, skin, cold[seen])
+        cold[visible] = np.where(body | head, skin, cold[visible])
     return scene(time, warm, cold, emissivity)
 
 

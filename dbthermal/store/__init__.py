@@ -2,7 +2,7 @@
 
 `save` and `open_dataset` keep datasets as zarr, `save_rows` one that is made row by row, and
 `join_parts` one whose rows several processes make;
-`save_numbers`, `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
+`save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
 record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
 `HeldFolder` is found wherever it is moved. No other package writes zarr.
 """
@@ -10,12 +10,9 @@ record from `provenance`. `Recording` grows in chunks and survives a kill or a p
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows
 from dbthermal.store._recording import HeldFolder, Recording, to_disk
 from dbthermal.store._results import (
-    Number,
     checksum,
     provenance,
-    read_numbers,
     save_figure,
-    save_numbers,
     save_text,
     save_video,
     whole,
@@ -23,16 +20,13 @@ from dbthermal.store._results import (
 
 __all__ = [
     "HeldFolder",
-    "Number",
     "Recording",
     "checksum",
     "join_parts",
     "open_dataset",
     "provenance",
-    "read_numbers",
     "save",
     "save_figure",
-    "save_numbers",
     "save_rows",
     "save_text",
     "save_video",

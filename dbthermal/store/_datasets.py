@@ -56,10 +56,10 @@ def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> 
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
-    most = height or sizes["y"]
-    rows = min(most, math.ceil(pixels / width))
+    tallest = height or sizes["y"]
+    rows = min(tallest, math.ceil(pixels / width))
     if height:
-        rows = next(count for count in range(rows, most + 1) if most % count == 0)
+        rows = next(count for count in range(rows, tallest + 1) if tallest % count == 0)
     return tuple((sizes | {"y": rows, "x": width}).values())
 
 
@@ -124,12 +124,12 @@ def save_rows(
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    rest = iter(parts)
-    if (first := next(rest, None)) is None:
+    following = iter(parts)
+    if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
     if height is not None and (type(height) is not int or height < 1):
         raise ValueError(f"Invalid height {height!r} of the rows. Must be a whole number from 1.")
-    _save(chain([first], rest), path, provenance, height or first.sizes.get("y"))
+    _save(chain([first], following), path, provenance, height or first.sizes.get("y"))
 
 
 def _save(
@@ -146,24 +146,29 @@ def _save(
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
-        for number, part in enumerate(parts):
-            _check(part)
+        for number, rows in enumerate(parts):
+            _check(rows)
             if number == 0:
-                first = part.isel(y=slice(0)) if "y" in part.dims else part
-                attrs = {**MARK, **part.attrs, **attrs}
-            _check_same(part, first, number)
+                first = rows.isel(y=slice(0)) if "y" in rows.dims else rows
+                attrs = {**MARK, **rows.attrs, **attrs}
+            _check_same(rows, first, number)
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
-            plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
+            plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {name: _chunks(one, height) for name, one in plain.variables.items()}
+            chunks = {name: _chunks(variable, height) for name, variable in plain.variables.items()}
             if number > 0:
-                rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
-                plain = plain.drop_vars(rest)
-            for name, one in plain.variables.items():
-                if one.chunks is not None:  # those of dask are written as those of the store
-                    plain[name] = one.chunk(dict(zip(one.dims, chunks[name], strict=True)))
+                constant = [
+                    name for name, variable in plain.variables.items() if "y" not in variable.dims
+                ]
+                plain = plain.drop_vars(constant)
+            for name, variable in plain.variables.items():
+                if variable.chunks is not None:  # those of dask are written as those of the store
+                    plain[name] = variable.chunk(
+                        dict(zip(variable.dims, chunks[name], strict=True))
+                    )
             encoding = {
-                name: {"chunks": one, "compressors": _COMPRESSORS} for name, one in chunks.items()
+                name: {"chunks": shape, "compressors": _COMPRESSORS}
+                for name, shape in chunks.items()
             }
             plain.to_zarr(
                 SummedStore(folder),
@@ -184,45 +189,52 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
     return context
 
 
-def _check(part: xr.Dataset) -> None:
+def _check(dataset: xr.Dataset) -> None:
     """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
-    every = {f"'{name}'": one.attrs for name, one in part.variables.items()}
-    for label, attrs in {"the dataset": part.attrs, **every}.items():
+    attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
+    for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
         for key, value in attrs.items():
             decoded = key in _DECODED or (key == "units" and " since " in str(value))
-            if (decoded and attrs is not part.attrs) or key == "coordinates":
-                found = f"Invalid attribute '{key}' of {label}"
-                raise ValueError(f"{found}. Must be left out: values are kept as they are.")
+            if (decoded and attrs is not dataset.attrs) or key == "coordinates":
+                label = f"Invalid attribute '{key}' of {owner}"
+                raise ValueError(f"{label}. Must be left out: values are kept as they are.")
             try:
-                json.dumps(value, default=lambda it: it.tolist())  # what NumPy made
+                json.dumps(value, default=lambda element: element.tolist())  # what NumPy made
             except (AttributeError, TypeError) as error:
-                found = f"Invalid attribute '{key}' of {label}, of type {type(value).__name__}"
-                raise TypeError(f"{found}. Must be text, numbers, or lists of these.") from error
-    for name, one in part.variables.items():
+                label = f"Invalid attribute '{key}' of {owner}, of type {type(value).__name__}"
+                raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
+    for name, variable in dataset.variables.items():
         if "/" in str(name):
             raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
-        text = one.dtype.kind == "O" and all(isinstance(it, str) for it in one.values.flat)
+        text = variable.dtype.kind == "O" and all(
+            isinstance(element, str) for element in variable.values.flat
+        )
         if not (
             text
-            or one.dtype.kind in "UTMm"
-            or (one.dtype.kind in "biuf" and one.dtype.itemsize <= 8)
+            or variable.dtype.kind in "UTMm"
+            or (variable.dtype.kind in "biuf" and variable.dtype.itemsize <= 8)
         ):
             rule = "Must be real numbers of at most 64 bits, truth values, or text"
-            raise TypeError(f"Invalid dtype {one.dtype} of '{name}'. {rule}.")
+            raise TypeError(f"Invalid dtype {variable.dtype} of '{name}'. {rule}.")
 
 
-def _check_same(part: xr.Dataset, first: xr.Dataset, number: int) -> None:
+def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
     """Refuse a part whose variables, units or coordinates are not those of the first."""
-    for name in part.variables.keys() ^ first.variables.keys():
+    for name in rows.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
-    for name, one in part.variables.items():
-        other = first.variables[name]
-        same = one.dims == other.dims and one.dtype == other.dtype
-        sizes = [[it.sizes[dim] for dim in it.dims if dim != "y"] for it in (one, other)]
-        same &= sizes[0] == sizes[1] and one.attrs.get("units") == other.attrs.get("units")
-        if same and name in part.coords and "y" not in one.dims:
-            same = bool(one.equals(other))  # type: ignore[no-untyped-call]
-        if not same:
+    for name, variable in rows.variables.items():
+        reference = first.variables[name]
+        equal = variable.dims == reference.dims and variable.dtype == reference.dtype
+        sizes = [
+            [candidate.sizes[dim] for dim in candidate.dims if dim != "y"]
+            for candidate in (variable, reference)
+        ]
+        equal &= sizes[0] == sizes[1] and variable.attrs.get("units") == reference.attrs.get(
+            "units"
+        )
+        if equal and name in rows.coords and "y" not in variable.dims:
+            equal = bool(variable.equals(reference))  # type: ignore[no-untyped-call]
+        if not equal:
             raise ValueError(
                 f"Invalid '{name}' of rows {number}. Must have the dims, type, unit and, of a "
                 "coordinate, the values of the first."
@@ -289,13 +301,13 @@ def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
 
 def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends, parts = valid_part(checked.attrs), []
+    ends, arrays = valid_part(checked.attrs), []
     names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
     for name in sorted(names):
-        part = _open(checked, leave=names - {name})
-        parts.append(part.isel({d: slice(end) for d, end in ends.items() if d in part.dims}))
+        array = _open(checked, leave=names - {name})
+        arrays.append(array.isel({d: slice(end) for d, end in ends.items() if d in array.dims}))
     # The attributes as checked, for they may have gone on since.
-    return xr.merge(parts, combine_attrs="override").assign_attrs(checked.attrs)
+    return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
 
 
 def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
@@ -323,21 +335,21 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    if not (folders := [texts.as_path(part) for part in parts]):
+    if not (folders := [texts.as_path(source) for source in parts]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
-    first, *rest = folders
+    first, *following = folders
     with whole(path, ".zarr") as folder:
         shutil.copytree(first, folder, copy_function=_link)
-        metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
-        along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
+        metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
+        along = {file: array for file, array in metadata.items() if "y" in array["dimension_names"]}
         sums = last_sums(folder)
-        for part in rest:
-            for one, array in along.items():
-                sums |= _added(part / one.parent.name, one.parent, array)
-        for one, array in along.items():
-            one.unlink()
-            one.write_text(json.dumps(array, indent=2))
-            sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
+        for source in following:
+            for file, array in along.items():
+                sums |= _added(source / file.parent.name, file.parent, array)
+        for file, array in along.items():
+            file.unlink()
+            file.write_text(json.dumps(array, indent=2))
+            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(file.read_bytes()):08x}"
         (folder / SUMS).unlink()
         (folder / SUMS).write_bytes(sums_file(sums))
 
@@ -350,26 +362,26 @@ def _link(source: str | Path, target: str | Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _added(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
+def _added(source: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
     """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
     place = array["dimension_names"].index("y")
     end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
-    own, sums = last_sums(part.parent), {}
+    part_sums, sums = last_sums(source.parent), {}
     if end % rows:
         raise ValueError(
-            f"Invalid part '{part.parent}' after {end} rows in chunks of {rows}. Must follow whole "
-            "chunks."
+            f"Invalid part '{source.parent}' after {end} rows in chunks of {rows}. Must follow "
+            "whole chunks."
         )
-    for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
-        numbers = list(chunk.relative_to(part / "c").parts)
+    for chunk in [chunk for chunk in (source / "c").rglob("*") if chunk.is_file()]:
+        numbers = list(chunk.relative_to(source / "c").parts)
         numbers[place] = str(int(numbers[place]) + end // rows)
         added = whole.joinpath("c", *numbers)
-        sums[added.relative_to(whole.parent).as_posix()] = own[
-            chunk.relative_to(part.parent).as_posix()
+        sums[added.relative_to(whole.parent).as_posix()] = part_sums[
+            chunk.relative_to(source.parent).as_posix()
         ]
         added.parent.mkdir(parents=True, exist_ok=True)
         _link(chunk, added)
-    array["shape"][place] += json.loads((part / "zarr.json").read_text())["shape"][place]
+    array["shape"][place] += json.loads((source / "zarr.json").read_text())["shape"][place]
     return sums
 
 

@@ -246,14 +246,14 @@ def _create(
 ) -> None:
     """Make an empty array with room for one chunk of frames, or for no row of the log."""
     whole, chunks = {**sizes, "log": 0}, {**sizes, "band": 1, "log": _LOG_CHUNK}
-    nothing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
+    missing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
     group.create_array(
         name,
         shape=tuple(whole[dim] for dim in variable.dims),
         chunks=tuple(chunks[dim] for dim in variable.dims),
         dtype=variable.dtype,
         compressors=_COMPRESSORS,
-        fill_value=nothing if fill is None else fill,
+        fill_value=missing if fill is None else fill,
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),
     )

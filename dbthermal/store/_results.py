@@ -1,4 +1,4 @@
-"""Results and their provenance: headline numbers as JSON, text, figures as PNG, films as MP4.
+"""Results and their provenance: text, figures as PNG, films as MP4.
 
 Each function that saves writes to a temporary place beside its path and renames at the end, so that
 a file under a result's name is always whole. Each result carries its provenance and nothing that
@@ -7,7 +7,6 @@ differs between two runs of the same code on the same input: no date, no host an
 
 import hashlib
 import json
-import math
 import os
 import platform
 import subprocess
@@ -24,12 +23,11 @@ import numpy.typing as npt
 
 from dbthermal import __version__, _numbers
 from dbthermal import _text as texts
-from dbthermal.store._integrity import AS_WRITTEN, SUMS, warn_unchecked
+from dbthermal.store._integrity import SUMS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Number = float | int | str | bool
 _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
 # FFmpeg's encoder of each codec of a film, with its options.
@@ -120,74 +118,6 @@ def _plain(name: str, value: object) -> Any:
     except (TypeError, ValueError) as error:
         rule = f"Must be JSON with finite numbers: {error}."
         raise type(error)(f"Invalid parameter {name!r} = {value!r}. {rule}") from error
-
-
-def save_numbers(
-    numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
-) -> None:
-    """Save headline numbers as strict JSON, with sorted names.
-
-    Parameters
-    ----------
-    numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
-        TypeError or ValueError for any other value.
-    path, provenance : str or Path, mapping
-        File ``*.json``; see `save`.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from dbthermal import store
-    >>> with TemporaryDirectory() as folder:
-    ...     path = f"{folder}/wall.json"
-    ...     store.save_numbers({"object_rmse_K": 0.21}, path, store.provenance({"frames": 2}))
-    ...     store.read_numbers(path)
-    {'object_rmse_K': 0.21}
-    """
-    content: dict[str, Any] = {
-        "numbers": {name: _number(name, value) for name, value in numbers.items()},
-        "provenance": dict(provenance),
-    }
-    content["sha256"] = _digest(content)
-    with whole(path, ".json") as part:
-        part.write_text(as_json(content, indent=2) + "\n", encoding="utf-8")
-
-
-def read_numbers(path: str | Path) -> dict[str, Number]:
-    """Read a file of `save_numbers`: name to value.
-
-    A file without a checksum, of dbthermal 0.1.0, is read with a warning.
-
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.json``.
-
-    Raises
-    ------
-    ValueError
-        With file and line, if it is not such a file, a name is listed twice, a number is not
-        finite, or it differs from what was written.
-    """
-    content = texts.parse_json(texts.read_text(path), str(path))
-    if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
-        raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
-    if content.keys() <= {"numbers", "provenance"}:
-        warn_unchecked(path, stacklevel=2)
-    elif content.pop("sha256", None) != _digest(content):
-        raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
-    for name, value in content["numbers"].items():
-        if not isinstance(value, bool | int | float | str):
-            raise ValueError(
-                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
-                "number, a string or a boolean."
-            )
-    return dict(content["numbers"])
-
-
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(as_json(content).encode()).hexdigest()
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
@@ -324,23 +254,13 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """
     path = check_place(path, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as beside:
-        part = Path(beside) / path.name
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
         yield part
         if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(Path(beside) / "replaced")
+            path.rename(Path(folder) / "replaced")
         part.replace(path)
 
 
 def as_json(content: Mapping[str, Any], indent: int | None = None) -> str:
     return json.dumps(content, allow_nan=False, ensure_ascii=True, indent=indent, sort_keys=True)
-
-
-def _number(name: str, value: object) -> Number:
-    """Headline value as a plain Python one."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    if not isinstance(plain, (bool, int, float, str)):
-        raise TypeError(f"Invalid {name!r} = {value!r}. Must be a number, a string or a boolean.")
-    if isinstance(plain, float) and not math.isfinite(plain):
-        raise ValueError(f"Invalid {name!r} = {value!r}. Must be finite.")
-    return plain

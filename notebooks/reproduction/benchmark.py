@@ -31,6 +31,7 @@ from matplotlib.figure import Figure
 from dbthermal import separation, simulation, store
 from dbthermal.figures import drawing
 from reproduction import default_call, experiments, paths, verify
+from reproduction import methods as outside
 from reproduction.default_call import processor_time
 
 RATE: Final = 10.0  # [Hz]
@@ -101,9 +102,10 @@ def solve(movie: xr.Dataset, method: str, settings: Any = None) -> xr.Dataset:
     """Separate by one thread."""
     names = [str(band) for band in movie["band"].values]
     known = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
-    emissivity = known if separation.get_method(method).knows_emissivity else None
+    record = outside.get_method(method)
+    emissivity = known if record.knows_emissivity else None
     options: dict[str, Any] = {"emissivity": emissivity, "settings": settings, "workers": 1}
-    return separation.solve(movie, response(tuple(names)), method, **options)
+    return separation.solve(movie, response(tuple(names)), record, **options)
 
 
 def seconds_of(method: str, sizes: dict[str, int]) -> float:
@@ -141,7 +143,7 @@ def series(method: str, name: str) -> Iterator[tuple[int, float]]:
     """Yield each size and its seconds, as long as the next one is expected to be short."""
     usual = USUAL | ({"pixels": FEW} if name == "frames" else {})
     last = (0, 0.0)
-    if name == "bands" and not separation.get_method(method).any_bands:
+    if name == "bands" and not outside.get_method(method).any_bands:
         return
     for size in SERIES[name]:
         if last[0] and last[1] * size / last[0] > LONGEST:
@@ -153,7 +155,7 @@ def series(method: str, name: str) -> Iterator[tuple[int, float]]:
 def all_series() -> Times:
     """Seconds of every method over pixels, frames and bands."""
     times: Times = {}
-    for method in separation.METHODS:
+    for method in outside.METHODS:
         solve(capture(**(USUAL | {"pixels": FEW})), method)  # imports and compiles
         for name in SERIES:
             times[method, name] = dict(series(method, name))
@@ -380,7 +382,7 @@ def shares(rates: dict[str, tuple[float, float]]) -> Iterator[tuple[str, ...]]:
 
 def methods(times: Times) -> str:
     """Table of the methods' times and exponents."""
-    usual = {method: a_pixel(times[method, "pixels"]) for method in separation.METHODS}
+    usual = {method: a_pixel(times[method, "pixels"]) for method in outside.METHODS}
     lines = [("method", "us a pixel", "over `subspace`", "pixels", "frames", "3, 4 bands over 2")]
     for method, seconds in usual.items():
         bands = times[method, "bands"]
@@ -414,7 +416,7 @@ def figure(times: Times) -> Figure:
     """Processor time of one thread over pixels and over frames, a line a method."""
     drawn, axes = drawing.canvas(1, 2, (9.0, 3.8))
     for axis, name in zip(axes[0], ("pixels", "frames"), strict=True):
-        for number, method in enumerate(separation.METHODS):
+        for number, method in enumerate(outside.METHODS):
             found = times[method, name]
             line = drawing.marked_line(number)
             axis.loglog(list(found), list(found.values()), label=method, **line)

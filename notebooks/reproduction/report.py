@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from dbthermal import store
 from dbthermal.reporting import Section, film_tag, image_tag, save_page, table
+from reproduction import numbers as headline
 from reproduction import paths
 
 _FIRST = "09_paper"  # paper against ours opens the page
@@ -24,7 +25,7 @@ def main() -> None:
     if not notebooks:
         raise SystemExit(f"No notebook in '{results}'. Must be made by: make reproduce")
     saved = {one.stem: one.with_suffix(".json") for one in notebooks}
-    numbers = {name: store.read_numbers(path) for name, path in saved.items() if path.exists()}
+    numbers = {name: headline.read(path) for name, path in saved.items() if path.exists()}
     sections = [Section(_title(one), list(_body(one))) for one in notebooks]
     target = results.parent / "report.html"
     save_page(

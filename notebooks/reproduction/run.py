@@ -20,11 +20,12 @@ import xarray as xr
 
 from dbthermal import readers, store
 from reproduction import cache, integrity, manifest, parameters, paths
+from reproduction import numbers as headline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Numbers = Mapping[str, store.Number | np.generic]
+Numbers = Mapping[str, headline.Number | np.generic]
 
 
 class Run:
@@ -108,7 +109,7 @@ class Run:
 
     def finish(self, numbers: Numbers) -> Numbers:
         """Save the headline numbers as ``<stem>.json``, and hand them back for display."""
-        store.save_numbers(numbers, self._path(".json"), self.provenance)
+        headline.save(numbers, self._path(".json"), self.provenance)
         return numbers
 
     def _path(self, ending: str) -> Path:

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from dbthermal import store
 from reproduction import accuracy, integrity, paper, paths
+from reproduction import numbers as headline
 
 TOLERANCE: Final = 0.01
 """Largest difference of two numbers, relative to the larger of the two [1]."""
@@ -22,7 +22,7 @@ TOLERANCE: Final = 0.01
 MARKS: Final = ("<!-- paper_vs_ours -->", "<!-- end of paper_vs_ours -->")
 """Marks around the comparison with the paper in docs/paper.md."""
 
-Numbers = dict[str, store.Number]
+Numbers = dict[str, headline.Number]
 
 
 def reference_path() -> Path:
@@ -49,7 +49,7 @@ def read_run(run: str) -> dict[str, Numbers]:
     numbers = {}
     for path in files:
         with integrity.reading(path):
-            numbers[paths.finished(run, path.stem)] = store.read_numbers(path)
+            numbers[paths.finished(run, path.stem)] = headline.read(path)
     return numbers
 
 

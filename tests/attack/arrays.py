@@ -13,10 +13,12 @@ from attack.damage import ALL, Rng, Table, cut, hurt, hurt_one
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import CALIBRATED, SLOPE, Array, Scene, blackbody, clock, pick, scene
 from dbthermal import calibration, separation
+from reproduction import methods
+from reproduction.methods.bcp import BcpSettings
 
 _FAST: Final[Mapping[str, Any]] = {
     "dbvt": separation.DbvtSettings(stages=2, stage_steps=2, steps=4),
-    "bcp": separation.BcpSettings(patch=3, window=5),
+    "bcp": BcpSettings(patch=3, window=5),
 }
 """Settings of the methods that take long, or whose windows are larger than the images here."""
 
@@ -82,7 +84,7 @@ def solving(
     more.setdefault("settings", _FAST.get(method))
     if method == "calibrated":
         more.setdefault("emissivity", made.known.isel(y=0, x=0, drop=True))
-    act = lambda: separation.solve(made.capture, used, method, **more)  # noqa: E731
+    act = lambda: separation.solve(made.capture, used, methods.get_method(method), **more)  # noqa: E731
     return Attack(f"{method}: {what}", act, lambda found: judge(made, found), names, good)
 
 

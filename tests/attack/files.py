@@ -19,6 +19,7 @@ from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick, scene
 from dbthermal import schema, store
 from dbthermal.instruments.recording import open_capture
+from reproduction import numbers
 
 
 @once
@@ -51,7 +52,7 @@ def originals() -> Path:
         recording.append_log({"log_time": np.arange(3.0), "log_value": np.ones(3)})
         recording.commit()
     recording.close(time=made["time"].values[:40])
-    store.save_numbers({"rmse_K": 0.21, "name": "a"}, folder / "numbers.json", {"seed": 1})
+    numbers.save({"rmse_K": 0.21, "name": "a"}, folder / "numbers.json", {"seed": 1})
     return folder
 
 
@@ -115,7 +116,7 @@ def kills(rng: Rng) -> Attack:
         if not target.exists():
             return Verdict("refused")
         if kind == "numbers.json":
-            value = store.read_numbers(target)["rmse_K"]
+            value = numbers.read(target)["rmse_K"]
             return wrong(f"{value}", where=value not in (0.21, 0.42))
         try:
             opened = store.open_dataset(target).load()
@@ -150,6 +151,6 @@ def _run(path: Path, place: int) -> None:
 
     sys.addaudithook(hook)
     if path.suffix == ".json":
-        store.save_numbers({"rmse_K": 0.42}, path, {})
+        numbers.save({"rmse_K": 0.42}, path, {})
     else:
         store.save(_made(2), path, store.provenance({}))

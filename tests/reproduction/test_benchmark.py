@@ -4,15 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from dbthermal import separation
-from reproduction import benchmark, default_call, paths, verify
+from reproduction import benchmark, default_call, methods, paths, verify
 from reproduction.benchmark import FRAME, Disk
 
 
 def times() -> benchmark.Times:
     """Times, linear over pixels and square over frames; each method takes twice the one before."""
     found: benchmark.Times = {}
-    for number, method in enumerate(separation.METHODS):
+    for number, method in enumerate(methods.METHODS):
         found[method, "pixels"] = {n: 2.0**number * n for n in (128, 512, 2048)}
         found[method, "frames"] = {n: 1e-6 * n**2 for n in (100, 1000)}
         found[method, "bands"] = {2: 1.0, 3: 1.5}

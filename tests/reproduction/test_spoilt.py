@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import store
-from reproduction import integrity, verify
+from reproduction import integrity, numbers, verify
 from reproduction.run import Run
 
 
@@ -26,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     frames = xr.Dataset({"counts": ("time", np.arange(50))})
     for name in ("01_calibration_response.zarr", "01_calibration/scene.zarr"):
         store.save(frames, folder / name, {})
-    store.save_numbers({"netd_K": 0.03}, folder / "01_calibration.json", {})
+    numbers.save({"netd_K": 0.03}, folder / "01_calibration.json", {})
     (folder / "01_calibration_scene.png").write_bytes(b"picture")
     monkeypatch.chdir(tmp_path)
     integrity.keep_sums("full", "01_calibration")

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dbthermal import store
-from reproduction import verify
+from reproduction import numbers, verify
 
 RECORD = {"parameters": {}, "versions": {}, "commit": "unknown", "inputs": {}}
 
@@ -18,8 +17,8 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "tests").mkdir()
     monkeypatch.chdir(tmp_path)
     results = tmp_path / "results" / "full"
-    store.save_numbers({"netd_K": 0.03, "missed": 0}, results / "01_calibration.json", RECORD)
-    store.save_numbers({"libraries": "embedded"}, results / "02_emissivity.json", RECORD)
+    numbers.save({"netd_K": 0.03, "missed": 0}, results / "01_calibration.json", RECORD)
+    numbers.save({"libraries": "embedded"}, results / "02_emissivity.json", RECORD)
     assert verify.main(["--record"]) == 0
     return tmp_path
 
@@ -33,7 +32,7 @@ def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize(
-    ("numbers", "code"),
+    ("measured", "code"),
     [
         ({"netd_K": 0.0302, "missed": 0}, 0),
         ({"netd_K": 0.0306, "missed": 0}, 1),
@@ -42,15 +41,15 @@ def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> N
         ({"netd_K": 0.03, "missed": 0, "new": 1.0}, 1),
     ],
 )
-def test_difference_is_found(project: Path, numbers: dict[str, float], code: int) -> None:
+def test_difference_is_found(project: Path, measured: dict[str, float], code: int) -> None:
     """Floats agree within 1 %; other, missing and additional numbers do not agree."""
-    store.save_numbers(numbers, project / "results/full/01_calibration.json", RECORD)
+    numbers.save(measured, project / "results/full/01_calibration.json", RECORD)
     assert verify.main([]) == code
 
 
 def test_other_kind_of_run_has_no_reference(project: Path) -> None:
     """A run with data is not compared with the numbers of one without."""
-    store.save_numbers({"libraries": "slum"}, project / "results/full/02_emissivity.json", RECORD)
+    numbers.save({"libraries": "slum"}, project / "results/full/02_emissivity.json", RECORD)
     assert verify.main([]) == 1
 
 

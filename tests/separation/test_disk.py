@@ -293,7 +293,7 @@ def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
     ("options", "message"),
     [
         ({"method": "nonsense"}, "Must"),
-        ({"method": "bcp"}, "Invalid method 'bcp' for a run. Must take each"),
+        ({"method": separation.Method(min)}, "Unknown method Method.* of a run. Must be one of"),
         ({"memory": 1e6}, "Invalid memory .* byte. Must be at least .* 64 frames.$"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Contract of all methods: properties of `solve` that hold for every registered method."""
+"""Contract of all methods: properties of `solve` for its names and for records from outside."""
 
 import functools
 from collections.abc import Callable
@@ -15,19 +15,21 @@ from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
+from reproduction import methods
+from reproduction.methods.bcp import BcpSettings
 
 RIG = Rig()
 TIME = np.arange(120) / 10.0  # s
 FILMS = ("object_temperature", "background_temperature")
 QUICK: dict[str, Any] = {
     "dbvt": separation.DbvtSettings(stages=2, stage_steps=2, steps=4),
-    "bcp": separation.BcpSettings(patch=3, window=5),
+    "bcp": BcpSettings(patch=3, window=5),
 }
 """Settings for a small image and little time, where the defaults are for more of both."""
 
 Pair = tuple[xr.Dataset, xr.Dataset]
 Plain = Callable[[str], xr.Dataset]
-every_method = pytest.mark.parametrize("method", separation.METHODS)
+every_method = pytest.mark.parametrize("method", methods.METHODS)
 
 
 GLASS = emissivity_of(0.86, 0.72)
@@ -55,9 +57,9 @@ def pair() -> Pair:
 def solve(capture: xr.Dataset, response: xr.Dataset, method: str, **options: Any) -> xr.Dataset:
     """Separate with small settings, and with the emissivities if the method must know them."""
     options.setdefault("settings", QUICK.get(method))
-    if separation.get_method(method).knows_emissivity:
+    if methods.get_method(method).knows_emissivity:
         options.setdefault("emissivity", GLASS)
-    return separation.solve(capture, response, method, **options)
+    return separation.solve(capture, response, methods.get_method(method), **options)
 
 
 def scaled(capture: xr.Dataset, factor: float) -> xr.Dataset:
@@ -104,7 +106,7 @@ def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
     first=st.floats(0.05, 0.97),
     second=st.floats(0.05, 0.97),
     loudness=st.floats(0.1, 10.0),
-    method=st.sampled_from(separation.METHODS),
+    method=st.sampled_from(methods.METHODS),
 )
 def test_good_means_complete(
     seed: int, frames: int, first: float, second: float, loudness: float, method: str
@@ -112,7 +114,7 @@ def test_good_means_complete(
     """Pixels with a status of 0 are finite in every quantity that the method estimates."""
     rng, rig = np.random.default_rng(seed), Rig(noise=(0.03 * loudness, 0.35 * loudness))
     known = emissivity_of(first, second)
-    knows = separation.get_method(method).knows_emissivity
+    knows = methods.get_method(method).knows_emissivity
     if knows and first == second:
         return
     scene = simulation.independent_pixels(
@@ -152,7 +154,7 @@ def test_lost_frames(pair: Pair, plain: Plain, method: str, gap: str) -> None:
     lossy = capture.isel(time=kept) if gap == "times" else capture.copy(deep=True)
     if gap == "nan":
         lossy["counts"].values[1, ~kept] = np.nan
-    if separation.get_method(method).even_times:
+    if methods.get_method(method).even_times:
         with pytest.raises(ValueError, match=rf"Invalid interval .* method '{method}'. Must be"):
             solve(lossy, response, method)
         return
@@ -178,7 +180,7 @@ def test_one_lost_sample_costs_its_frame_alone(pair: Pair, plain: Plain, method:
 @every_method
 def test_pixel_that_lacks_frames(pair: Pair, method: str) -> None:
     """A pixel with missing frames is solved, or flagged by methods that need common frames."""
-    record, spoilt = separation.get_method(method), pair[0].copy(deep=True)
+    record, spoilt = methods.get_method(method), pair[0].copy(deep=True)
     spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
     result = solve(spoilt, pair[1], method)
     lacking = result["status"].values & Status.INVALID_SAMPLES != 0
@@ -217,7 +219,7 @@ def test_bad_pixel_is_flagged_and_alone(pair: Pair, plain: Plain, method: str, b
     assert not np.any(result["status"].values[others] & bit)
     found, expected = (each["object_temperature"].values[:, others] for each in (result, whole))
     assert np.isfinite(found).any()
-    record = separation.get_method(method)
+    record = methods.get_method(method)
     if not (record.whole_image or hasattr(record.settings, "starts")):
         np.testing.assert_array_equal(found, expected)
 
@@ -257,10 +259,10 @@ def test_third_band_is_taken_or_refused(method: str) -> None:
     rig = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
     emissivity = emissivity_of(0.86, 0.72, 0.88, bands=rig.bands)
     capture, response = capture_of((4, 6), TIME, emissivity, rig), rig.response()
-    record = separation.get_method(method)
+    record = methods.get_method(method)
     if record.any_bands:
         known = emissivity if record.knows_emissivity else None
-        result = separation.solve(capture, response, method, emissivity=known)
+        result = separation.solve(capture, response, methods.get_method(method), emissivity=known)
         assert bool(result["object_temperature"].notnull().any())
         return
     message = rf"Invalid bands \['8-14', '9.5', '10.6'\] for method '{method}'. Must be exactly two"
@@ -271,7 +273,7 @@ def test_third_band_is_taken_or_refused(method: str) -> None:
 @every_method
 def test_demands_are_said(pair: Pair, method: str) -> None:
     """Unmet demands of a method raise an error that names them."""
-    record = separation.get_method(method)
+    record = methods.get_method(method)
     if record.minimum_frames > 1:
         frames = record.minimum_frames - 1
         message = f"Invalid capture of {frames} frames for method '{method}'. Must have at least"

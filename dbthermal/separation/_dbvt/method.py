@@ -20,12 +20,12 @@ import numpy.typing as npt
 
 from dbthermal import mixing
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import WITHOUT_STD, calibrated
+from dbthermal.separation import _calibrated as calibrated
 from dbthermal.separation._dbvt import DbvtSettings, objective
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
-from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
+from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5

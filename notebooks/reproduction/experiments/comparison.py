@@ -9,6 +9,7 @@ import xarray as xr
 
 from dbthermal import separation, simulation
 from dbthermal.simulation import Rig
+from reproduction import methods
 
 MOVING: Final = 0.5
 """Standard deviation of the background from which a pixel takes part [K]."""
@@ -48,7 +49,7 @@ def compare(
     """Errors of several methods on one simulated scene: a heated plate, people walking by.
 
     The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
-    variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
+    variants (label -> `method`, of `methods.METHODS`, and fields of its settings) are scored on the
     same number of pixels, drawn from those in which the reflection varies by more than `MOVING`;
     methods that treat each pixel alone get these only, the others all pixels of some frames
     (`EVERY`), with noise of their own. The noise of the two bands [K] is known to all, the
@@ -65,7 +66,7 @@ def compare(
     chosen = _choose(scene, pixels, rng)
     truth = _strip(scene, chosen)
     frames = scene.isel(time=slice(None, None, EVERY))
-    imaging = [separation.get_method(one["method"]).whole_image for one in variants.values()]
+    imaging = [methods.get_method(one["method"]).whole_image for one in variants.values()]
     strip = simulation.observe(truth, response, rng)
     images = simulation.observe(frames, response, rng) if any(imaging) else strip
     rows = []
@@ -146,7 +147,7 @@ def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
 def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
     """Arguments of `solve`, with the true emissivities for a method that must know them."""
     known = arguments(options)
-    if separation.get_method(options["method"]).knows_emissivity:
+    if methods.get_method(options["method"]).knows_emissivity:
         known["emissivity"] = scene["emissivity"]
     return known
 
@@ -154,11 +155,14 @@ def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
 def arguments(variant: Options) -> dict[str, Any]:
     """Arguments of `separation.solve` for a variant, with the settings' fields in their record.
 
-    The variant has `method`, fields of its settings, and other arguments of `solve`, side by side.
+    The variant has the name of its `method`, fields of its settings, and other arguments of
+    `solve`, side by side.
     """
-    kind = separation.get_method(variant["method"]).settings
+    method = methods.get_method(variant["method"])
+    kind = method.settings
     names = set() if kind is None else {field.name for field in fields(kind)} & variant.keys()
     rest = {name: value for name, value in variant.items() if name not in names}
+    rest["method"] = method
     if kind is not None and names:
         rest["settings"] = kind(**{name: variant[name] for name in names})
     return rest

@@ -10,7 +10,7 @@ from scipy.constants import zero_Celsius
 from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
 from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
-from reproduction import twins
+from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.experiments.stress import INTERVAL
@@ -201,9 +201,9 @@ def at_thermocouple(
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
-    `method` of `separation.solve` and its arguments, with the shift of the reflections where it
-    takes one; the default method without arguments is what has been separated. A method that looks
-    at whole images, each by itself, gets the first of `EVERY` frames.
+    `method` of `methods.METHODS` and arguments of `solve`, with the shift of the reflections
+    where it takes one; the default method without arguments is what has been separated. A method
+    that looks at whole images, each by itself, gets the first of `EVERY` frames.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def _mean(
             nearby = options["reflection_shift"] = options["reflection_shift"].isel(around)
             if not bool(nearby["shift"].notnull().any()):
                 return (corrected["time"].astype(np.float64) * np.nan).assign_attrs(units="K")
-    if separation.get_method(variant["method"]).whole_image:
+    if methods.get_method(variant["method"]).whole_image:
         seen = seen.isel(time=slice(None, None, EVERY))
     estimates = separation.solve(seen, response, **options)["object_temperature"]
     bead = {dim: corrected[dim][part] for dim, part in square.items()}

@@ -1,5 +1,6 @@
-"""Baselines: exact under their own assumptions, and undefined or wrong beyond them."""
+"""Methods to compare with: exact under their assumptions, and undefined or wrong beyond them."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,11 @@ from numpy.typing import NDArray
 
 from dbthermal import bands, mixing, planck, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal.separation import BcpSettings, NaiveSettings, RatioSettings
 from dbthermal.simulation import Background, Rig
+from reproduction import methods
+from reproduction.methods.bcp import BcpSettings
+from reproduction.methods.naive import NaiveSettings
+from reproduction.methods.ratio import RatioSettings
 
 Floats = NDArray[np.float64]
 RIG = Rig()
@@ -42,8 +46,9 @@ def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> xr.Data
 
 
 def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any) -> xr.Dataset:
-    """Separate by a baseline."""
-    return separation.solve(capture, RESPONSE, method, settings=settings, **options)
+    """Separate by a method to compare with."""
+    record = methods.get_method(method)
+    return separation.solve(capture, RESPONSE, record, settings=settings, **options)
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +113,30 @@ def test_settings_outside_their_range(settings: Any, options: dict[str, Any], me
         settings(**options)
 
 
+@pytest.mark.parametrize(
+    ("settings", "options", "message"),
+    [
+        (BcpSettings, {"patch": "15"}, "patch '15' of method"),
+        (BcpSettings, {"patch": 15.0}, "whole number"),
+        (NaiveSettings, {"starts": 2.5}, "starts 2.5 of method"),
+        (RatioSettings, {"order": 2.5}, "order 2.5 of method"),
+    ],
+)
+def test_settings_of_another_type(settings: Any, options: dict[str, Any], message: str) -> None:
+    """Each is refused with its name and its value."""
+    with pytest.raises(TypeError, match=message):
+        settings(**options)
+
+
+def test_a_record_has_its_name_in_the_result() -> None:
+    """An outside method is named in the result; without a name, "outside"."""
+    apparent = separation.get_method("apparent")
+    for record, name in ((apparent, "apparent"), (replace(apparent, name="mine"), "mine")):
+        result = separation.solve(gray_body("wide", 1.0), RESPONSE, record)
+        assert result.attrs["method"] == name
+    assert separation.Method(apparent.separate).name == "outside"
+
+
 def gray_body(kind: str, share: float) -> xr.Dataset:
     """A gray body in a room without emission, for either kind of radiance."""
     apparent = []
@@ -162,7 +191,7 @@ def test_ratio_refuses_a_stationary_pair() -> None:
     names = ("8-14", "10.6")
     capture = capture_of([20000.0 + WARM, 20000.0 + WARM], names)
     with pytest.raises(ValueError, match=r"'8-14', '10.6' .* stationary near 30\d\.\d K"):
-        separation.solve(capture, Rig(bands=names).response(), "ratio")
+        separation.solve(capture, Rig(bands=names).response(), methods.get_method("ratio"))
 
 
 def test_ratio_out_of_range_is_undefined() -> None:

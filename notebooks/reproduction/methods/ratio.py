@@ -1,7 +1,6 @@
-r"""Pyrometry, which neglects the background: apparent temperature, and dual-wavelength ratio.
+r"""Dual-wavelength pyrometry: the temperature of a gray body from the ratio of two radiances.
 
-The apparent temperature is that of a blackbody in the quieter band, as a camera shows it. The ratio
-of two radiances gives the temperature of a gray body,
+The background is neglected,
 
 .. math:: R = \frac{L_1}{L_2} = \frac{e_1 B_1(T)}{e_2 B_2(T)} = \frac{B_1(T)}{B_2(T)}
           \quad\text{if}\quad e_1 = e_2 \qquad (1)
@@ -24,24 +23,14 @@ from dbthermal import _smooth as smooth
 from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import WITHOUT_BACKGROUND, point_estimate
-from dbthermal.separation._inputs import Method, check_fields, require
+from dbthermal.separation import Method
+from dbthermal.separation._inputs import check_fields, require
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Tile
+from dbthermal.separation._tiles import WITHOUT_BACKGROUND, Array, Estimate, Tile
 
 KINDS: Final = ("wide", "narrow")
 # Knots of the table of ln R, in which 1/T is nearly straight: the spline is within 1 uK.
 _KNOTS: Final = 256
-
-
-def apparent(tile: Tile) -> Estimate:
-    """Apparent temperature in the quieter band; NaN where no temperature gives the signal."""
-    temperature = tile.temperature(0, tile.signals[0])
-    missing = np.any(np.isnan(temperature), axis=0)
-    status = status_bits({Status.OUTSIDE_RESPONSE: missing})
-    return point_estimate(tile, temperature, status).check_range(
-        tile.curves[0], not_estimated=APPARENT.not_estimated
-    )
 
 
 @dataclass(frozen=True)
@@ -74,7 +63,7 @@ class RatioSettings:
         require(self, "ratio", "order", self.order is None or self.order >= 1, "be at least 1")
 
 
-def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
+def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     """Temperature of a gray body before a background that emits nothing.
 
     NaN where no temperature in the response's range has the ratio. The emissivity is the mean over
@@ -95,7 +84,7 @@ def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
     odd = (mean <= 0) | (mean >= 1)
     bits = {Status.OUTSIDE_RESPONSE: frames < len(valid), Status.NONPHYSICAL_EMISSIVITY: odd}
     status = status_bits(bits)
-    return point_estimate(tile, temperature, status, np.stack([mean, mean])).check_range(
+    return Estimate.without_std(tile, temperature, status, np.stack([mean, mean])).check_range(
         first, not_estimated=WITHOUT_BACKGROUND
     )
 
@@ -140,7 +129,5 @@ def _inverse(curves: tuple[Curve, Curve], kind: str) -> Callable[[Array], Array]
     return lambda value: np.asarray(1.0 / spline(value))
 
 
-APPARENT: Final = Method(apparent, not_estimated=(*WITHOUT_BACKGROUND, "emissivity"))
-"""The camera's own reading, for `solve`."""
-RATIO: Final = Method(ratio, settings=RatioSettings, not_estimated=WITHOUT_BACKGROUND)
+METHOD: Final = Method(separate, RatioSettings, "ratio", not_estimated=WITHOUT_BACKGROUND)
 """Dual-wavelength pyrometry, for `solve`."""

@@ -21,10 +21,10 @@ from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method, check_fields, require
+from dbthermal.separation import Method
+from dbthermal.separation._inputs import check_fields, require
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Mask, Pixels, Tile
+from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Pixels, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
@@ -92,7 +92,7 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
-    estimate = point_estimate(tile, temperature, status, emissivity, background)
+    estimate = Estimate.without_std(tile, temperature, status, emissivity, background)
     return estimate.undefine(lost, lost, lost).check_range(
         tile.curves[0], not_estimated=WITHOUT_STD
     )
@@ -196,5 +196,5 @@ def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
     )
 
 
-METHOD: Final = Method(separate, settings=NaiveSettings, not_estimated=WITHOUT_STD)
+METHOD: Final = Method(separate, NaiveSettings, "naive", not_estimated=WITHOUT_STD)
 """Least squares without a prior, for `solve`."""

@@ -15,7 +15,7 @@ With I the linearised signal of the quieter band, linear in radiance, and A the 
 3. :math:`I' = (I - A) / \max(t, t_0) + A` is the object's signal; its temperature follows from the
    response.
 
-Clipping is part of the algorithm, as of the dark channel prior; nothing else in this package clips.
+Clipping is part of the algorithm, as of the dark channel prior; nothing in the library clips.
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
 from dbthermal.response import require_range
-from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method, check_fields, require
-from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
+from dbthermal.separation import Method
+from dbthermal.separation._inputs import check_fields, require
+from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     temperature = np.where(_usable(tile, 0), tile.temperature(0, object_signal), np.nan)
     background = np.tile(tile.temperature(0, reflected)[:, np.newaxis], temperature.shape[1])
     status = np.zeros(temperature.shape[1], dtype=np.uint32)
-    estimate = point_estimate(tile, temperature, status, transmissions, background)
+    estimate = Estimate.without_std(tile, temperature, status, transmissions, background)
     return estimate.check_range(tile.curves[0], not_estimated=WITHOUT_STD)
 
 
@@ -149,5 +149,5 @@ def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Ar
     return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
-METHOD: Final = Method(separate, settings=BcpSettings, whole_image=True, not_estimated=WITHOUT_STD)
+METHOD: Final = Method(separate, BcpSettings, "bcp", whole_image=True, not_estimated=WITHOUT_STD)
 """The reconstructed blackbody channel prior, for `solve`."""

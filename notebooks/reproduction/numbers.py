@@ -1,0 +1,92 @@
+"""Headline numbers of a notebook: strict JSON with their provenance and a checksum."""
+
+import hashlib
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dbthermal import _text as texts
+from dbthermal import store
+from dbthermal.store._integrity import AS_WRITTEN, warn_unchecked
+from dbthermal.store._results import as_json
+
+Number = float | int | str | bool
+
+
+def save(
+    numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
+) -> None:
+    """Save headline numbers as strict JSON, with sorted names.
+
+    Parameters
+    ----------
+    numbers : mapping
+        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
+        TypeError or ValueError for any other value.
+    path, provenance : str or Path, mapping
+        File ``*.json``; see `store.save`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     save({"object_rmse_K": 0.21}, f"{folder}/wall.json", {"parameters": {"frames": 2}})
+    ...     read(f"{folder}/wall.json")
+    {'object_rmse_K': 0.21}
+    """
+    content: dict[str, Any] = {
+        "numbers": {name: _number(name, value) for name, value in numbers.items()},
+        "provenance": dict(provenance),
+    }
+    content["sha256"] = _digest(content)
+    with store.whole(path, ".json") as part:
+        part.write_text(as_json(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read(path: str | Path) -> dict[str, Number]:
+    """Read a file of `save`: name to value.
+
+    A file without a checksum, of dbthermal 0.1.0, is read with a warning.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.json``.
+
+    Raises
+    ------
+    ValueError
+        With file and line, if it is not such a file, a name is listed twice, a number is not
+        finite, or it differs from what was written.
+    """
+    content = texts.parse_json(texts.read_text(path), str(path))
+    if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
+        raise ValueError(f"No 'numbers' in '{path}'. Must be a file that numbers.save wrote.")
+    if content.keys() <= {"numbers", "provenance"}:
+        warn_unchecked(path, stacklevel=2)
+    elif content.pop("sha256", None) != _digest(content):
+        raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
+    for name, value in content["numbers"].items():
+        if not isinstance(value, bool | int | float | str):
+            raise ValueError(
+                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
+                "number, a string or a boolean."
+            )
+    return dict(content["numbers"])
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(as_json(content).encode()).hexdigest()
+
+
+def _number(name: str, value: object) -> Number:
+    """Headline value as a plain Python one."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(plain, (bool, int, float, str)):
+        raise TypeError(f"Invalid {name!r} = {value!r}. Must be a number, a string or a boolean.")
+    if isinstance(plain, float) and not math.isfinite(plain):
+        raise ValueError(f"Invalid {name!r} = {value!r}. Must be finite.")
+    return plain
