@@ -40,7 +40,14 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
 
 @inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    """Variance of the slope by a background that walks, and its bound; `tensors._walk`."""
+    r"""
+    Variance [1] of the slope by a background that walks, and its upper bound.
+
+    With the unit coefficients :math:`\xi_j` of the object's curve of norm :math:`|u|`, and the
+    energy A of a random walk in the residual's spectrum, the larger of those of two octaves; for
+    the bound, at the upper end of their 95 % interval,
+    :math:`\mathrm{var}(e_1) = A / |u|^2 \sum_j \xi_j^2 / j^2`.
+    """
     degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
     for t in range(kept.size):
@@ -66,7 +73,12 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 @inlined
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
-    """Variance of the slope by a linear drift, as `tensors._linear`."""
+    r"""
+    Variance [1] of the slope by a linear drift of size d, seen with a variance v.
+
+    :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
+    Weighted twice, for a large drift takes the weight from the frames that tell it best.
+    """
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
     slope, level, _ = regression.moments(emitted, drift, weights)
@@ -300,7 +312,17 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
 
 @inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
-    """Autocorrelation, delay of the bands, and whether the residual is noise; see `tensors`."""
+    r"""
+    Autocorrelation, delay of the bands, and whether the residual is noise.
+
+    A band that is a frame late, or early, leaves the difference between two frames in the null
+    residual r, which is held against the first band's differences, a matched filter,
+    :math:`\sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2`; the last term takes out that r
+    holds the noise of :math:`z_1(t)`. A delay that changes sign, as after an interpolation between
+    frames, is seen in the energy of r in the frames at a change, over that of the noise: a
+    chi-square variable of few degrees of freedom, whose cube root is nearly normal (Wilson,
+    Hilferty 1931, doi:10.1073/pnas.17.12.684). The delay is the largest score in magnitude.
+    """
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
@@ -338,7 +360,14 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 
 @inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
-    """As `tensors._unexplained`."""
+    r"""
+    Is the null residual r [K] no white noise in some part of time?
+
+    Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
+    object that the smooth functions do not follow. Or blocks differ in its correlation with the
+    rapid changes, which have not one ratio: :math:`\sum_b (\sum_t r h)^2 / \sigma^2 \sum_t h^2`,
+    with :math:`h = z_1 - r \, w_1 s_1^2 / \sigma^2` of independent noise, is a chi-square variable.
+    """
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
     sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
     products, squares = work.kernel, work.mean
