@@ -361,7 +361,7 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 @inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     r"""
-    Is the null residual r [K] no white noise in some part of time?
+    Say whether the null residual r [K] is no white noise in some part of time.
 
     Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
     object that the smooth functions do not follow. Or blocks differ in its correlation with the
