@@ -19,6 +19,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
+from dbthermal.separation._frames import bridge
 from dbthermal.separation._inputs import Method, check
 from dbthermal.separation._solve import require_workers, solve
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
@@ -347,38 +348,16 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
         y, x = np.nonzero((gaps > 0) & (gaps < time.size))
         place = (np.flatnonzero(frames)[:, np.newaxis], rows.start + y, x)
         curves, stds = (np.ascontiguousarray(film[place].T, dtype=np.float64) for film in films)
-        _bridge(curves, stds, time)
-        films[0][place], films[1][place] = curves.T, stds.T
+        variances = stds**2
+        _bridge(curves, variances, time)
+        films[0][place], films[1][place] = curves.T, np.sqrt(variances).T
         number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
     return number
 
 
 @compiled
-def _bridge(values: Array, stds: Array, time: Array) -> None:
+def _bridge(values: Array, variances: Array, time: Array) -> None:
     """Bridge the gaps of curves (curve, time) with a number somewhere, in place."""
-    for value, std in zip(values, stds):  # noqa: B905 - not compiled with strict
-        last, rate, steps = -1, 0.0, 0
-        for t in range(time.size):
-            if not np.isnan(value[t]):
-                if last >= 0:
-                    rate += (value[t] - value[last]) ** 2 / (time[t] - time[last])
-                    steps += 1
-                last = t
-        rate, left = rate / max(steps, 1), -1
-        for right in range(time.size + 1):
-            if right < time.size and np.isnan(value[right]):
-                continue
-            for t in range(left + 1, right):
-                if left < 0 or right == time.size:  # an end: as the nearest frame
-                    near = right if left < 0 else left
-                    value[t], walk = value[near], abs(time[t] - time[near])
-                    variance = std[near] ** 2
-                else:
-                    since, whole = time[t] - time[left], time[right] - time[left]
-                    share = since / whole
-                    value[t] = value[left] + share * (value[right] - value[left])
-                    variance = std[left] ** 2 + share * (std[right] ** 2 - std[left] ** 2)
-                    walk = since * (time[right] - time[t]) / whole
-                std[t] = np.sqrt(variance + rate * walk)
-            left = right
+    for p in range(len(values)):
+        bridge(values[p], variances[p], time)

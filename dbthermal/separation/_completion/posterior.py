@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dbthermal._compiled import compiled
-from dbthermal.separation import _known_emissivity as known_emissivity
+from dbthermal.separation import _frames as frames
 from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
@@ -222,7 +222,7 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     share = np.empty((pixels, points))
     mean, spread = np.empty((pixels, 2, size)), np.empty((pixels, 2, size, size))
     _moments(
-        known_emissivity.response_tables(tile),
+        frames.response_tables(tile),
         np.log(prior.weight),
         _Given(
             *(
@@ -379,7 +379,7 @@ def _quadratic(
         for i in range(4):
             signal[5 * g + i] = c + (nodes[i] - c) / work.place[g, 0]
     spare = work.signals[3], work.signals[4]
-    known_emissivity.other_band(first, other, signal, emitted, rate, *spare)
+    frames.other_band(first, other, signal, emitted, rate, *spare)
     for g in range(len(work.place)):
         share, e, c = 1.0 / work.place[g, 0], work.place[g, 1 + band], work.place[g, -1]
         level, by_level = emitted[5 * g + 4], (1.0 - e) * rate[5 * g + 4]
@@ -522,7 +522,7 @@ def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Ar
     """
     vague = np.full_like(static.level, _VAGUE)
     bins_alone = replace(tile, signals=means.signals)
-    free = known_emissivity.solve(bins_alone, static.point, static.level, vague)
+    free = frames.solve(bins_alone, static.point, static.level, vague)
     observed, noise = free.background, free.background_variance / np.maximum(means.frames, 1.0)
     used = means.frames > 0
     count = np.maximum(used.sum(axis=0), 2)

@@ -11,8 +11,9 @@ from dbthermal import _numbers, schema
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-from dbthermal.separation import _known_emissivity as known_emissivity
+from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
+from dbthermal.separation import _windows as windows
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
 from dbthermal.separation._completion.posterior import Level, Moments
@@ -204,8 +205,8 @@ def solve(
     """
     with np.errstate(all="ignore"):
         static_parts = (static.point, static.level, variance, static.covariance)
-        found = known_emissivity.solve(tile, *static_parts, apart=scene.apart)
-        signal, left = known_emissivity.smooth(found.signal, found.white, valid, tile.time)
+        found = frames.solve(tile, *static_parts, apart=scene.apart)
+        signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
         background, spread = found.background, found.background_variance
         if (some := np.isfinite(measured[0]).any(axis=0)).any():
             part = (tile.select_pixels(some), static.select_pixels(some), measured[..., some])
@@ -216,7 +217,7 @@ def solve(
         values: Values = {}
         films = (signal, left + found.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
-            pair = known_emissivity.temperatures(tile, np.where(valid, mean, np.nan), deviation)
+            pair = frames.temperatures(tile, np.where(valid, mean, np.nan), deviation)
             values[name], values[f"{name}_std"] = pair
         pairs = ((static.emissivity, static.emissivity_covariance), static.reflection_ratio())
         values["emissivity_covariance"] = static.emissivity_covariance
