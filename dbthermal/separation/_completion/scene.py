@@ -14,6 +14,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _windows as windows
+from dbthermal.separation._completion import curve as curves
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
 from dbthermal.separation._completion.posterior import Level, Moments
@@ -181,7 +182,7 @@ def solve_statics(
     """
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
-        means = posterior.bins(tile, valid)
+        means = curves.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
         stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
@@ -189,7 +190,7 @@ def solve_statics(
         own = 1.0 if scene.apart else prior.mean[:, :1]
         bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / own) ** 2, 1))
         bend = bend * level.fluctuation
-        data = posterior.curve(tile, means, scene.offset, stray**2, bend)
+        data = curves.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
     return static, np.maximum(variance, _LEAST[1] ** 2)
