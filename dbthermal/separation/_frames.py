@@ -13,9 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dbthermal import mixing
 from dbthermal._compiled import compiled
 from dbthermal.separation._subspace import kernels
-from dbthermal.separation._tiles import Array, Tile
+from dbthermal.separation._tiles import Array, Mask, Tile
 
 # Newton's steps, at most, and the length of the last one in a pixel, which leaves its square over
 # a thousand kelvin [K].
@@ -276,6 +277,48 @@ def _add_through(sensitivity: Array, covariance: Array, total: Array, result: Ar
                 total[t] += sensitivity[i, t] * covariance[i, j] * sensitivity[j, t]
     for t in range(total.size):
         result[t] += max(total[t], 0.0)
+
+
+def background(
+    tile: Tile,
+    measured: Array,
+    valid: Mask,
+    emissivity: Array,
+    level: Array,
+    fluctuation: Array,
+    covariance: Array,
+) -> tuple[Array, Array]:
+    r"""Background behind a measured object (time, pixel) [K], and its variance [K^2].
+
+    What the object's temperatures and deviations (2, time, pixel) [K] leave of the first band,
+
+    .. math:: r_0 = \frac{z_1 - e_1 s}{1 - e_1}, \quad
+              r = c + g (\bar r_0 - c) + k (r_0 - \bar r_0)
+
+    The object's error is common to all frames: it makes the mean over time uncertain, which leans
+    on the level c, and not the change about it. NaN where no object temperature was measured. All
+    else as in `solve`.
+    """
+    curve, e, dark = tile.curves[0], emissivity[0], 1.0 - emissivity[0]
+    signal = curve.signal(measured[0]) - tile.reference
+    seen = np.where(valid, mixing.background(e, tile.signals[0], signal), np.nan)
+    used = np.isfinite(seen)
+    number = np.maximum(used.sum(axis=0), 1)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.where(used, values, 0.0).sum(axis=0) / number)
+
+    noise = (tile.noise[0] / dark) ** 2
+    common = mean((e * measured[1] * curve.slope(measured[0]) / dark) ** 2) + noise / number
+    by_change, by_level = fluctuation / (fluctuation + noise), fluctuation / (fluctuation + common)
+    middle, off = mean(seen), (seen - signal) / dark
+    value = level + by_level * (middle - level) + by_change * (seen - middle)
+    # dr_0 = (r_0 - s) / (1 - e_1) de_1
+    slope = np.zeros((len(covariance), *seen.shape))
+    slope[0] = by_level * mean(off) + by_change * (off - mean(off))
+    slope[-1] = 1.0 - by_level
+    through = np.einsum("itp,ijp,jtp->tp", slope, covariance, slope, optimize=True)
+    return value, by_level * common + by_change * noise + np.maximum(through, 0.0)
 
 
 def temperatures(tile: Tile, signal: Array, variance: Array) -> tuple[Array, Array]:

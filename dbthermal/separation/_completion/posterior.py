@@ -30,7 +30,7 @@ from dbthermal.separation._completion.curve import Bins, Curve
 from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._frames import other_band
 from dbthermal.separation._subspace import kernels
-from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
+from dbthermal.separation._tiles import Array, Pixels, Tile, Whole
 
 # Probability that the object is farther off than the camera's own reading, at most [1].
 _WORSE: Final = 0.04
@@ -346,41 +346,6 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
                 for j in range(size):
                     moved = part[i] * part[j] + direction[i] * direction[j] / stiff[g, k]
                     spread[i, j] += weight * moved
-
-
-def behind(
-    tile: Tile, static: Moments, measured: Array, valid: Mask, fluctuation: Array
-) -> tuple[Array, Array]:
-    r"""Background behind a measured object (time, pixel) [K], and its variance [K^2].
-
-    What the object's temperatures and deviations (2, time, pixel) [K] leave of the first band,
-
-    .. math:: r_0 = \frac{z_1 - e_1 s}{1 - e_1}, \quad
-              r = c + g (\bar r_0 - c) + k (r_0 - \bar r_0)
-
-    The object's error is common to all frames: it makes the mean over time uncertain, which leans
-    on the level c, and not the change about it. NaN where no object temperature was measured.
-    """
-    curve, e = tile.curves[0], static.emissivity[0]
-    signal, dark = curve.signal(measured[0]) - tile.reference, 1.0 - e
-    seen = np.where(valid, (tile.signals[0] - e * signal) / dark, np.nan)
-    used = np.isfinite(seen)
-    number = np.maximum(used.sum(axis=0), 1)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(np.where(used, values, 0.0).sum(axis=0) / number)
-
-    noise = (tile.noise[0] / dark) ** 2
-    common = mean((e * measured[1] * curve.slope(measured[0]) / dark) ** 2) + noise / number
-    change, level = fluctuation / (fluctuation + noise), fluctuation / (fluctuation + common)
-    middle, off = mean(seen), (seen - signal) / dark
-    value = static.level + level * (middle - static.level) + change * (seen - middle)
-    # dr_0 = (r_0 - s) / (1 - e_1) de_1
-    slope = np.zeros((len(static.covariance), *seen.shape))
-    slope[0], slope[-1] = level * mean(off) + change * (off - mean(off)), 1.0 - level
-    spread = level * common + change * noise
-    through = np.einsum("itp,ijp,jtp->tp", slope, static.covariance, slope, optimize=True)
-    return value, spread + np.maximum(through, 0.0)
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Array:

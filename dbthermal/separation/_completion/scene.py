@@ -205,13 +205,14 @@ def solve(
     (2, time, pixel) [K], NaN elsewhere.
     """
     with np.errstate(all="ignore"):
-        static_parts = (static.point, static.level, variance, static.covariance)
-        found = frames.solve(tile, *static_parts, apart=scene.apart)
+        parts = static.point, static.level, variance, static.covariance
+        found = frames.solve(tile, *parts, apart=scene.apart)
         signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
         background, spread = found.background, found.background_variance
         if (some := np.isfinite(measured[0]).any(axis=0)).any():
-            part = (tile.select_pixels(some), static.select_pixels(some), measured[..., some])
-            behind = posterior.behind(*part, valid[:, some], variance[some])
+            parts = measured, valid, static.emissivity, static.level, variance, static.covariance
+            parts = (part[..., some] for part in parts)
+            behind = frames.background(tile.select_pixels(some), *parts)
             known = np.isfinite(behind).all(axis=0)
             for film, own in zip((background, spread), behind, strict=True):
                 film[:, some] = np.where(known, own, film[:, some])

@@ -91,9 +91,8 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     # Once more, with the weights of the residual less that drift.
     inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
     for t in range(frames):
-        off = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
-        inside = max(1.0 - off * off, 0.0)
-        kept[t] = inside * inside
+        off = residual[t] - size * (drift[t] - level - slope * emitted[t])
+        kept[t] = regression.bisquare(off * inverse)
     slope, level, _ = regression.moments(emitted, drift, kept)
     size, length = 0.0, 0.0
     for t in range(frames):
