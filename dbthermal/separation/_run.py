@@ -342,14 +342,9 @@ def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor
         every.isel(y=slice(end - rows, end))
         for end, rows in zip(accumulate(heights), heights, strict=True)
     ]
-    if all(one.variable._in_memory for one in capture.values()):
-        return [_digest(rest), "".join(map(_row_digests, parts))]
-    jobs = [executor.submit(_row_digests, one) for one in parts]
-    try:
-        return [_digest(rest), "".join(job.result() for job in jobs)]
-    finally:
-        for job in jobs:
-            job.cancel()
+    in_memory = all(one.variable._in_memory for one in capture.values())
+    digests = map(_row_digests, parts) if in_memory else executor.map(_row_digests, parts)
+    return [_digest(rest), "".join(digests)]
 
 
 def _row_digests(part: xr.Dataset) -> str:

@@ -210,9 +210,9 @@ def solve(
         signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
         background, spread = found.background, found.background_variance
         if (some := np.isfinite(measured[0]).any(axis=0)).any():
-            parts = measured, valid, static.emissivity, static.level, variance, static.covariance
-            parts = (part[..., some] for part in parts)
-            behind = frames.background(tile.select_pixels(some), *parts)
+            own, samples = static.select_pixels(some), (measured[..., some], valid[:, some])
+            parts = own.emissivity, own.level, variance[some], own.covariance
+            behind = frames.background(tile.select_pixels(some), *samples, *parts)
             known = np.isfinite(behind).all(axis=0)
             for film, own in zip((background, spread), behind, strict=True):
                 film[:, some] = np.where(known, own, film[:, some])

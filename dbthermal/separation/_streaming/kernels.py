@@ -108,26 +108,19 @@ def fit(means: Array, centre: int, latency: int, interval: float, frames: Array)
 
 
 class Block(NamedTuple):
-    """Frames of one mean, and what is known of their pixels."""
+    """Frames of one mean, what is known of their pixels, and their temperatures."""
 
     frames: Planes  # (band, frame, y, x) [count]
     means: Planes  # around them (mean, band, y, x) [count]
     order: npt.NDArray[np.intp]  # places of these, by time
     maps: Planes  # ratio, its variance, emissivities, elements of their covariance (map, y, x)
     gain: Planes  # noise of the second band over that of a frame (y, x)
-
-
-class Result(NamedTuple):
-    """Temperatures of the frames, and scratch rows; separate, so that none is taken to overlap."""
-
     status: npt.NDArray[np.uint32]  # (y, x)
     films: Planes  # object, deviation, background, deviation (film, frame, y, x) [K]
-    line: tuple[Planes, ...]  # terms of each pixel, see `_object`
-    out: tuple[Planes, ...]  # films of a frame, and if they are out of range
 
 
 ROWS: Final = (18, 5)
-"""Numbers of the scratch rows."""
+"""Numbers of scratch rows: terms of each pixel, see `_object`; films of a frame and their range."""
 
 
 @allocating
@@ -277,9 +270,9 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
 
 
 @allocating
-def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
+def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
-    line, here, found, maps, pairs = work
+    (line, here, found, maps, pairs), status = work, block.status[y, x]
     size, (ratio, noise, w), missing = block.order.size, pairs, 0
     defined = (status & _UNDEFINED) == 0 and (status & _AMBIGUOUS) != _AMBIGUOUS
     for i in range(size if defined else 0):
@@ -308,23 +301,24 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
 
 @_entered
 def emit(
-    block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
+    block: Block, fit: Fit, camera: Camera, fine: Camera, scratch: Any, top: int, stop: int
 ) -> None:
     """Films of the frames of one mean, and in the status the calibrated range, in place.
 
-    With the camera's numbers in double and in single precision.
+    With the camera's numbers in double and in single precision; the scratch rows are separate, so
+    that none is taken to overlap.
     """
-    line, out, films = result.line, result.out, result.films
+    line, out = scratch
     pairs = np.ones(2), np.empty(2), np.empty(2)
     work = line, np.empty((4, block.order.size)), np.empty((2, 2)), np.empty(7), pairs
     for y in range(top, stop):
-        for x in range(films.shape[3]):
-            _terms(block, fit, camera, y, result.status[y, x], x, work)
+        for x in range(block.films.shape[3]):
+            _terms(block, fit, camera, y, x, work)
         out[4][:] = 0.0
-        for f in range(films.shape[1]):
+        for f in range(block.films.shape[1]):
             one, two = block.frames[0, f, y], block.frames[1, f, y]
             _frame(one, two, line, fine, np.float32(fit.time[f]), out)
             for film in range(4):
-                films[film, f, y] = out[film]
-        for x in range(films.shape[3]):
-            result.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)
+                block.films[film, f, y] = out[film]
+        for x in range(block.films.shape[3]):
+            block.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)

@@ -327,33 +327,27 @@ class Stream:
         times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
         order = np.arange(self._blocks - means, self._blocks) % len(self._means)
         films = np.empty((4, self._block, *self._shape), np.float32)
-        maps, status = self._history.maps, self._history.status.copy()
-        block = kernels.Block(self._frames[slot], self._means, order, maps, self._gain)
+        status = self._history.status.copy()
+        pixels = self._history.maps, self._gain, status, films
+        block = kernels.Block(self._frames[slot], self._means, order, *pixels)
         interval, centre = self._block / self._rate, means - 1 - self._half
         fit = kernels.fit(self._mean_times, centre, self._half, interval, times)
-        self._apply(partial(self._temperatures, block, fit, status, films), self._rows)
+        self._apply(partial(self._temperatures, block, fit), self._rows)
         return times, films, status
 
-    def _temperatures(
-        self,
-        block: kernels.Block,
-        fit: kernels.Fit,
-        status: quality.Bits,
-        films: Planes,
-        rows: slice,
-    ) -> None:
+    def _temperatures(self, block: kernels.Block, fit: kernels.Fit, rows: slice) -> None:
         """Films and status of some rows of a block, in place."""
-        scratch = (tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
-        result = kernels.Result(status, films, *scratch)
-        kernels.emit(block, fit, *self._camera, result, rows.start, rows.stop)
+        scratch = tuple(tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
+        kernels.emit(block, fit, *self._camera, scratch, rows.start, rows.stop)
 
     def _warm(self) -> None:
         """Compile all that frames need, before the first one comes."""
         kernels.absorb(self._frames[0], self._means[0], 0, 0)
         films, history = np.empty((4, self._block, *self._shape), np.float32), self._history
         fit = kernels.fit(np.zeros((2, 1)), 0, 1, 1.0, np.zeros(self._block))
-        block = kernels.Block(self._frames[0], self._means, np.arange(1), history.maps, self._gain)
-        self._temperatures(block, fit, history.status, films, slice(0, 0))
+        pixels = history.maps, self._gain, history.status, films
+        block = kernels.Block(self._frames[0], self._means, np.arange(1), *pixels)
+        self._temperatures(block, fit, slice(0, 0))
         history.warm()
 
     def _dataset(self, known: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
