@@ -210,12 +210,12 @@ def solve(
         signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
         background, spread = found.background, found.background_variance
         if (some := np.isfinite(measured[0]).any(axis=0)).any():
-            own, samples = static.select_pixels(some), (measured[..., some], valid[:, some])
-            parts = own.emissivity, own.level, variance[some], own.covariance
-            behind = frames.background(tile.select_pixels(some), *samples, *parts)
-            known = np.isfinite(behind).all(axis=0)
+            part, samples = static.select_pixels(some), (measured[..., some], valid[:, some])
+            known = part.emissivity, part.level, variance[some], part.covariance
+            behind = frames.background(tile.select_pixels(some), *samples, *known)
+            seen = np.isfinite(behind).all(axis=0)
             for film, own in zip((background, spread), behind, strict=True):
-                film[:, some] = np.where(known, own, film[:, some])
+                film[:, some] = np.where(seen, own, film[:, some])
         values: Values = {}
         films = (signal, left + found.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):

@@ -182,40 +182,34 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -
     epsilon = ratios.inverse_energy * null + by_level**2
     restless = _propagate(model, ratios, epsilon, work)
     _background(model, ratios, epsilon, noise_variance + drift_variance, work)
-    _covariance(model, ratios, noise_variance + drift_variance, by_level, work, covariance)
+    _covariance(model, ratios, noise_variance + drift_variance, work, covariance)
     return Bars(epsilon, noise_variance, drift_variance, restless)
 
 
 @inlined
 def _covariance(
-    model: Model, ratios: Ratio, slope_variance: float, by_level: float, work: Work, covariance: Any
+    model: Model, ratios: Ratio, slope_variance: float, work: Work, covariance: Any
 ) -> None:
     r"""
     Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
 
     :math:`\delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o` and
-    :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`.
+    :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`, with
+    :math:`\epsilon = \sum w_m \delta \kappa_m`.
     """
-    first, k, w, energy = work.emissivity[0], work.ratio, work.null_weights, ratios.inverse_energy
-    reflectivity, square = 1.0 - first, model.noise[0] ** 2
-    through = slope_variance + (first * reflectivity) ** 2 * ratios.null_variance * energy
-    cross = first * reflectivity**2 * energy
-    for m in range(k.size):
-        # Of kappa_m with epsilon, over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
-        one = model.noise[m] ** 2 * w[m] - k[m] * square * w[0] if m > 0 else 0.0
-        for n in range(m + 1):
-            two = model.noise[n] ** 2 * w[n] - k[n] * square * w[0] if n > 0 else 0.0
-            value = k[m] * k[n] * through + cross * (k[m] * two + k[n] * one)
-            # Of the ratios with one another, kappa_m kappa_n s_1^2, and their variances (eq. 4).
-            between = k[m] * k[n] * square if n > 0 else 0.0
-            between += model.noise[m] ** 2 if m == n and n > 0 else 0.0
-            # Through the background's level, -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
-            levels = (
-                k[m] * first * by_level + work.level[m],
-                k[n] * first * by_level + work.level[n],
-            )
-            value += reflectivity**2 * (between * energy + levels[0] * levels[1])
-            covariance[m, n] = covariance[n, m] = value
+    k, change, error, bands = work.ratio, work.turned, work.turns, work.ratio.size
+    first, square = work.emissivity[0], model.noise[0] ** 2
+    for m, n in np.ndindex(bands, bands):
+        same = 1.0 if m == n else 0.0
+        change[m, n] = (1.0 - first) * (first * k[m] * work.null_weights[n] + same)
+        # Of the ratios (eq. 4), and through the background's level; the first one is 1.
+        error[m, n] = ratios.inverse_energy * (k[m] * k[n] * square + same * model.noise[m] ** 2)
+        error[m, n] += work.level[m] * work.level[n]
+    for m, n in np.ndindex(bands, bands):
+        covariance[m, n] = k[m] * k[n] * slope_variance
+        for i in range(1, bands):
+            for j in range(1, bands):
+                covariance[m, n] += change[m, i] * error[i, j] * change[n, j]
 
 
 @inlined
