@@ -63,14 +63,14 @@ def bridge(values: Array, variance: Array, time: Array) -> int:
     for right in range(time.size + 1 if last >= 0 else 0):
         if right < time.size and np.isnan(values[right]):
             continue
-        one, other = right if left < 0 else left, left if right == time.size else right
+        before, after = right if left < 0 else left, left if right == time.size else right
         for t in range(left + 1, right):
-            share, walk = 0.0, abs(time[t] - time[one])
-            if one != other:
-                share = walk / (time[other] - time[one])
+            share, walk = 0.0, abs(time[t] - time[before])
+            if before != after:
+                share = walk / (time[after] - time[before])
                 walk *= 1.0 - share
-            values[t] = values[one] + share * (values[other] - values[one])
-            variance[t] = variance[one] + share * (variance[other] - variance[one])
+            values[t] = values[before] + share * (values[after] - values[before])
+            variance[t] = variance[before] + share * (variance[after] - variance[before])
             variance[t] += rate * walk
         left = right
     return missing

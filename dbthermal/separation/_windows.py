@@ -63,11 +63,8 @@ def _smooth(
     windows = np.empty((halves.size, 4, frames))
     # Arrays by themselves: of parts of one the compiler takes no vectors.
     bounds = lower, upper, agreeing = np.empty(frames), np.empty(frames), np.empty(frames)
-    estimate, widest, unbounded = (
-        np.empty(frames),
-        np.empty(frames, np.intp),
-        np.full(frames, np.inf),
-    )
+    estimate, unbounded = np.empty(frames), np.full(frames, np.inf)
+    widest = np.empty(frames, np.intp)
     for p in range(len(values)):
         if p == 0 or np.any(valid[p] != valid[p - 1]):
             _lay_windows(valid[p], position, halves, windows)
