@@ -129,15 +129,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         raise TypeError(
             f"Invalid provenance of type {type(provenance).__name__}. Must be a mapping."
         )
-    options: dict[str, Any] = {
-        "settings": settings,
-        "emissivity": emissivity,
-        "emissivity_std": emissivity_std,
-        "emissivity_covariance": emissivity_covariance,
-        "mask": mask,
-        "response_kind": response_kind,
-        "seed": seed,
-    }
+    options: dict[str, Any] = {"settings": settings, "mask": mask, "seed": seed}
+    options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
+    options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}
     pairs = _pairs(source, target)
     # Two captures at a time: while one is joined, the processes have the other's rows.
     with (

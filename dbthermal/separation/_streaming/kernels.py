@@ -65,14 +65,10 @@ def camera(inputs: Inputs) -> tuple[Camera, Camera]:
     one, two = inputs.curves
     pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
     double = Camera(
-        first=kernels.table(one, two),
-        second=kernels.table(two, one),
-        counts=(one.reference_counts, two.reference_counts),
-        slopes=(one.reference_slope, two.reference_slope),
-        noise=(float(inputs.noise[0]), float(inputs.noise[1])),
-        pattern=(float(pattern[0]), float(pattern[1])),
-        lowest=one.lowest,
-        highest=one.highest,
+        *(kernels.table(one, two), kernels.table(two, one)),
+        *((one.reference_counts, two.reference_counts), (one.reference_slope, two.reference_slope)),
+        *((float(both[0]), float(both[1])) for both in (inputs.noise, pattern)),
+        *(one.lowest, one.highest),
     )
     return double, _single(double)
 

@@ -482,44 +482,35 @@ def _judge(model: Model, work: Work) -> None:
     lagged = torch.stack([(residual[lag:] * residual[:-lag]).sum(dim=0) for lag in lags]).sum(0)
     mean = _quotient(lagged, residuals.LAGS * (residual**2).sum(dim=0), 0.0)
     work.correlation = mean * np.sqrt(residuals.LAGS * len(residual))
-    common = work.null_weights[0] * model.noise[0] ** 2
-    work.delay = _delay(model, work, residual, rapid, work.freedom * common)
-    work.unexplained = _unexplained(model, residual, rapid, work.null_variance, common)
-
-
-def _delay(model: Model, work: Work, residual: Tensor, rapid: Tensor, common: Tensor) -> Tensor:
-    """Score (pixel) of rapid changes that are not simultaneous in all bands, see `bars`."""
-    change = rapid.diff(dim=0)
-    late = (residual[:-1] * change).sum(dim=0) + common
-    early = (residual[1:] * change).sum(dim=0) - common
+    # A matched filter with the differences between frames, of a band that is late or early.
+    common, change = work.null_weights[0] * model.noise[0] ** 2, rapid.diff(dim=0)
+    late = (residual[:-1] * change).sum(dim=0) + work.freedom * common
+    early = (residual[1:] * change).sum(dim=0) - work.freedom * common
     variance = work.null_variance * (change**2).sum(dim=0)
     score = _quotient(torch.maximum(late.abs(), early.abs()), variance.sqrt(), 0.0)
+    # Energy in the frames at a change; the cube root of a chi-square over its n degrees has the
+    # mean 1 - v and the variance v.
     steps = change.abs() > residuals.CHANGE * np.sqrt(2.0) * model.noise[0]
     at = torch.zeros_like(residual, dtype=torch.bool)
     at[1:] |= steps
     at[:-1] |= steps
     count = at.sum(dim=0).double()
     mean = _quotient((residual**2 * at).sum(dim=0) / work.null_variance, count, 1.0)
-    # The cube root of a chi-square over its n degrees has the mean 1 - v and the variance v.
     spread = 2.0 / (9.0 * count.clip(min=1.0))
-    return torch.maximum(score, (mean ** (1.0 / 3.0) - (1.0 - spread)) / spread.sqrt())
-
-
-def _unexplained(
-    model: Model, residual: Tensor, rapid: Tensor, null_variance: Tensor, common: Tensor
-) -> Tensor:
-    """Pixels of which the null residual is not white noise in some part of time, see `bars`."""
+    at_changes = (mean ** (1.0 / 3.0) - (1.0 - spread)) / spread.sqrt()
+    work.delay = torch.maximum(score, at_changes)
+    # White noise in all parts of time: its correlation with independent changes, and its sums.
     (most, limit), length = model.limits, model.edges.diff()[:, None]
-    variance = null_variance.where(null_variance > 0, np.inf)
+    variance = work.null_variance.where(work.null_variance > 0, np.inf)
     rapid = rapid - common / variance * residual
     sums, products, squares = (
         _block_sums(part, model.edges) for part in (residual, residual * rapid, rapid**2)
     )
-    result = _quotient(products**2, squares, 0.0).sum(dim=0) / variance > most
+    unexplained = _quotient(products**2, squares, 0.0).sum(dim=0) / variance > most
     while len(sums) > 1:
-        result |= (sums**2 > limit * variance * length).any(dim=0)
+        unexplained |= (sums**2 > limit * variance * length).any(dim=0)
         sums, length = sums[::2] + sums[1::2], length[::2] + length[1::2]
-    return result
+    work.unexplained = unexplained
 
 
 def _block_sums(values: Tensor, edges: Tensor) -> Tensor:
