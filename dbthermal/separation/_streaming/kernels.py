@@ -67,7 +67,8 @@ def camera(inputs: Inputs) -> tuple[Camera, Camera]:
     double = Camera(
         *(kernels.table(one, two), kernels.table(two, one)),
         *((one.reference_counts, two.reference_counts), (one.reference_slope, two.reference_slope)),
-        *((float(both[0]), float(both[1])) for both in (inputs.noise, pattern)),
+        (float(inputs.noise[0]), float(inputs.noise[1])),
+        (float(pattern[0]), float(pattern[1])),
         *(one.lowest, one.highest),
     )
     return double, _single(double)
