@@ -4,7 +4,7 @@ r"""Separation with known emissivities: as many equations as bands, in two tempe
 
 is solved for x and y by Newton's method from the linear closed form of Narayanan et al. (2026),
 equation 12, doi:10.48550/arXiv.2509.11334, all bands weighted by their noise, see
-`_known_emissivity`. Each frame stands alone; then the object is smoothed over as many frames as its
+`_frames`. Each frame stands alone; then the object is smoothed over as many frames as its
 own curve allows. Errors of the emissivities are not lessened by that. For two bands and slopes 1,
 the noise of a frame is
 
@@ -18,7 +18,8 @@ from typing import Final
 import numpy as np
 
 from dbthermal.schema import Status
-from dbthermal.separation import _known_emissivity as known_emissivity
+from dbthermal.separation import _frames as frames
+from dbthermal.separation import _windows as windows
 from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
@@ -58,15 +59,15 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     level = np.zeros(e.shape[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
-        found = known_emissivity.solve(tile, e, level, np.full_like(level, _ANY), shared)
+        found = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
         solved = np.isfinite(found.signal)
         signal, left = found.signal, found.white
         if settings.smooth and len(signal) > 1:
-            signal, left = known_emissivity.smooth(signal, left, solved, tile.time)
+            signal, left = windows.smooth(signal, left, solved, tile.time)
         left = left + found.shared
         values = list[Array]()
         for mean, variance in ((signal, left), (found.background, found.background_variance)):
-            values += known_emissivity.temperatures(tile, np.where(solved, mean, np.nan), variance)
+            values += frames.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
     solved &= np.all(np.isfinite(values), axis=0)
     values = [np.where(solved, value, np.nan) for value in values]

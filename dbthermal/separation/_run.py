@@ -129,15 +129,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         raise TypeError(
             f"Invalid provenance of type {type(provenance).__name__}. Must be a mapping."
         )
-    options: dict[str, Any] = {
-        "settings": settings,
-        "emissivity": emissivity,
-        "emissivity_std": emissivity_std,
-        "emissivity_covariance": emissivity_covariance,
-        "mask": mask,
-        "response_kind": response_kind,
-        "seed": seed,
-    }
+    options: dict[str, Any] = {"settings": settings, "mask": mask, "seed": seed}
+    options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
+    options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}
     pairs = _pairs(source, target)
     # Two captures at a time: while one is joined, the processes have the other's rows.
     with (
@@ -342,14 +336,9 @@ def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor
         every.isel(y=slice(end - rows, end))
         for end, rows in zip(accumulate(heights), heights, strict=True)
     ]
-    if all(one.variable._in_memory for one in capture.values()):
-        return [_digest(rest), "".join(map(_row_digests, parts))]
-    jobs = [executor.submit(_row_digests, one) for one in parts]
-    try:
-        return [_digest(rest), "".join(job.result() for job in jobs)]
-    finally:
-        for job in jobs:
-            job.cancel()
+    in_memory = all(one.variable._in_memory for one in capture.values())
+    digests = map(_row_digests, parts) if in_memory else executor.map(_row_digests, parts)
+    return [_digest(rest), "".join(digests)]
 
 
 def _row_digests(part: xr.Dataset) -> str:

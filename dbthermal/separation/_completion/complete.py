@@ -19,6 +19,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
+from dbthermal.separation._frames import bridge
 from dbthermal.separation._inputs import Method, check
 from dbthermal.separation._solve import require_workers, solve
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
@@ -28,7 +29,7 @@ _BITS: Final = {
     scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
 }
 _SPREAD: Final = (1e-3, 1e3)  # deviation of surroundings that are stated [K]
-_METHOD: Final = Method(posterior.curve, any_bands=True, survey=posterior.curve)
+_METHOD: Final = Method(posterior.moments, any_bands=True, survey=posterior.moments)
 
 
 def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
@@ -167,14 +168,14 @@ def filled(
         fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
-    bridged = _lacking(result, inputs.blocks)
+    lacking = empty(result[FILMS[0]].shape, np.bool_)  # samples of a result without a film
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
-        list(threads.map(partial(_complete_rows, scene, result), inputs.blocks))
-        film = result[FILMS[0]].values
-        frames = np.array([np.isfinite(frame).any() for frame in film])
-        parts = threads.map(partial(_bridge_rows, result, frames), inputs.blocks)
+        list(threads.map(partial(_complete_rows, scene, result, lacking), inputs.blocks))
+        frames = np.array([np.isfinite(frame).any() for frame in result[FILMS[0]].values])
+        parts = threads.map(partial(_bridge_rows, result, frames, lacking), inputs.blocks)
         number = np.concatenate(list(parts))
-    _mark_bridged(result, bridged, inputs.blocks)
+    variable = schema.OPTIONAL["separated"]["bridged"]
+    result["bridged"] = (variable.dims, lacking, variable.attrs)
     result["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
     return result.assign_attrs(
@@ -184,36 +185,6 @@ def filled(
         surroundings_std=float(np.mean(level.std)),
         surroundings_source="capture" if beside.surroundings is None else "stated",
     )
-
-
-def _lacking(result: xr.Dataset, blocks: list[slice]) -> Mask:
-    """Samples (time, y, x) of which a result lacks one of the films."""
-    lacking = empty(result[FILMS[0]].shape, np.bool_)
-    for rows in blocks:
-        films = [np.isnan(result[name].values[:, rows]) for name in FILMS]
-        lacking[:, rows] = np.any(films, axis=0)
-        release()
-    return lacking
-
-
-def _mark_bridged(completed: xr.Dataset, lacking: Mask, blocks: list[slice]) -> None:
-    """Mark, in place, the samples that a measured pixel lacked and now has: by frame, not by pixel.
-
-    A pixel that lacked too many of them gets a bit of the status, too.
-    """
-    status = completed["status"].values
-    elsewhere = np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)
-    for rows in blocks:
-        here = lacking[:, rows]
-        here &= np.isfinite(completed[FILMS[0]].values[:, rows])
-        here &= (status[rows] & elsewhere) == 0
-        many = here.mean(axis=0) >= quality.MOST_BRIDGED
-        status[rows] |= many * np.uint32(Status.COMPLETED_FRAMES)
-        if "bridged" in completed:
-            here |= completed["bridged"].values[:, rows]
-        release()
-    variable = schema.OPTIONAL["separated"]["bridged"]
-    completed["bridged"] = (variable.dims, lacking, variable.attrs)
 
 
 def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
@@ -237,17 +208,22 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
     return laid_on(result, corrected, "the result", "the capture")
 
 
-def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
-    """Complete the pixels of some rows, in place; what was measured is not touched."""
-    lacking = np.zeros(completed["status"].values[rows].shape, dtype=bool)
-    for name in (*FILMS, *MAPS):
-        lacking |= np.isnan(completed[name].values[:, rows]).any(axis=0)
-    if not lacking.any():
+def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: slice) -> None:
+    """Complete the pixels of some rows, in place; what was measured is not touched.
+
+    The samples that lack one of the films are marked (time, y, x), in place.
+    """
+    films, maps = (
+        [np.isnan(completed[name].values[:, rows]) for name in names] for names in (FILMS, MAPS)
+    )
+    lacking[:, rows] = np.any(films, axis=0)
+    pixels = lacking[:, rows].any(axis=0) | np.any(maps, axis=(0, 1))
+    if not pixels.any():
         return
-    lines = np.flatnonzero(lacking.any(axis=1))
+    lines = np.flatnonzero(pixels.any(axis=1))
     part = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
-    tile, valid = scene.tile(part, lacking[lines].ravel())
-    places = np.flatnonzero(lacking) + rows.start * completed.sizes["x"]
+    tile, valid = scene.tile(part, pixels[lines].ravel())
+    places = np.flatnonzero(pixels) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
         some = np.arange(start, min(start + tiles.PIXELS, places.size))
         _complete_pixels(scene, completed, tile.select_pixels(some), valid[:, some], places[some])
@@ -333,11 +309,12 @@ def _take(
                 beyond[p] |= a < limits[0] - margin or a > limits[1] + margin
 
 
-def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
+def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice) -> Whole:
     """Bridge gaps of single pixels of some rows by lines, in place.
 
-    Only in the frames (time) that some pixel has. The deviation grows as that of a random walk of
-    the curve's own steps. Returns how many each pixel (y, x) had, in one of the films.
+    Only in the frames (time) that some pixel has. Returns how many each pixel (y, x) had, in one of
+    the films. Of the samples that were lacking those are left, in place, that a measured pixel now
+    has: by frame, not by pixel. A pixel that lacked too many gets a bit of the status, too.
     """
     time = completed["time"].values[frames].astype(np.float64)
     number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
@@ -347,38 +324,24 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
         y, x = np.nonzero((gaps > 0) & (gaps < time.size))
         place = (np.flatnonzero(frames)[:, np.newaxis], rows.start + y, x)
         curves, stds = (np.ascontiguousarray(film[place].T, dtype=np.float64) for film in films)
-        _bridge(curves, stds, time)
-        films[0][place], films[1][place] = curves.T, stds.T
+        variances = stds**2
+        _bridge(curves, variances, time)
+        films[0][place], films[1][place] = curves.T, np.sqrt(variances).T
         number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
+    bridged, status = lacking[:, rows], completed["status"].values[rows]
+    bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
+    bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0
+    many = bridged.mean(axis=0) >= quality.MOST_BRIDGED
+    status |= many * np.uint32(Status.COMPLETED_FRAMES)
+    if "bridged" in completed:
+        bridged |= completed["bridged"].values[:, rows]
+    release()
     return number
 
 
 @compiled
-def _bridge(values: Array, stds: Array, time: Array) -> None:
+def _bridge(values: Array, variances: Array, time: Array) -> None:
     """Bridge the gaps of curves (curve, time) with a number somewhere, in place."""
-    for value, std in zip(values, stds):  # noqa: B905 - not compiled with strict
-        last, rate, steps = -1, 0.0, 0
-        for t in range(time.size):
-            if not np.isnan(value[t]):
-                if last >= 0:
-                    rate += (value[t] - value[last]) ** 2 / (time[t] - time[last])
-                    steps += 1
-                last = t
-        rate, left = rate / max(steps, 1), -1
-        for right in range(time.size + 1):
-            if right < time.size and np.isnan(value[right]):
-                continue
-            for t in range(left + 1, right):
-                if left < 0 or right == time.size:  # an end: as the nearest frame
-                    near = right if left < 0 else left
-                    value[t], walk = value[near], abs(time[t] - time[near])
-                    variance = std[near] ** 2
-                else:
-                    since, whole = time[t] - time[left], time[right] - time[left]
-                    share = since / whole
-                    value[t] = value[left] + share * (value[right] - value[left])
-                    variance = std[left] ** 2 + share * (std[right] ** 2 - std[left] ** 2)
-                    walk = since * (time[right] - time[t]) / whole
-                std[t] = np.sqrt(variance + rate * walk)
-            left = right
+    for p in range(len(values)):
+        bridge(values[p], variances[p], time)

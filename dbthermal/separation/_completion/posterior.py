@@ -20,26 +20,18 @@ fluctuation f(t), and any object at all:
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from dbthermal._compiled import compiled
-from dbthermal.separation import _known_emissivity as known_emissivity
+from dbthermal.separation import _frames as frames
+from dbthermal.separation._completion.curve import Bins, Curve
 from dbthermal.separation._completion.prior import Mixture
+from dbthermal.separation._frames import other_band
 from dbthermal.separation._subspace import kernels
-from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
+from dbthermal.separation._tiles import Array, Pixels, Tile, Whole
 
-# Bins of time, at most, and frames in each, at least.
-_BINS: Final = 32
-_LEAST: Final = 2
-# Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
-_NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
-_LEAST_RANGE: Final = 0.5
-# A constant, a quadratic and a cubic, at the nodes: Chebyshev's polynomials.
-_SHAPES: Final = np.cos(np.multiply.outer([0.0, 2.0, 3.0], np.arccos(_NODES)))
-# The first band's change over its noise, in variance, from which a slope is not attenuated.
-_SEEN: Final = 25.0
 # Probability that the object is farther off than the camera's own reading, at most [1].
 _WORSE: Final = 0.04
 # Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
@@ -66,14 +58,6 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Bins:
-    """Means over bins of time."""
-
-    signals: Array  # (band, bin, pixel) [K]
-    frames: Array  # (bin, pixel)
-
-
-@dataclass(frozen=True)
 class Moments(Pixels):
     """Posterior of the emissivities and of the background's level."""
 
@@ -95,153 +79,27 @@ class Moments(Pixels):
         return ratio, np.einsum("imp,mnp,jnp->ijp", change, self.emissivity_covariance, change)
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Information of the bins on the values at the nodes: log-likelihood -g H g / 2 + h g."""
-
-    nodes: Array  # (node, pixel) [K]
-    information: Array  # H (band - 1, node, node, pixel) [1/K^2]
-    linear: Array  # h (band - 1, node, pixel) [1/K]
-
-
-def bins(tile: Tile, valid: Mask) -> Bins:
-    """Means of the tile's signals over bins of as many frames each."""
-    size = max(_LEAST, -(-tile.time.size // _BINS))
-    starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
-    frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
-    total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
-    return Bins(total / np.maximum(frames, 1.0), frames)
-
-
-def curve(
-    tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0, bend: Array | float = 0.0
-) -> Curve:
-    """Other bands over the first; offsets (band - 1) [K] of a pixel against them are not known.
-
-    Nor is what a slow change of the background bends them by, of deviations (band - 1, pixel) [K].
-    It would pass for the bend of the responses, which is large for a hot metal alone.
-
-    The variance is that of the noise, or the bins' if it is more: there the background fluctuates.
-    The first band has a variance of strays [K^2], beside the noise, which the others do not follow.
-    """
-    weight, first = means.frames, means.signals[0]
-    total = np.maximum(weight.sum(axis=0), 1.0)
-    middle = (weight * first).sum(axis=0) / total
-    centred = np.where(weight > 0, first - middle, 0.0)
-    energy = (weight * centred**2).sum(axis=0)
-    bins_used = np.count_nonzero(weight, axis=0)
-    centred = centred * (energy > _SEEN * (tile.noise[0] ** 2 * bins_used + stray * total))
-    half = np.maximum(np.abs(centred).max(axis=0), _LEAST_RANGE)
-    base = _lagrange(centred / half)  # (node, bin, pixel)
-    gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)
-    information, linear = [], []
-    bends = np.broadcast_to(bend, (len(tile.noise) - 1, total.size))
-    ridge = 1e-9 * total * np.eye(4)[..., np.newaxis]
-    for m in range(1, len(tile.noise)):
-        moment = np.einsum("ibp,bp,bp->ip", base, weight, means.signals[m])
-        fitted = np.linalg.solve(np.moveaxis(gram + ridge, -1, 0), moment.T[..., np.newaxis])
-        residual = means.signals[m] - np.einsum("ibp,pi->bp", base, fitted[..., 0])
-        noise = tile.noise[m] ** 2 + tile.noise[0] ** 2  # of one frame
-        variance = _long_run(residual, weight, bins_used, noise)
-        inverse, right = gram / variance, moment / variance
-        # Of a constant, quadratic and cubic part of variance p^2 is told nothing:
-        # H - H b b^T H / (1 / p^2 + b^T H b).
-        for shape, deviation in zip(
-            _SHAPES, (offset[m - 1], bends[m - 1], bends[m - 1]), strict=True
-        ):
-            row = np.einsum("ijp,j->ip", inverse, shape)
-            share = deviation**2 / (1.0 + deviation**2 * (shape @ row))
-            right = right - row * (share * (shape @ right))
-            inverse = inverse - share * row[:, np.newaxis] * row
-        information.append(inverse)
-        linear.append(right)
-    nodes = middle + half * _NODES[:, np.newaxis]
-    return Curve(nodes, np.array(information), np.array(linear))
-
-
-def _lagrange(places: Array) -> Array:
-    """Cubics (node, ...) at places in [-1, 1] that are 1 at one of the nodes, 0 at the others."""
-    parts = []
-    for node in _NODES:
-        others = _NODES[node != _NODES]
-        parts.append(np.prod([(places - one) / (node - one) for one in others], axis=0))
-    return np.asarray(parts)
-
-
-def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Array:
-    """Variance (pixel) [K^2] of a frame that gives the bins' scatter, with their correlation."""
-    scaled = np.sqrt(weight) * residual
-    freedom = np.maximum(used - 4, 1)
-    variance = (scaled**2).sum(axis=0) / freedom
-    power = np.maximum((scaled**2).sum(axis=0), np.finfo(np.float64).tiny)
-    lags = [(scaled[lag:] * scaled[:-lag]).sum(axis=0) for lag in (1, 2) if lag < len(scaled)]
-    correlated = 1.0 + 2.0 * np.sum([np.maximum(lag / power, 0.0) for lag in lags], axis=0)
-    more = variance > noise * (1.0 + 3.0 * np.sqrt(2.0 / freedom))
-    return np.asarray(np.where(more, variance * correlated, noise))
-
-
-class _Given(NamedTuple):
-    """What is known of each pixel."""
-
-    grid: Array  # of the first emissivity (pixel, grid) [1]
-    mean: Array  # of the prior's components (pixel, component, band) [1]
-    covariance: Array  # (pixel, component, band, band) [1]
-    level: Array  # of the background, and its deviation (pixel, 2) [K]
-    nodes: Array  # see `Curve`, of pixels first
-    information: Array
-    linear: Array
-
-
-class _Work(NamedTuple):
-    """Quantities on the grid of one pixel: (grid, component, ...), or (grid, band - 1, ...)."""
-
-    density: Array  # prior of the first emissivity, a logarithm; of the cells
-    weight: Array  # of the posterior, a logarithm first
-    normal: Array  # mean and precision of the other emissivities (grid, component, 2, band - 1)
-    whole: Array  # the same of the components as one (grid, 2, band - 1)
-    place: Array  # where the model is linearised, (e, c) (grid, band + 1)
-    likelihood: Array  # quadratic functions, see `_quadratic` (grid, band - 1, 6)
-    values: Array  # mean of (e, c) (grid, component, band + 1)
-    slope: Array  # of the other emissivities with c (grid, component, band - 1) [1/K]
-    loose: Array  # their variances at a value of c (grid, component, band - 1)
-    stiff: Array  # precision of c (grid, component) [1/K^2]
-    signals: Array  # spare (5, 5 * grid)
-
-
 def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     """Posterior of the emissivities and of the background's level, steps 1 and 2."""
     grid = prior.grid()  # (grid, pixel)
-    (points, pixels), size, parts = grid.shape, len(tile.noise) + 1, prior.weight.size
+    (points, pixels), size = grid.shape, len(tile.noise) + 1
     levels = np.stack([np.broadcast_to(part, pixels) for part in (level.signal, level.std)])
-    curve_parts = (data.nodes, data.information, data.linear)
-    shapes = {"whole": (2, size - 2), "place": (size,), "likelihood": (size - 2, 6)}
-    shapes |= {"normal": (parts, 2, size - 2), "values": (parts, size)}
-    shapes |= dict.fromkeys(("slope", "loose"), (parts, size - 2))
-    work = {name: np.empty((points, *shapes.get(name, (parts,)))) for name in _Work._fields}
-    work["signals"] = np.empty((5, 5 * points))
-    share = np.empty((pixels, points))
-    mean, spread = np.empty((pixels, 2, size)), np.empty((pixels, 2, size, size))
+    parts = (grid, prior.mean, prior.covariance, levels, *vars(data).values())
+    share, means = np.empty((pixels, points)), np.empty((pixels, 2, size))
+    spreads = np.empty((pixels, 2, size, size))
     _moments(
-        known_emissivity.response_tables(tile),
+        frames.response_tables(tile),
         np.log(prior.weight),
-        _Given(
-            *(
-                np.ascontiguousarray(np.moveaxis(part, -1, 0))
-                for part in (grid, prior.mean, prior.covariance, levels, *curve_parts)
-            )
-        ),
-        _Work(**work),
-        share,
-        mean,
-        spread,
+        tuple(np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in parts),
+        (share, means, spreads),
     )
     (plain, mean), (covariance, spread) = (
-        np.ascontiguousarray(np.moveaxis(part, 0, -1)) for part in (mean, spread)
+        np.ascontiguousarray(np.moveaxis(part, 0, -1)) for part in (means, spreads)
     )
     # The blackest emissivity that is as improbable; the grid rises.
     above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
     blackest = _crossing(grid, above, _WORSE)
-    bound = 1.0 + 2.0 * (1.0 / blackest - 1.0) if parts > 1 else np.inf
+    bound = 1.0 + 2.0 * (1.0 / blackest - 1.0) if prior.weight.size > 1 else np.inf
     moved = np.minimum(mean[0], bound) - mean[0]
     mean[0] += moved
     spread[0, 0] += moved**2
@@ -269,140 +127,153 @@ def _crossing(grid: Array, falling: Array, level: float) -> Array:
 def _moments(
     tables: tuple[kernels.Table, ...],
     weight: Array,
-    given: _Given,
-    work: _Work,
-    share: Array,
-    means: Array,
-    spreads: Array,
+    knowledge: tuple[Array, ...],
+    result: tuple[Array, Array, Array],
 ) -> None:
     """Probability on the grid (pixel, grid), and moments of (e, c) and (1 / e_1, e_m / e_1, c).
 
-    (pixel, 2, band + 1), (pixel, 2, band + 1, band + 1), in place; the weights are logarithms.
+    (pixel, 2, band + 1), (pixel, 2, band + 1, band + 1), in place; the weights are logarithms. Of
+    each pixel its grid, mean and covariance of the prior's components, the background's level and
+    its deviation, and the parts of its `Curve`.
     """
-    for p in range(len(share)):
-        mean, covariance = given.mean[p], given.covariance[p]
-        if (
-            p == 0
-            or np.any(mean != given.mean[p - 1])
-            or np.any(covariance != given.covariance[p - 1])
-        ):
-            _condition(mean, covariance, weight, given.grid[p], work)
-        _linearise(tables, given, p, work)
-        for g in range(share.shape[1]):
-            for k in range(weight.size):
-                work.values[g, k, 0] = given.grid[p, g]
-                evidence, work.stiff[g, k] = _eliminate(
-                    work.likelihood[g],
-                    work.normal[g, k],
-                    given.level[p],
-                    work.values[g, k],
-                    work.slope[g, k],
-                    work.loose[g, k],
-                )
-                work.weight[g, k] = work.density[g, k] + evidence
-        _normalise(work)
-        for g in range(share.shape[1]):
-            share[p, g] = work.weight[g].sum()
+    grids, means, covariances, levels, nodes, information, linear = knowledge
+    points, parts, others = grids.shape[1], weight.size, means.shape[2] - 1
+    # Prior and posterior of (grid, component), logarithms at first, and the precisions of c.
+    density, posterior = np.empty((points, parts)), np.empty((points, parts))
+    stiff = np.empty((points, parts))
+    # Mean and precision of the other emissivities before, and of the components as one.
+    normal, whole = np.empty((points, parts, 2, others)), np.empty((points, 2, others))
+    # Mean of (e, c); slopes of the others with c, and their variances at a value of it.
+    values = np.empty((points, parts, others + 2))
+    slope, loose = np.empty((points, parts, others)), np.empty((points, parts, others))
+    place, likelihood = np.empty((points, others + 2)), np.empty((points, others, 6))
+    spare = np.empty((5, 5 * points))
+    for p in range(len(grids)):
+        mean, covariance = means[p], covariances[p]
+        if p == 0 or np.any(mean != means[p - 1]) or np.any(covariance != covariances[p - 1]):
+            _condition(mean, covariance, weight, grids[p], density, normal, whole)
+        # About the best values at each point of the grid, with the components taken as one, by
+        # the method of Gauss and Newton.
+        for g in range(points):
+            place[g, 0], place[g, 1 + others] = grids[p, g], levels[p, 0]
+            place[g, 1 : 1 + others] = whole[g, 0]
+        curve, settled = (nodes[p], information[p], linear[p]), False
+        for step in range(_STEPS + 1):
+            _quadratic(tables, curve, place, spare, likelihood)
+            if step == _STEPS or settled:
+                break
+            settled = _settled(likelihood, whole, levels[p], place, slope, loose)
+        for g, k in np.ndindex(density.shape):
+            values[g, k, 0] = grids[p, g]
+            belief, moved = (likelihood[g], normal[g, k], levels[p]), (slope[g, k], loose[g, k])
+            evidence, stiff[g, k] = _eliminate(*belief, values[g, k], *moved)
+            posterior[g, k] = density[g, k] + evidence
+        _normalise(posterior, values, slope, loose, stiff)
+        for g in range(points):
+            result[0][p, g] = posterior[g].sum()
         for way in range(2):
-            _average(work, way, means[p, way], spreads[p, way])
+            terms = posterior, values, slope, loose, stiff
+            _average(terms, way, result[1][p, way], result[2][p, way])
 
 
 @compiled
-def _condition(mean: Array, covariance: Array, weight: Array, grid: Array, work: _Work) -> None:
+def _condition(
+    mean: Array,
+    covariance: Array,
+    weight: Array,
+    grid: Array,
+    density: Array,
+    normal: Array,
+    whole: Array,
+) -> None:
     """Log-density of the first emissivity, and mean and precision of the others at it, in place.
 
     The others are taken as independent given the first.
     """
-    points, bands = grid.size, mean.shape[1]
-    for g in range(points):
-        low, high = grid[max(g - 1, 0)], grid[min(g + 1, points - 1)]
-        cell = np.log((high - low) / (min(g + 1, points - 1) - max(g - 1, 0)))
-        log, normal, whole = work.density[g], work.normal[g], work.whole[g]
+    last = grid.size - 1
+    for g in range(grid.size):
+        low, high = max(g - 1, 0), min(g + 1, last)
+        log, off = density[g], grid[g] - mean[:, 0]
         for k in range(weight.size):
-            variance, off = covariance[k, 0, 0], grid[g] - mean[k, 0]
-            log[k] = weight[k] - 0.5 * (np.log(variance) + off**2 / variance)
-            for m in range(bands - 1):
+            variance = covariance[k, 0, 0]
+            log[k] = weight[k] - 0.5 * (np.log(variance) + off[k] ** 2 / variance)
+            for m in range(mean.shape[1] - 1):
                 slope = covariance[k, 1 + m, 0] / variance
-                normal[k, 0, m] = mean[k, 1 + m] + slope * off
+                normal[g, k, 0, m] = mean[k, 1 + m] + slope * off[k]
                 rest = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
-                normal[k, 1, m] = 1.0 / max(rest, 1e-8)
+                normal[g, k, 1, m] = 1.0 / max(rest, 1e-8)
         share = np.exp(log - log.max())
         share /= share.sum()
-        for m in range(bands - 1):
-            whole[0, m] = (share * normal[:, 0, m]).sum()
-            wide = 1.0 / normal[:, 1, m] + (normal[:, 0, m] - whole[0, m]) ** 2
-            whole[1, m] = 1.0 / (share * wide).sum()
-        log += cell
+        for m in range(mean.shape[1] - 1):
+            whole[g, 0, m] = (share * normal[g, :, 0, m]).sum()
+            wide = 1.0 / normal[g, :, 1, m] + (normal[g, :, 0, m] - whole[g, 0, m]) ** 2
+            whole[g, 1, m] = 1.0 / (share * wide).sum()
+        log += np.log((grid[high] - grid[low]) / (high - low))  # of the cell
 
 
 @compiled
-def _linearise(tables: tuple[kernels.Table, ...], given: _Given, p: int, work: _Work) -> None:
-    """Log-likelihoods of a pixel about its best values at each point of the grid, in place.
-
-    Those of a Gauss-Newton method, with the components of the prior taken as one.
-    """
-    points, others, settled = work.whole.shape[0], work.whole.shape[2], False
-    for g in range(points):
-        work.place[g, 0], work.place[g, 1 + others] = given.grid[p, g], given.level[p, 0]
-        for m in range(others):
-            work.place[g, 1 + m] = work.whole[g, 0, m]
-    for step in range(_STEPS + 1):
-        for m in range(others):
-            for g in range(points):
-                work.place[g, 1 + m] = min(max(work.place[g, 1 + m], _BOUNDS[0]), _BOUNDS[1])
-            _quadratic(tables[0], tables[1 + m], given, p, m, work)
-        if step == _STEPS or settled:
-            break
-        settled = True
-        for g in range(points):
-            before = work.place[g, 1 + others]
-            spare = work.slope[g, 0], work.loose[g, 0]
-            knowledge = work.likelihood[g], work.whole[g], given.level[p]
-            _eliminate(*knowledge, work.place[g], *spare)
-            change = abs(work.place[g, 1 + others] - before)
-            settled &= not change > _SETTLED * given.level[p, 1]
+def _settled(
+    likelihood: Array, whole: Array, level: Array, place: Array, slope: Array, loose: Array
+) -> bool:
+    """Step to the best values at each point of the grid, in place; whether no level moves."""
+    settled = True
+    for g in range(len(place)):
+        before = place[g, -1]
+        _eliminate(likelihood[g], whole[g], level, place[g], slope[g, 0], loose[g, 0])
+        settled &= not abs(place[g, -1] - before) > _SETTLED * level[1]
+    return settled
 
 
 @compiled
 def _quadratic(
-    first: kernels.Table, other: kernels.Table, given: _Given, p: int, band: int, work: _Work
+    tables: tuple[kernels.Table, ...],
+    curve: tuple[Array, Array, Array],
+    place: Array,
+    spare: Array,
+    likelihood: Array,
 ) -> None:
-    """Log-likelihoods of another band as quadratic functions about zero, in place.
+    """Log-likelihoods of the other bands as quadratic functions about zero, in place.
 
     Near (e_1, e_m, c): value; slopes with e_m, with c; curvatures with e_m, both, c.
     """
-    nodes, linear, information = given.nodes[p], given.linear[p, band], given.information[p, band]
-    signal, emitted, rate = work.signals[0], work.signals[1], work.signals[2]
-    of_e, of_c = np.empty(4), np.empty(4)
-    for g in range(len(work.place)):
-        c = signal[5 * g + 4] = work.place[g, -1]
+    nodes, informations, linears = curve
+    signal, emitted, rate, base, of_e, of_c = (
+        spare[0],
+        spare[1],
+        spare[2],
+        np.empty(4),
+        np.empty(4),
+        np.empty(4),
+    )
+    for g in range(len(place)):
+        c = signal[5 * g + 4] = place[g, -1]
         for i in range(4):
-            signal[5 * g + i] = c + (nodes[i] - c) / work.place[g, 0]
-    spare = work.signals[3], work.signals[4]
-    known_emissivity.other_band(first, other, signal, emitted, rate, *spare)
-    for g in range(len(work.place)):
-        share, e, c = 1.0 / work.place[g, 0], work.place[g, 1 + band], work.place[g, -1]
-        level, by_level = emitted[5 * g + 4], (1.0 - e) * rate[5 * g + 4]
-        for i in range(4):
-            of_e[i] = emitted[5 * g + i] - level
-            of_c[i] = by_level + e * rate[5 * g + i] * (1.0 - share)
-        square, value, by_e, by_c, ee, ec, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(4):
-            here, here_e, here_c = 0.0, 0.0, 0.0  # H times the model and its slopes
-            for j in range(4):
-                here += information[i, j] * (level + e * of_e[j])
-                here_e += information[i, j] * of_e[j]
-                here_c += information[i, j] * of_c[j]
-            model, left = level + e * of_e[i], linear[i] - here
-            value, square = value + linear[i] * model, square + model * here
-            by_e, by_c = by_e + of_e[i] * left, by_c + of_c[i] * left
-            ee, ec, cc = ee + of_e[i] * here_e, ec + of_e[i] * here_c, cc + of_c[i] * here_c
-        # L = L0 + g d - d A d / 2 with d = (e, c) less the point.
-        result = work.likelihood[g, band]
-        result[0] = value - 0.5 * square - by_e * e - by_c * c
-        result[0] -= 0.5 * (ee * e**2 + 2.0 * ec * e * c + cc * c**2)
-        result[1], result[2] = by_e + ee * e + ec * c, by_c + ec * e + cc * c
-        result[3], result[4], result[5] = ee, ec, cc
+            signal[5 * g + i] = c + (nodes[i] - c) / place[g, 0]
+    for m in range(len(linears)):
+        information, linear = informations[m], linears[m]
+        other_band(tables[0], tables[1 + m], signal, emitted, rate, spare[3], spare[4])
+        for g in range(len(place)):
+            e = place[g, 1 + m] = min(max(place[g, 1 + m], _BOUNDS[0]), _BOUNDS[1])
+            # The model at the nodes, base + of_e e_m + of_c c.
+            for i in range(4):
+                of_e[i] = emitted[5 * g + i] - emitted[5 * g + 4]
+                of_c[i] = e * rate[5 * g + i] * (1.0 - 1.0 / place[g, 0])
+                of_c[i] += (1.0 - e) * rate[5 * g + 4]
+                base[i] = emitted[5 * g + 4] - of_c[i] * place[g, -1]
+            value, by_e, by_c, ee, ec, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(4):
+                here, here_e, here_c = 0.0, 0.0, 0.0  # H times its parts
+                for j in range(4):
+                    here += information[i, j] * base[j]
+                    here_e += information[i, j] * of_e[j]
+                    here_c += information[i, j] * of_c[j]
+                value += base[i] * (linear[i] - 0.5 * here)
+                by_e += of_e[i] * (linear[i] - here)
+                by_c += of_c[i] * (linear[i] - here)
+                ee, ec, cc = ee + of_e[i] * here_e, ec + of_e[i] * here_c, cc + of_c[i] * here_c
+            result = likelihood[g, m]
+            result[0], result[1], result[2] = value, by_e, by_c
+            result[3], result[4], result[5] = ee, ec, cc
 
 
 @compiled
@@ -431,88 +302,50 @@ def _eliminate(
 
 
 @compiled
-def _normalise(work: _Work) -> None:
+def _normalise(weight: Array, values: Array, slope: Array, loose: Array, stiff: Array) -> None:
     """Weights (grid, component) that add up to 1 of logarithms, in place.
 
     Each times the probability that the other emissivities lie between 0 and 1.
     """
-    weight = work.weight
     for g, k in np.ndindex(weight.shape):
         weight[g, k] = weight[g, k] if np.isfinite(weight[g, k]) else -np.inf
     highest = weight.max()
     for g, k in np.ndindex(weight.shape):
         share = np.exp(weight[g, k] - highest)
-        for m in range(work.slope.shape[2] if share > _NEGLIGIBLE else 0):
-            variance = work.slope[g, k, m] ** 2 / work.stiff[g, k] + work.loose[g, k, m]
-            value, scale = work.values[g, k, 1 + m], 1.0 / np.sqrt(2.0 * variance)
+        for m in range(slope.shape[2] if share > _NEGLIGIBLE else 0):
+            variance = slope[g, k, m] ** 2 / stiff[g, k] + loose[g, k, m]
+            value, scale = values[g, k, 1 + m], 1.0 / np.sqrt(2.0 * variance)
             share *= 0.5 * (math.erf((1.0 - value) * scale) + math.erf(value * scale))
         weight[g, k] = share if share > _NEGLIGIBLE else 0.0
     weight /= weight.sum()
 
 
 @compiled
-def _average(work: _Work, relative: int, mean: Array, spread: Array) -> None:
+def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array) -> None:
     """Mean and covariance of (e, c), or of (1 / e_1, e_m / e_1, c), over grid and components."""
+    weights, values, slope, loose, stiff = terms
     size = mean.size
     part, direction = np.empty(size), np.ones(size)
     mean[:], spread[:], direction[0] = 0.0, 0.0, 0.0
     for second in range(2):
-        for g, k in np.ndindex(work.weight.shape):
-            weight = work.weight[g, k]
+        for g, k in np.ndindex(weights.shape):
+            weight, scale = weights[g, k], 1.0 / values[g, k, 0] if relative else 1.0
             if weight == 0.0:
                 continue
-            scale = 1.0 / work.values[g, k, 0] if relative else 1.0
             for i in range(size):
-                part[i] = work.values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
-            part[0] = (scale if relative else work.values[g, k, 0]) - mean[0] * second
+                part[i] = values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
+            part[0] = (scale if relative else values[g, k, 0]) - mean[0] * second
             if second == 0:
-                for i in range(size):
-                    mean[i] += weight * part[i]
+                mean += weight * part
                 continue
             # Given e_1, c has the variance 1 / stiff, of which e_m follows a share.
-            inner = 1.0 / work.stiff[g, k]
             for m in range(size - 2):
-                direction[1 + m] = work.slope[g, k, m] * scale
-                spread[1 + m, 1 + m] += weight * work.loose[g, k, m] * scale**2
+                direction[1 + m] = slope[g, k, m] * scale
+                spread[1 + m, 1 + m] += weight * loose[g, k, m] * scale**2
             for i in range(size):
                 for j in range(size):
-                    moved = part[i] * part[j] + inner * direction[i] * direction[j]
+                    moved = part[i] * part[j] + direction[i] * direction[j] / stiff[g, k]
                     spread[i, j] += weight * moved
-
-
-def behind(
-    tile: Tile, static: Moments, measured: Array, valid: Mask, fluctuation: Array
-) -> tuple[Array, Array]:
-    r"""Background behind a measured object (time, pixel) [K], and its variance [K^2].
-
-    What the object's temperatures and deviations (2, time, pixel) [K] leave of the first band,
-
-    .. math:: r_0 = \frac{z_1 - e_1 s}{1 - e_1}, \quad
-              r = c + g (\bar r_0 - c) + k (r_0 - \bar r_0)
-
-    The object's error is common to all frames: it makes the mean over time uncertain, which leans
-    on the level c, and not the change about it. NaN where no object temperature was measured.
-    """
-    curve, e = tile.curves[0], static.emissivity[0]
-    signal, dark = curve.signal(measured[0]) - tile.reference, 1.0 - e
-    seen = np.where(valid, (tile.signals[0] - e * signal) / dark, np.nan)
-    used = np.isfinite(seen)
-    number = np.maximum(used.sum(axis=0), 1)
-
-    def mean(values: Array) -> Array:
-        return np.asarray(np.where(used, values, 0.0).sum(axis=0) / number)
-
-    noise = (tile.noise[0] / dark) ** 2
-    common = mean((e * measured[1] * curve.slope(measured[0]) / dark) ** 2) + noise / number
-    change, level = fluctuation / (fluctuation + noise), fluctuation / (fluctuation + common)
-    middle, off = mean(seen), (seen - signal) / dark
-    value = static.level + level * (middle - static.level) + change * (seen - middle)
-    # dr_0 = (r_0 - s) / (1 - e_1) de_1
-    slope = np.zeros((len(static.covariance), *seen.shape))
-    slope[0], slope[-1] = level * mean(off) + change * (off - mean(off)), 1.0 - level
-    spread = level * common + change * noise
-    through = np.einsum("itp,ijp,jtp->tp", slope, static.covariance, slope, optimize=True)
-    return value, spread + np.maximum(through, 0.0)
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Array:
@@ -522,7 +355,7 @@ def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Ar
     """
     vague = np.full_like(static.level, _VAGUE)
     bins_alone = replace(tile, signals=means.signals)
-    free = known_emissivity.solve(bins_alone, static.point, static.level, vague)
+    free = frames.solve(bins_alone, static.point, static.level, vague)
     observed, noise = free.background, free.background_variance / np.maximum(means.frames, 1.0)
     used = means.frames > 0
     count = np.maximum(used.sum(axis=0), 2)

@@ -11,8 +11,10 @@ from dbthermal import _numbers, schema
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-from dbthermal.separation import _known_emissivity as known_emissivity
+from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
+from dbthermal.separation import _windows as windows
+from dbthermal.separation._completion import curve as curves
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
 from dbthermal.separation._completion.posterior import Level, Moments
@@ -180,7 +182,7 @@ def solve_statics(
     """
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
-        means = posterior.bins(tile, valid)
+        means = curves.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
         stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
@@ -188,7 +190,7 @@ def solve_statics(
         own = 1.0 if scene.apart else prior.mean[:, :1]
         bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / own) ** 2, 1))
         bend = bend * level.fluctuation
-        data = posterior.curve(tile, means, scene.offset, stray**2, bend)
+        data = curves.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
     return static, np.maximum(variance, _LEAST[1] ** 2)
@@ -203,20 +205,21 @@ def solve(
     (2, time, pixel) [K], NaN elsewhere.
     """
     with np.errstate(all="ignore"):
-        static_parts = (static.point, static.level, variance, static.covariance)
-        found = known_emissivity.solve(tile, *static_parts, apart=scene.apart)
-        signal, left = known_emissivity.smooth(found.signal, found.white, valid, tile.time)
+        parts = static.point, static.level, variance, static.covariance
+        found = frames.solve(tile, *parts, apart=scene.apart)
+        signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
         background, spread = found.background, found.background_variance
         if (some := np.isfinite(measured[0]).any(axis=0)).any():
-            part = (tile.select_pixels(some), static.select_pixels(some), measured[..., some])
-            behind = posterior.behind(*part, valid[:, some], variance[some])
-            known = np.isfinite(behind).all(axis=0)
+            part, samples = static.select_pixels(some), (measured[..., some], valid[:, some])
+            known = part.emissivity, part.level, variance[some], part.covariance
+            behind = frames.background(tile.select_pixels(some), *samples, *known)
+            seen = np.isfinite(behind).all(axis=0)
             for film, own in zip((background, spread), behind, strict=True):
-                film[:, some] = np.where(known, own, film[:, some])
+                film[:, some] = np.where(seen, own, film[:, some])
         values: Values = {}
         films = (signal, left + found.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
-            pair = known_emissivity.temperatures(tile, np.where(valid, mean, np.nan), deviation)
+            pair = frames.temperatures(tile, np.where(valid, mean, np.nan), deviation)
             values[name], values[f"{name}_std"] = pair
         pairs = ((static.emissivity, static.emissivity_covariance), static.reflection_ratio())
         values["emissivity_covariance"] = static.emissivity_covariance

@@ -3,7 +3,6 @@
 Planes (y, x) are in single precision, and the loops along a row are taken many pixels at once.
 """
 
-from math import sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -11,11 +10,12 @@ import numpy.typing as npt
 
 from dbthermal._compiled import kept
 from dbthermal.schema import LARGEST, Status
+from dbthermal.separation._frames import bridge, newton, null_weights
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._known_emissivity import AGREE
 from dbthermal.separation._subspace import bars, kernels
 from dbthermal.separation._subspace.kernels import Table, allocating
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
+from dbthermal.separation._windows import intersect
 
 _entered: Final = kept(**kernels.ALLOCATING)
 
@@ -65,14 +65,11 @@ def camera(inputs: Inputs) -> tuple[Camera, Camera]:
     one, two = inputs.curves
     pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
     double = Camera(
-        first=kernels.table(one),
-        second=kernels.table(two),
-        counts=(one.reference_counts, two.reference_counts),
-        slopes=(one.reference_slope, two.reference_slope),
-        noise=(float(inputs.noise[0]), float(inputs.noise[1])),
-        pattern=(float(pattern[0]), float(pattern[1])),
-        lowest=one.lowest,
-        highest=one.highest,
+        *(kernels.table(one, two), kernels.table(two, one)),
+        *((one.reference_counts, two.reference_counts), (one.reference_slope, two.reference_slope)),
+        (float(inputs.noise[0]), float(inputs.noise[1])),
+        (float(pattern[0]), float(pattern[1])),
+        *(one.lowest, one.highest),
     )
     return double, _single(double)
 
@@ -108,26 +105,19 @@ def fit(means: Array, centre: int, latency: int, interval: float, frames: Array)
 
 
 class Block(NamedTuple):
-    """Frames of one mean, and what is known of their pixels."""
+    """Frames of one mean, what is known of their pixels, and their temperatures."""
 
     frames: Planes  # (band, frame, y, x) [count]
     means: Planes  # around them (mean, band, y, x) [count]
     order: npt.NDArray[np.intp]  # places of these, by time
     maps: Planes  # ratio, its variance, emissivities, elements of their covariance (map, y, x)
     gain: Planes  # noise of the second band over that of a frame (y, x)
-
-
-class Result(NamedTuple):
-    """Temperatures of the frames, and scratch rows; separate, so that none is taken to overlap."""
-
     status: npt.NDArray[np.uint32]  # (y, x)
     films: Planes  # object, deviation, background, deviation (film, frame, y, x) [K]
-    line: tuple[Planes, ...]  # terms of each pixel, see `_object`
-    out: tuple[Planes, ...]  # films of a frame, and if they are out of range
 
 
 ROWS: Final = (18, 5)
-"""Numbers of the scratch rows."""
+"""Numbers of scratch rows: terms of each pixel, see `_object`; films of a frame and their range."""
 
 
 @allocating
@@ -161,41 +151,13 @@ def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
 
 
 @allocating
-def _bridge(means: Any) -> bool:
-    """Fill means (band, mean) that are NaN by lines between their neighbours; false if too many."""
-    size, missing = means.shape[1], 0
-    for i in range(size):
-        if np.isnan(means[0, i]) or np.isnan(means[1, i]):
-            missing += 1
-            before, after = i - 1, i + 1
-            while after < size and (np.isnan(means[0, after]) or np.isnan(means[1, after])):
-                after += 1
-            if before < 0 and after == size:
-                return False
-            for band in range(2):
-                if before < 0:
-                    means[band, i] = means[band, after]
-                elif after == size:
-                    means[band, i] = means[band, before]
-                else:
-                    step = means[band, after] - means[band, before]
-                    means[band, i] = means[band, before] + step / (after - before)
-    return bool(3 * missing <= size)
-
-
-@allocating
 def _fitted(
-    means: Any,
-    slopes: tuple[float, float],
-    fit: Fit,
-    w: tuple[float, float],
-    null: float,
-    found: Any,
+    means: Any, slopes: tuple[float, float], fit: Fit, w: Any, null: float, found: Any
 ) -> float:
     """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower ones, in place.
 
     Of means less the reference (band, mean) [count]. The variance of the null combination's value;
-    see `_known_emissivity`.
+    see `_windows`.
     """
     low, high, variance = -np.inf, np.inf, np.nan
     for j in range(fit.variance.size):
@@ -207,8 +169,7 @@ def _fitted(
             two0 += value * means[1, i]
             two1 += slope * means[1, i]
         combined = w[0] / slopes[0] * one0 + w[1] / slopes[1] * two0
-        within = AGREE * sqrt(null * fit.variance[j])
-        low, high = max(low, combined - within), min(high, combined + within)
+        low, high = intersect(low, high, combined, null * fit.variance[j])
         if j > 0 and low > high:
             break
         found[0, 0], found[0, 1] = one0 / slopes[0], one1 / slopes[0]
@@ -219,43 +180,31 @@ def _fitted(
 
 @allocating
 def _object(
-    camera: Camera,
-    found: Any,
-    maps: Any,
-    noise: tuple[float, float],
-    variance: float,
-    e: tuple[float, float],
-    line: Any,
-    x: int,
+    camera: Camera, found: Any, maps: Any, noise: Any, variance: float, w: Any, line: Any, x: int
 ) -> None:
     """Object, and the terms of its frames' background, of a pixel (eq. 6, 9 and 10)."""
-    k, first, last = maps[0], e[0], e[1]
-    w = -k / (1.0 - k), 1.0 / (1.0 - k)
+    first, last, table, other = maps[2], maps[3], camera.first, camera.second
     one, two = w[0] * first, w[1] * last
     target = w[0] * found[0, 0] + w[1] * found[1, 0]
-    table, other = camera.first, camera.second
-    t = kernels.polynomial(other.inverse, (target - other.middle_signal) / other.half_signal)
-    u, v, du, dv, steepness = 0.0, 0.0, 0.0, 0.0, 1.0
+    start = kernels.polynomial(other.inverse, (target - other.middle_signal) / other.half_signal)
+    mixed = kernels.mixed(one, table.signal, two, other.signal)
+    place, scale = (start - table.middle) / table.half, 1.0 / table.half
     for _ in range(_NEWTON + 1):
-        p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
-        u, v = kernels.polynomial(table.signal, p), kernels.polynomial(other.signal, q)
-        du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, q)
-        steepness = one * du + two * dv
-        step = (target - one * u - two * v) / steepness
-        t += step
-        if abs(step) < _NEAR:  # what is left is of the step's square
+        place, lack, slope = newton(mixed, target, place)
+        if abs(lack) < _NEAR * scale * abs(slope):
             break
-    u, v = u + du * step, v + dv * step
-    p = (t - table.middle) / table.half
+    u, du = kernels.with_slope(table.signal, place)
+    v, dv = kernels.with_slope(other.signal, place)
+    du, dv, steepness = du * scale, dv * scale, (one * du + two * dv) * scale
     # Eq. 6 by implicit differentiation, as in `_subspace.bars`.
     sensitivity = (v + first * (u - v) - found[0, 0]) / steepness
     epsilon = w[1] ** 2 * maps[1]
     through = sensitivity**2 * epsilon / (1.0 - bars.NORMAL95**2 * epsilon) ** 2
     smooth = variance / steepness**2
     patterned = camera.pattern[0] * w[0] / steepness, camera.pattern[1] * w[1] / steepness
-    std = sqrt(through + smooth + patterned[0] ** 2 + patterned[1] ** 2)
-    good = abs(p) <= 1.0 and std < USELESS
-    line[0][x] = t if good else np.nan
+    std = np.sqrt(through + smooth + patterned[0] ** 2 + patterned[1] ** 2)
+    good = abs(place) <= 1.0 and std < USELESS
+    line[0][x] = table.middle + table.half * place if good else np.nan
     line[1][x] = (w[0] * found[0, 1] + w[1] * found[1, 1]) / steepness
     line[2][x] = std if good else np.nan
     # The background of eq. 9 with its variance, by the emissivities and their covariance:
@@ -271,7 +220,8 @@ def _object(
     offset0 = camera.pattern[0] * direct[0] - slope * patterned[0]
     offset1 = camera.pattern[1] * direct[1] - slope * patterned[1]
     physical = 0 < first < 1 and 0 < last < 1
-    line[3][x], line[4][x] = direct if physical else (np.nan, np.nan)
+    line[3][x] = 1.0 / (1.0 - first) if physical else np.nan
+    line[4][x] = 1.0 / (1.0 - last) if physical else np.nan
     line[5][x], line[6][x] = first * u, first * du * line[1][x]
     line[7][x], line[8][x] = last * v, last * dv * line[1][x]
     line[9][x], line[10][x] = share * a[0], share * a[1]
@@ -284,26 +234,27 @@ def _object(
 @allocating
 def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
     """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
-    table, other = camera.first, camera.second
+    table, other, scale = camera.first, camera.second, _ONE / camera.first.half
     for x in range(one.size):
         z0 = (one[x] - camera.counts[0]) / camera.slopes[0]
         z1 = (two[x] - camera.counts[1]) / camera.slopes[1]
         valid = _ZERO * (z0 + z1)  # NaN where one is none
-        r0, r1 = (
-            line[3][x] * (z0 - line[5][x] - line[6][x] * dt),
-            line[4][x] * (z1 - line[7][x] - line[8][x] * dt),
-        )
-        guess = (r0 + r1 - table.middle_signal) / table.half_signal
+        # Reflected signals, and one Gauss-Newton step of eq. 9 from that of their mean.
+        share0, share1 = line[13][x], line[14][x]
+        r0 = line[3][x] * (z0 - line[5][x] - line[6][x] * dt)
+        r1 = line[4][x] * (z1 - line[7][x] - line[8][x] * dt)
+        guess = (share0 * r0 + share1 * r1 - table.middle_signal) / table.half_signal
         t = kernels.polynomial(table.inverse, guess)
-        # One Gauss-Newton step of eq. 9.
-        p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
-        du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, q)
-        curvature = line[13][x] * du * du + line[14][x] * dv * dv
-        step = du * (r0 - line[13][x] * kernels.polynomial(table.signal, p))
-        step += dv * (r1 - line[14][x] * kernels.polynomial(other.signal, q))
-        x_now, y_now = line[0][x] + line[1][x] * dt + valid, t + step / curvature
+        p = (t - table.middle) * scale
+        du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, p)
+        step = share0 * du * (r0 - kernels.polynomial(table.signal, p))
+        step += share1 * dv * (r1 - kernels.polynomial(other.signal, p))
+        curvature = share0 * du * du + share1 * dv * dv
+        x_now = line[0][x] + line[1][x] * dt + valid
+        y_now = t + step / curvature
         contrast = y_now - x_now
-        c0, c1 = line[3][x] * contrast - line[9][x], line[4][x] * contrast - line[10][x]
+        c0 = share0 * line[3][x] * contrast - line[9][x]
+        c1 = share1 * line[4][x] * contrast - line[10][x]
         variance = line[11][x] / curvature + line[12][x]
         variance += c0 * (c0 * line[15][x] + _TWO * c1 * line[16][x]) + c1 * c1 * line[17][x]
         y_std = np.sqrt(variance) + (_ZERO if abs(p) <= _ONE else _NAN)
@@ -316,53 +267,55 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
 
 
 @allocating
-def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
+def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
-    line, here, found, pixel = work
+    (line, here, found, maps, pairs), status = work, block.status[y, x]
+    size, (ratio, noise, w), missing = block.order.size, pairs, 0
     defined = (status & _UNDEFINED) == 0 and (status & _AMBIGUOUS) != _AMBIGUOUS
-    if defined:
-        missing = 0
-        for i in range(block.order.size):
-            one, two = block.means[block.order[i], 0, y, x], block.means[block.order[i], 1, y, x]
-            here[0, i], here[1, i] = one - camera.counts[0], two - camera.counts[1]
-            missing += np.isnan(one) or np.isnan(two)
-        defined = missing == 0 or _bridge(here)
-    if not defined:
+    for i in range(size if defined else 0):
+        one, two = block.means[block.order[i], 0, y, x], block.means[block.order[i], 1, y, x]
+        here[0, i], here[1, i] = one - camera.counts[0], two - camera.counts[1]
+        if np.isnan(one) or np.isnan(two):  # a line between the same means in both bands
+            here[0, i], here[1, i], missing = np.nan, np.nan, missing + 1
+        here[2, i], here[3, i] = 0.0, i
+    if not defined or 3 * missing > size:
         for row in line:
             row[x] = np.nan
         return
+    for band in range(2 if missing > 0 else 0):
+        bridge(here[band], here[2], here[3])
     for i in range(7):
-        pixel[i] = block.maps[i, y, x]
-    k, noise = pixel[0], (camera.noise[0], camera.noise[1] * block.gain[y, x])
-    first, last = pixel[2], pixel[3]
-    if np.isnan(first):  # of a constant object, as in `_subspace.pixel`
-        largest = max(1.0, k)
-        first = 0.5 * (1.0 + (largest - 1.0) / largest)
-        last = 1.0 - k * (1.0 - first)
-    w = -k / (1.0 - k), 1.0 / (1.0 - k)
-    null = (w[0] * noise[0]) ** 2 + (w[1] * noise[1]) ** 2
+        maps[i] = block.maps[i, y, x]
+    ratio[1], noise[0], noise[1] = maps[0], camera.noise[0], camera.noise[1] * block.gain[y, x]
+    if np.isnan(maps[2]):  # of a constant object, as in `_subspace.pixel`
+        largest = max(1.0, ratio[1])
+        maps[2] = 0.5 * (1.0 + (largest - 1.0) / largest)
+        maps[3] = 1.0 - ratio[1] * (1.0 - maps[2])
+    null = null_weights(ratio, noise, w)
     variance = _fitted(here, camera.slopes, fit, w, null, found)
-    _object(camera, found, pixel, noise, variance, (first, last), line, x)
+    _object(camera, found, maps, noise, variance, w, line, x)
 
 
 @_entered
 def emit(
-    block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
+    block: Block, fit: Fit, camera: Camera, fine: Camera, scratch: Any, top: int, stop: int
 ) -> None:
     """Films of the frames of one mean, and in the status the calibrated range, in place.
 
-    With the camera's numbers in double and in single precision.
+    With the camera's numbers in double and in single precision; the scratch rows are separate, so
+    that none is taken to overlap.
     """
-    line, out, films = result.line, result.out, result.films
-    work = line, np.empty((2, block.order.size)), np.empty((2, 2)), np.empty(7)
+    line, out = scratch
+    pairs = np.ones(2), np.empty(2), np.empty(2)
+    work = line, np.empty((4, block.order.size)), np.empty((2, 2)), np.empty(7), pairs
     for y in range(top, stop):
-        for x in range(films.shape[3]):
-            _terms(block, fit, camera, y, result.status[y, x], x, work)
+        for x in range(block.films.shape[3]):
+            _terms(block, fit, camera, y, x, work)
         out[4][:] = 0.0
-        for f in range(films.shape[1]):
+        for f in range(block.films.shape[1]):
             one, two = block.frames[0, f, y], block.frames[1, f, y]
             _frame(one, two, line, fine, np.float32(fit.time[f]), out)
             for film in range(4):
-                films[film, f, y] = out[film]
-        for x in range(films.shape[3]):
-            result.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)
+                block.films[film, f, y] = out[film]
+        for x in range(block.films.shape[3]):
+            block.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)

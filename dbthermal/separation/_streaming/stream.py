@@ -141,6 +141,8 @@ class Stream:
         inputs = _inputs.check(template, **known | {"response": inputs.response})
         self._template, self._kind = template.isel(time=0, drop=True), response_kind
         self._shape = shape = (template.sizes["y"], template.sizes["x"])
+        height = shape[0]
+        self._rows = [slice(y, min(y + _ROWS, height)) for y in range(0, height, _ROWS)]
         self._camera = kernels.camera(inputs)
         self._status, self._gain = np.zeros(shape, np.uint32), np.ones(shape, np.float32)
         if "status" in template:
@@ -313,7 +315,7 @@ class Stream:
         """Take the full block: its mean into those of now and into the history."""
         slot, place = self._blocks % len(self._frames), self._blocks % len(self._means)
         frames, mean, time = self._frames[slot], self._means[place], self._frame_times[slot].mean()
-        self._apply(lambda rows: kernels.absorb(frames, mean, rows.start, rows.stop), self._rows())
+        self._apply(lambda rows: kernels.absorb(frames, mean, rows.start, rows.stop), self._rows)
         self._mean_times = np.column_stack([self._mean_times, (time, self._segment)])
         self._mean_times = self._mean_times[:, -len(self._means) :]
         self._history.add(mean, float(time), self._segment)
@@ -325,33 +327,27 @@ class Stream:
         times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
         order = np.arange(self._blocks - means, self._blocks) % len(self._means)
         films = np.empty((4, self._block, *self._shape), np.float32)
-        maps, status = self._history.maps, self._history.status.copy()
-        block = kernels.Block(self._frames[slot], self._means, order, maps, self._gain)
+        status = self._history.status.copy()
+        pixels = self._history.maps, self._gain, status, films
+        block = kernels.Block(self._frames[slot], self._means, order, *pixels)
         interval, centre = self._block / self._rate, means - 1 - self._half
         fit = kernels.fit(self._mean_times, centre, self._half, interval, times)
-        self._apply(partial(self._temperatures, block, fit, status, films), self._rows())
+        self._apply(partial(self._temperatures, block, fit), self._rows)
         return times, films, status
 
-    def _temperatures(
-        self,
-        block: kernels.Block,
-        fit: kernels.Fit,
-        status: quality.Bits,
-        films: Planes,
-        rows: slice,
-    ) -> None:
+    def _temperatures(self, block: kernels.Block, fit: kernels.Fit, rows: slice) -> None:
         """Films and status of some rows of a block, in place."""
-        scratch = (tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
-        result = kernels.Result(status, films, *scratch)
-        kernels.emit(block, fit, *self._camera, result, rows.start, rows.stop)
+        scratch = tuple(tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
+        kernels.emit(block, fit, *self._camera, scratch, rows.start, rows.stop)
 
     def _warm(self) -> None:
         """Compile all that frames need, before the first one comes."""
         kernels.absorb(self._frames[0], self._means[0], 0, 0)
         films, history = np.empty((4, self._block, *self._shape), np.float32), self._history
         fit = kernels.fit(np.zeros((2, 1)), 0, 1, 1.0, np.zeros(self._block))
-        block = kernels.Block(self._frames[0], self._means, np.arange(1), history.maps, self._gain)
-        self._temperatures(block, fit, history.status, films, slice(0, 0))
+        pixels = history.maps, self._gain, history.status, films
+        block = kernels.Block(self._frames[0], self._means, np.arange(1), *pixels)
+        self._temperatures(block, fit, slice(0, 0))
         history.warm()
 
     def _dataset(self, known: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
@@ -384,10 +380,6 @@ class Stream:
         )
         return result.isel(band=back, other_band=back).assign_attrs(lost_frames=self.lost_frames)
 
-    def _rows(self) -> list[slice]:
-        """Rows that threads take at once."""
-        return [slice(y, min(y + _ROWS, self._shape[0])) for y in range(0, self._shape[0], _ROWS)]
-
     def _apply(self, function: Callable[[Any], None], parts: Iterable[Any]) -> None:
         """Apply a function to parts of the image, in threads."""
         list(self._threads.map(function, parts))
@@ -399,5 +391,5 @@ class Stream:
         self._gain[:] = np.sqrt((weights**2).sum(axis=1)).reshape(self._shape)
         unpaired = (np.diff(weights.indptr) == 0).reshape(self._shape)
         self._status |= quality.status_bits({Status.NO_REFLECTION_PAIR: unpaired})
-        edges = [rows.start * width for rows in self._rows()] + [weights.shape[0]]
+        edges = [rows.start * width for rows in self._rows] + [weights.shape[0]]
         self._resample = [weights[start:stop] for start, stop in pairwise(edges)]

@@ -40,7 +40,14 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
 
 @inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    """Variance of the slope by a background that walks, and its bound; `tensors._walk`."""
+    r"""
+    Variance [1] of the slope by a background that walks, and its upper bound.
+
+    With the unit coefficients :math:`\xi_j` of the object's curve of norm :math:`|u|`, and the
+    energy A of a random walk in the residual's spectrum, the larger of those of two octaves; for
+    the bound, at the upper end of their 95 % interval,
+    :math:`\mathrm{var}(e_1) = A / |u|^2 \sum_j \xi_j^2 / j^2`.
+    """
     degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
     for t in range(kept.size):
@@ -66,7 +73,12 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 @inlined
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
-    """Variance of the slope by a linear drift, as `tensors._linear`."""
+    r"""
+    Variance [1] of the slope by a linear drift of size d, seen with a variance v.
+
+    :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
+    Weighted twice, for a large drift takes the weight from the frames that tell it best.
+    """
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
     slope, level, _ = regression.moments(emitted, drift, weights)
@@ -79,9 +91,8 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     # Once more, with the weights of the residual less that drift.
     inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
     for t in range(frames):
-        off = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
-        inside = max(1.0 - off * off, 0.0)
-        kept[t] = inside * inside
+        off = residual[t] - size * (drift[t] - level - slope * emitted[t])
+        kept[t] = regression.bisquare(off * inverse)
     slope, level, _ = regression.moments(emitted, drift, kept)
     size, length = 0.0, 0.0
     for t in range(frames):
@@ -171,40 +182,34 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -
     epsilon = ratios.inverse_energy * null + by_level**2
     restless = _propagate(model, ratios, epsilon, work)
     _background(model, ratios, epsilon, noise_variance + drift_variance, work)
-    _covariance(model, ratios, noise_variance + drift_variance, by_level, work, covariance)
+    _covariance(model, ratios, noise_variance + drift_variance, work, covariance)
     return Bars(epsilon, noise_variance, drift_variance, restless)
 
 
 @inlined
 def _covariance(
-    model: Model, ratios: Ratio, slope_variance: float, by_level: float, work: Work, covariance: Any
+    model: Model, ratios: Ratio, slope_variance: float, work: Work, covariance: Any
 ) -> None:
     r"""
     Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
 
     :math:`\delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o` and
-    :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`.
+    :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`, with
+    :math:`\epsilon = \sum w_m \delta \kappa_m`.
     """
-    first, k, w, energy = work.emissivity[0], work.ratio, work.null_weights, ratios.inverse_energy
-    reflectivity, square = 1.0 - first, model.noise[0] ** 2
-    through = slope_variance + (first * reflectivity) ** 2 * ratios.null_variance * energy
-    cross = first * reflectivity**2 * energy
-    for m in range(k.size):
-        # Of kappa_m with epsilon, over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
-        one = model.noise[m] ** 2 * w[m] - k[m] * square * w[0] if m > 0 else 0.0
-        for n in range(m + 1):
-            two = model.noise[n] ** 2 * w[n] - k[n] * square * w[0] if n > 0 else 0.0
-            value = k[m] * k[n] * through + cross * (k[m] * two + k[n] * one)
-            # Of the ratios with one another, kappa_m kappa_n s_1^2, and their variances (eq. 4).
-            between = k[m] * k[n] * square if n > 0 else 0.0
-            between += model.noise[m] ** 2 if m == n and n > 0 else 0.0
-            # Through the background's level, -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
-            levels = (
-                k[m] * first * by_level + work.level[m],
-                k[n] * first * by_level + work.level[n],
-            )
-            value += reflectivity**2 * (between * energy + levels[0] * levels[1])
-            covariance[m, n] = covariance[n, m] = value
+    k, change, error, bands = work.ratio, work.turned, work.turns, work.ratio.size
+    first, square = work.emissivity[0], model.noise[0] ** 2
+    for m, n in np.ndindex(bands, bands):
+        same = 1.0 if m == n else 0.0
+        change[m, n] = (1.0 - first) * (first * k[m] * work.null_weights[n] + same)
+        # Of the ratios (eq. 4), and through the background's level; the first one is 1.
+        error[m, n] = ratios.inverse_energy * (k[m] * k[n] * square + same * model.noise[m] ** 2)
+        error[m, n] += work.level[m] * work.level[n]
+    for m, n in np.ndindex(bands, bands):
+        covariance[m, n] = k[m] * k[n] * slope_variance
+        for i in range(1, bands):
+            for j in range(1, bands):
+                covariance[m, n] += change[m, i] * error[i, j] * change[n, j]
 
 
 @inlined
@@ -300,7 +305,17 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
 
 @inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
-    """Autocorrelation, delay of the bands, and whether the residual is noise; see `tensors`."""
+    r"""
+    Autocorrelation, delay of the bands, and whether the residual is noise.
+
+    A band that is a frame late, or early, leaves the difference between two frames in the null
+    residual r, which is held against the first band's differences, a matched filter,
+    :math:`\sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2`; the last term takes out that r
+    holds the noise of :math:`z_1(t)`. A delay that changes sign, as after an interpolation between
+    frames, is seen in the energy of r in the frames at a change, over that of the noise: a
+    chi-square variable of few degrees of freedom, whose cube root is nearly normal (Wilson,
+    Hilferty 1931, doi:10.1073/pnas.17.12.684). The delay is the largest score in magnitude.
+    """
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
@@ -338,7 +353,14 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 
 @inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
-    """As `tensors._unexplained`."""
+    r"""
+    Say whether the null residual r [K] is no white noise in some part of time.
+
+    Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
+    object that the smooth functions do not follow. Or blocks differ in its correlation with the
+    rapid changes, which have not one ratio: :math:`\sum_b (\sum_t r h)^2 / \sigma^2 \sum_t h^2`,
+    with :math:`h = z_1 - r \, w_1 s_1^2 / \sigma^2` of independent noise, is a chi-square variable.
+    """
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
     sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
     products, squares = work.kernel, work.mean

@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from dbthermal._arrays import Array
+from dbthermal.separation._frames import newton, null_weights
 from dbthermal.separation._subspace import kernels, reflection_ratio, regression
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._tiles import Whole
@@ -166,7 +167,7 @@ def ratios(model: Model, work: Work) -> Ratio:
         for m in range(1, bands):
             ratio[m] = material[5 + m] + (own * (ratio[m] - material[5 + m]) if own > 0 else 0.0)
         inverse = (1.0 - own) * (spread + (1.0 - own) * material[0])
-    variance = _null_combination(model, work)
+    variance = null_weights(ratio, noise, work.null_weights)
     last = work.scatter[orders - 1]
     least, whole = _across(last, work, pooled), 0.0
     for m in range(bands):
@@ -216,22 +217,6 @@ def _agrees(scatter: Array, axis: Array, limit: float) -> bool:
         along += axis[m] * turned
         square += turned**2
     return square / along - along < limit
-
-
-@inlined
-def _null_combination(model: Model, work: Work) -> float:
-    """Weights w of eq. 5, in place, and the variance; as `reflection_ratio.null_combination`."""
-    noise, ratio, weights = model.noise, work.ratio, work.null_weights
-    product, length, rest = 0.0, 0.0, 0.0
-    for m in range(noise.size):
-        product += ratio[m] / noise[m] ** 2
-        length += (ratio[m] / noise[m]) ** 2
-    for m in range(noise.size):
-        weights[m] = (1.0 - product / length * ratio[m]) / noise[m]
-        rest += weights[m] ** 2
-    for m in range(noise.size):
-        weights[m] /= rest * noise[m]
-    return 1.0 / rest
 
 
 @inlined
@@ -331,10 +316,9 @@ def _approach(model: Model, emissivity: float, work: Work, emitted: Array) -> No
     mixed = _mixed(model, work, emissivity)
     for t in range(now.size):
         x = (now[t] - middle) * scale
-        value, slope = kernels.with_slope(mixed, x)
-        y = x + (target[t] - value) / slope
+        y, work.lack[t], slope = newton(mixed, target[t], x)
         outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
-        work.lack[t], work.steepness[t] = target[t] - value, slope * scale
+        work.steepness[t] = slope * scale
         after[t] = middle + first.half * y
         emitted[t] = kernels.polynomial(first.signal, y)
     if outside > 0.0:

@@ -64,6 +64,13 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
     return float(np.uint32(lowest + above).view(np.float32))
 
 
+@compiled
+def bisquare(off: float) -> float:
+    """Tukey's weight of a residual over the tuning constant times the scale, 0 beyond 1."""
+    inside = max(1.0 - off * off, 0.0)
+    return inside * inside
+
+
 def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
     """Weighted line, and that of bisquare weights, of arrays of a precision, compiled."""
     zero, one = real(0.0), real(1.0)
@@ -189,9 +196,7 @@ def regress(
     inverse = 1.0 / (TUNING * scale)
     for t in range(x.size):
         residual[t] = y[t] - intercept - slope * x[t]
-        off = (y[t] - last[1] - last[0] * x[t]) * inverse
-        inside = max(1.0 - off * off, 0.0)
-        weights[t] = inside * inside
+        weights[t] = bisquare((y[t] - last[1] - last[0] * x[t]) * inverse)
     kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
     for t in range(1, x.size):
         one = residual[t] * weights[t]
