@@ -15,8 +15,7 @@ from scipy.ndimage import gaussian_filter
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import BORDER, ROWS, Movie, products
-from dbthermal.alignment._views import TAPS, interpolation
+from dbthermal.alignment._products import Movie, blurred, products, splines
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
@@ -26,7 +25,7 @@ BLUR: Final = 1.2
 
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
-SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+_SLOPE_NOISE: Final = _VALUE_NOISE / (np.sqrt(2.0) * BLUR)
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
@@ -36,6 +35,7 @@ _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 _PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
+_NOISE_PIXELS: Final = 256  # that tell the noise of a movie
 _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
 
 
@@ -43,7 +43,7 @@ _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is no
 class Movies:
     """Rapid changes of one picture (y, x, time) [K], blurred alike."""
 
-    first: Movie
+    first: Movie  # its splines
     others: list[Movie]
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
@@ -61,19 +61,17 @@ class Movies:
         factor: int,
         whole: float = 0.0,
     ) -> "Movies":
-        """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
+        """Movies of pixels that are so many times coarser than the mask's."""
         mostly = binned(valid.astype(np.float64), factor) > 0.5
-        some = tuple(part[::3] for part in np.nonzero(mostly))
+        some = tuple(part[:: max(1, part.size // _NOISE_PIXELS)] for part in np.nonzero(mostly))
         if some[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
             usual = [MAD * np.median(np.abs(movie[some])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
-        for movie in movies:
-            gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
         return cls(
-            movies[0],
-            movies[1:],
+            splines(movies[0], BLUR),
+            [blurred(movie, BLUR) for movie in movies[1:]],
             mostly,
             noise / factor,
             freedom,
@@ -146,7 +144,7 @@ def _moderate(movie: Movie) -> Movie:
     return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
 
 
-def _information(movies: Movies, padded: Movie, shift: Array) -> Information:
+def _information(movies: Movies, shift: Array) -> Information:
     r"""
     Information on a step of the field at each pixel, by Gauss-Newton.
 
@@ -162,9 +160,9 @@ def _information(movies: Movies, padded: Movie, shift: Array) -> Information:
     noise = movies.noise[0] * _VALUE_NOISE
     tensor, gradient, chance = (np.zeros((size, *used.shape)) for size in (3, 2, 1))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(padded, movies.others, places) * used
+    moments = products(movies.first, movies.others, places) * used
     for parts, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = parts
+        yy, yx, my, yh, xx, mx, xh, mm, mh, hh = parts
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto = gaussian_filter(mm, WINDOW) - number * noise**2
         ratio = gaussian_filter(mh, WINDOW) / np.maximum(auto, 0.1 * number * noise**2)
@@ -175,7 +173,7 @@ def _information(movies: Movies, padded: Movie, shift: Array) -> Information:
         excess = residual / (variance * _VALUE_NOISE**2) - number
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used / (misfit * variance)
-        less = movies.freedom * (movies.noise[0] * SLOPE_NOISE) ** 2
+        less = movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less
@@ -196,16 +194,18 @@ def _positive(tensor: Array) -> Array:
     return np.stack([result[..., 0, 0], result[..., 0, 1], result[..., 1, 1]])
 
 
-def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | None:
-    """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
+def start(
+    movies: Movies, films: list[Movie], freedom: float, spline: Spline, reach: tuple[int, int]
+) -> Field | None:
+    """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
     # Changes as large as there are seldom are cut: an object's, if rapid.
     first, *others = (
         part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
-        for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
+        for part, level in zip((blurred(film, BLUR) for film in films), movies.noise, strict=True)
     )
-    functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES)
+    functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES).astype(np.float32)
     first, *others = (part @ functions for part in (first, *others))
-    freedom = movies.freedom * functions.shape[1] / functions.shape[0]
+    freedom *= functions.shape[1] / functions.shape[0]
     rough, share = _whole_pixels(first, others, freedom, reach)
     share *= movies.valid
     if not share.any():
@@ -230,11 +230,9 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    border = (BORDER, BORDER)
-    padded = np.pad(movies.first, (border, border, (0, 0)), mode="reflect")
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
-        data = _information(movies, padded, shift)
+        data = _information(movies, shift)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
         if change.mean() < _CONVERGED * movies.factor:
@@ -246,7 +244,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     r"""
     Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate that of the first movie [K/s]. What moves one way only
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What moves one way only
     is shifted or late. One Newton step of both, the shift free in each window: with the slopes g of
     the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the others over their
     ratio to it, and sums over time and a window,
@@ -258,36 +256,17 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
     that the moved movie explains, and all of it, in variances of noise.
     """
-    places, (_, width, count) = np.indices(movies.shape) + shift, movies.first.shape
-    steps = 0.5 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[..., np.newaxis, np.newaxis]
-    weights = [interpolation(places + step, TAPS) for step in steps]
+    places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    for part in weights:  # none near the border
-        used &= (np.diff(part.indptr) > 0).reshape(used.shape)
-    sums = np.zeros((len(movies.others), 14, *movies.shape))
-    for start in range(0, movies.shape[0], ROWS):
-        rows = slice(start, min(start + ROWS, movies.shape[0]))
-        pixels = slice(rows.start * width, rows.stop * width)
-        moved, below, above, left, right = (
-            (part[pixels] @ movies.first.reshape(-1, count)).reshape(-1, width, count)
-            for part in weights
-        )
-        change = (weights[0][pixels] @ rate.reshape(-1, count)).reshape(moved.shape)
-        four = [below - above, right - left, change, moved]
-        for other, out in zip(movies.others, sums, strict=True):
-            pairs = [(a, b) for i, a in enumerate(four) for b in four[i:]]
-            pairs += [(a, other[rows]) for a in four]
-            for place, (one, two) in enumerate(pairs):
-                out[place, rows] = np.einsum("yxt,yxt->yx", one, two)
+    sums = products(movies.first, movies.others, places, rate) * used
     gradient, information, explained, energy = np.zeros((4, *movies.shape))
-    parts = zip(sums * used, movies.others, movies.noise[1:], strict=True)
-    for part, other, level in parts:
-        yy, yx, yt, ym, xx, xt, xm, tt, tm, mm, yh, xh, th, mh = gaussian_filter(
+    for part, level in zip(sums, movies.noise[1:], strict=True):
+        yy, yx, yt, ym, yh, xx, xt, xm, xh, tt, tm, th, mm, mh, hh = gaussian_filter(
             part, WINDOW, axes=(-2, -1)
         )
         # Noise of the slopes: half of them at most.
         less = gaussian_filter(used * 1.0, WINDOW) * movies.freedom
-        less *= (movies.noise[0] * SLOPE_NOISE) ** 2
+        less *= (movies.noise[0] * _SLOPE_NOISE) ** 2
         yy, xx = (one - np.minimum(less, 0.5 * one) for one in (yy, xx))
         ratio = mh / np.maximum(mm, np.finfo(np.float64).tiny)
         ridge = _RIDGE * (yy + xx).max()
@@ -296,9 +275,8 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         slope -= ratio[..., np.newaxis] * np.stack([ym, xm], axis=-1)
         share = np.linalg.solve(both, cross[..., np.newaxis])[..., 0]
         late = th - ratio * tm - (share * slope).sum(axis=-1)
-        own = gaussian_filter(np.einsum("yxt,yxt->yx", other, other) * used, WINDOW)
         explained += np.where(used, ratio * np.maximum(mh, 0.0) / level**2, 0.0)
-        energy += np.where(used, own / level**2, 0.0)
+        energy += np.where(used, hh / level**2, 0.0)
         gradient += np.where(used, ratio / level**2 * late, 0.0)
         information += np.where(used, ratio**2 / level**2 * (tt - (share * cross).sum(-1)), 0.0)
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]

@@ -27,6 +27,7 @@ from dbthermal.alignment._products import Movie
 SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _ROWS: Final = 32  # that are read at a time
+_FOR_EACH: Final = 8  # pixels that tell a function of time
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
@@ -161,12 +162,10 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
             freedom, pictures = _freedom(functions), capture.planes(functions)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames]
-            # Planes of a rate, by the functions that a rate's transpose makes of these.
-            rates = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions
-            rate = Movies.blurred(
-                capture.planes(rates)[:1], capture.valid, capture.noise, freedom, 1
-            )
-            late, std, energy = matching.delay(level, rate.first, field.on(level.centres()))
+            # What a rate's planes are of these, by its functions.
+            change = np.gradient(np.eye(times.size), times, axis=0).T @ functions
+            rate = np.linalg.lstsq(functions, change)[0].astype(np.float32)
+            late, std, energy = matching.delay(level, rate, field.on(level.centres()))
             result = _result(corrected, capture, field, data, spread)
             result["energy"] = ("part", "y", "x"), energy
             return result.assign_attrs(delay=late, delay_std=std)
@@ -218,13 +217,16 @@ class _Capture:
         rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
         return cls(counts, order, slopes[order], noise[order], valid, frames, rough)
 
-    def blocks(self, height: int) -> Iterator[tuple[slice, Array]]:
-        """Rows, and their signals (band, y, x, time) [K] in the frames, NaN where missing."""
+    def blocks(self, height: int) -> Iterator[tuple[slice, Movie, Mask]]:
+        """Rows, their films (band, time, y, x) [K] in the frames, and pixels that lack few."""
         for start in range(0, self.valid.shape[0], height):
             rows = slice(start, start + height)
-            values = self.counts.isel(y=rows).values[self.bands][:, self.frames]
-            values = np.where(schema.measured(values), values, np.nan)
-            yield rows, np.moveaxis(values, 1, -1) / self.slopes[:, None, None, None]
+            films = self.counts.isel(y=rows).values[self.bands][:, self.frames]
+            films = films.astype(np.float32, copy=False)
+            filled, share = bridged(films.reshape(*films.shape[:2], -1))
+            filled = filled / self.slopes.astype(np.float32)[:, None, None]
+            few = np.all(share >= 1.0 - _MISSING, axis=0).reshape(films.shape[2:])
+            yield rows, filled.reshape(films.shape), few
 
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
@@ -235,31 +237,43 @@ class _Capture:
         penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
-    def functions(self, signals: Array, period: float) -> Array:
+    def functions(self, signals: Array, period: float) -> Movie:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
-        rapid = _rapid(signals.reshape(-1, signals.shape[-1]), smoothing)
-        return _rapid(smooth.leading(rapid, _PLANES).T, smoothing).T
+        some = signals.reshape(-1, signals.shape[-1])
+        some = some[:: max(1, len(some) // (_FOR_EACH * _PLANES))]
+        functions = _rapid(smooth.leading(_rapid(some, smoothing), _PLANES).T, smoothing).T
+        return np.ascontiguousarray(functions, np.float32)
 
-    def planes(self, functions: Array) -> list[Movie]:
+    def planes(self, functions: Movie) -> list[Movie]:
         """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""
         result = np.empty((self.bands.size, *self.valid.shape, functions.shape[1]), np.float32)
-        for rows, signals in self.blocks(_ROWS):
-            for movie, signal in zip(result, signals, strict=True):
-                movie[rows] = _filled(signal) @ functions
-        nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
-        result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+        for rows, films, _ in self.blocks(_ROWS):
+            for movie, film in zip(result, films, strict=True):
+                planes = film.reshape(len(film), -1).T @ functions
+                movie[rows] = planes.reshape(movie[rows].shape)
+        if not self.valid.all():
+            nearest = distance_transform_edt(
+                ~self.valid, return_distances=False, return_indices=True
+            )
+            result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
         return list(result)
 
-    def binned(self, factor: int) -> tuple[list[Array], Mask]:
+    def binned(self, factor: int) -> tuple[list[Movie], Mask]:
         """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
         valid, parts = self.valid.copy(), []
-        for rows, signals in self.blocks(max(1, _ROWS // factor) * factor):
-            valid[rows] &= np.all(np.isnan(signals).mean(axis=-1) <= _MISSING, axis=0)
+        for rows, films, few in self.blocks(max(1, _ROWS // factor) * factor):
+            valid[rows] &= few
             here = valid[rows, :, np.newaxis].astype(np.float64)
             share = np.maximum(matching.binned(here, factor), factor**-2)
-            parts.append([matching.binned(_filled(s) * here, factor) / share for s in signals])
-        return [np.concatenate(band) for band in zip(*parts, strict=True)], valid
+            films = films if valid[rows].all() else np.where(valid[rows], films, np.float32(0.0))
+            squares = sum(
+                films[:, :, i : films.shape[2] // factor * factor : factor]
+                [..., j : films.shape[3] // factor * factor : factor]
+                for i, j in np.ndindex(factor, factor)
+            ) / np.float32(factor**2)
+            parts.append(np.moveaxis(squares, 1, -1) / share.astype(np.float32))
+        return list(np.concatenate(parts, axis=1)), valid
 
 
 def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, Array, float, Field]:
@@ -272,7 +286,7 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         if frames < 2 * period and result is not None:
             break
         functions = capture.functions(signals[0], period)
-        pictures = [(part @ functions).astype(np.float32) for part in signals]
+        pictures = [part @ functions for part in signals]
         level = Movies.blurred(
             pictures, valid, capture.noise, _freedom(functions), factor, _white(frames, period)
         )
@@ -280,10 +294,8 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         if begin is None:
             # Whole frames: what is rare in a pixel's time is cut.
             smoothing = capture.smoothing(period)
-            pictures = [_rapid(part, smoothing).astype(np.float32) for part in signals]
-            freedom = _white(frames, period)
-            whole = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
-            begin = matching.start(whole, spline, reach)
+            films = [_rapid(part, smoothing).astype(np.float32) for part in signals]
+            begin = matching.start(level, films, _white(frames, period), spline, reach)
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
@@ -345,14 +357,29 @@ def _white(frames: int, period: float) -> float:
     return float(np.sum((ratio / (1.0 + ratio)) ** 2))
 
 
-def _filled(signal: Array) -> Array:
-    """Signal (y, x, time) with missing samples on the line between those before and after."""
-    places = np.arange(signal.shape[-1])
-    for row, column in np.argwhere(np.isnan(signal).any(axis=-1)):
-        part = signal[row, column]
-        here = np.isfinite(part)
-        part[:] = np.interp(places, places[here], part[here]) if here.any() else 0.0
-    return signal
+def bridged(films: Movie) -> tuple[Movie, Array]:
+    """Films (band, time, pixel) with missing samples on the line between those before and after.
+
+    And the share of the samples (band, pixel) that are measured; a pixel without any is zero.
+    """
+    known = schema.measured(films)
+    if known.all():
+        return films, np.ones((len(films), films.shape[2]))
+    bands, pixels = np.nonzero(~known.all(axis=1))
+    film, here = films[bands, :, pixels], known[bands, :, pixels]
+    frame = np.arange(film.shape[1])
+    before = np.maximum.accumulate(np.where(here, frame, -1), axis=1)
+    after = np.minimum.accumulate(np.where(here, frame, frame.size)[:, ::-1], axis=1)[:, ::-1]
+    before, after = (
+        np.clip(np.where(before < 0, after, before), 0, frame.size - 1),
+        np.where(after == frame.size, np.maximum(before, 0), after),
+    )
+    film = np.where(here, film, np.float32(0.0))
+    low, high = (np.take_along_axis(film, place, axis=1) for place in (before, after))
+    weight = (frame - before) / np.maximum(after - before, 1)
+    result = films.copy()
+    result[bands, :, pixels] = low + weight.astype(np.float32) * (high - low)
+    return result, known.mean(axis=1)
 
 
 def _rapid(signal: Array, smoothing: Array) -> Array:
