@@ -90,9 +90,17 @@ class Spline:
         ]
 
     def fitted(
-        self, data: Information, centres: list[Array], around: "Field | None" = None
+        self,
+        data: Information,
+        centres: list[Array],
+        around: "Field | None" = None,
+        *,
+        search: bool = True,
     ) -> "Field":
-        """Field of information at places, which is on steps from another field, or from 0."""
+        """Field of information at places, which is on steps from another field, or from 0.
+
+        With the penalty of that other field, or one that is searched near it.
+        """
         rows, columns = self.values(centres)
         matrix = _normal(data.tensor, rows, columns)
         target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
@@ -100,7 +108,7 @@ class Spline:
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if around is not None:
             target += matrix @ around.nodes
-            sharp, trials = around.sharpness, around.penalty * _STEPS
+            sharp, trials = around.sharpness, around.penalty * (_STEPS if search else np.ones(1))
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
@@ -108,9 +116,13 @@ class Spline:
             before = trial * blocks + self.before
             trial_factor = cho_factor(matrix + block_diag(*before))
             trial_nodes = cho_solve(trial_factor, target)
-            roots = [np.diagonal(np.linalg.cholesky(before), 0, 1, 2), np.diag(trial_factor[0])]
-            logs = [2.0 * np.sum(np.log(part)) for part in roots]
-            likelihood = logs[0] - logs[1] + target @ trial_nodes
+            likelihood = np.inf
+            if len(trials) > 1:
+                roots = [
+                    np.diagonal(np.linalg.cholesky(before), 0, 1, 2), np.diag(trial_factor[0])
+                ]
+                logs = [2.0 * np.sum(np.log(part)) for part in roots]
+                likelihood = logs[0] - logs[1] + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])

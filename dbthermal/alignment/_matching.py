@@ -28,6 +28,7 @@ _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE / (np.sqrt(2.0) * BLUR)
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
+_SEARCHED: Final = 2  # rounds in which the field's penalty is searched
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
@@ -230,10 +231,10 @@ def start(
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
         shift = field.on(movies.centres())
         data = _information(movies, shift)
-        field = field.spline.fitted(data, movies.centres(), field)
+        field = field.spline.fitted(data, movies.centres(), field, search=turn < _SEARCHED)
         change = np.abs(field.on(movies.centres()) - shift)
         if change.mean() < _CONVERGED * movies.factor:
             break

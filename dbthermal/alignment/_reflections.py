@@ -25,7 +25,7 @@ from dbthermal.alignment._offset import noise_levels, sample
 from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image, at least
-_COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
+_COARSE: Final = 24  # pixels along the shorter side of the coarsest image, at least
 _ROWS: Final = 32  # that are read at a time
 _FOR_EACH: Final = 8  # pixels that tell a function of time
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
