@@ -28,7 +28,8 @@ _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE / (np.sqrt(2.0) * BLUR)
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
-_SEARCHED: Final = 2  # rounds in which the field's penalty is searched
+_ROBUST: Final = 7  # rounds of the weights of whole-pixel matches
+_SEARCHED: Final = 9  # rounds in which the field's penalty is searched
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
@@ -219,13 +220,13 @@ def start(
             "third of the image."
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
-    field, centres = None, movies.centres()
-    for _ in range(8):
-        off = 0.0 if field is None else np.sum((field.on(centres) - target) ** 2, axis=0)
-        kept = weight / (1.0 + off / (1.0 * movies.factor) ** 2) ** 2
-        tensor = np.stack([kept, 0.0 * kept, kept])
-        field = spline.fitted(Information(tensor, kept * target), centres)
-    assert field is not None
+    centres, zero = movies.centres(), np.zeros_like(share)
+    field = spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
+    for _ in range(_ROBUST):
+        step = target - field.on(centres)
+        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
+        data = Information(np.stack([kept, zero, kept]), kept * step)
+        field = spline.fitted(data, centres, field, search=False)
     return field
 
 

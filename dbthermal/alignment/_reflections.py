@@ -25,7 +25,7 @@ from dbthermal.alignment._offset import noise_levels, sample
 from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image, at least
-_COARSE: Final = 24  # pixels along the shorter side of the coarsest image, at least
+_COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _ROWS: Final = 32  # that are read at a time
 _FOR_EACH: Final = 8  # pixels that tell a function of time
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
@@ -281,7 +281,7 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
     signals, valid = capture.binned(factor)
     reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, result = capture.frames.size, None
-    best, before, limit = np.inf, None, np.inf  # of the field that was taken
+    before, seen, sizes, limit = None, np.False_, np.inf, np.inf  # of the field that was taken
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -301,11 +301,15 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         field, data = matching.refine(level, begin)
         told, squares = _told(data, factor), _squares(data, factor)
         variance = _variances(field, level, told, squares)
-        size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
+        # Deviations of the field in the pixels in which one of both is known by its data.
+        size = 0.25 * np.log(variance).sum(axis=0)
+        gain = np.mean((sizes - size)[told | seen]) if told.any() else 0.0
         # A field of slower changes must fit the data of the more robust one.
         apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
-        if told.any() and size < best / _MORE and apart < limit:
-            best, before, limit = size, data, _AGREE * max(squares[:, told].mean(), 1.0)
+        better = gain > np.log(_MORE) or (gain > 0.0 and told.sum() > _MORE * seen.sum())
+        if better and apart < limit:
+            before, seen, sizes = data, told, size
+            limit = _AGREE * max(squares[:, told].mean(), 1.0)
             result = (replace(capture, valid=valid), signals[0], period, field)
     if result is None:
         raise ValueError(
