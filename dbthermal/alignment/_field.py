@@ -169,18 +169,22 @@ class Field:
         parts = self.nodes.reshape(2, *self.spline.nodes)
         return np.stack([rows @ part @ columns.T for part in parts])
 
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (node, node) [pixel^2]."""
+        return self.spline.solved(self.factor, np.eye(self.nodes.size))
+
     def disagreement(self, data: Information, centres: list[Array], other: "Field") -> float:
         """Chi-square of another field by the data of this one, over what chance makes of it."""
         matrix = _normal(data.tensor, *self.spline.values(centres))
         off = other.nodes - self.nodes
-        return float(off @ matrix @ off / np.trace(self.spline.solved(self.factor, matrix)))
+        return float(off @ matrix @ off / np.sum(self.covariance * matrix))
 
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(part) for part in self.spline.values(centres))
         height, width = self.spline.nodes
-        covariance = self.spline.solved(self.factor, np.eye(self.nodes.size))
-        blocks = covariance.reshape(2, height, width, 2, height, width)
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
         parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
 

@@ -93,11 +93,11 @@ class Movies:
 
 def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
     """Means (y, x, ...) over squares of pixels, in memory of their own."""
-    rows, columns = (size // factor for size in image.shape[:2])
-    parts = image[: rows * factor, : columns * factor]
-    return np.asarray(
-        parts.reshape(rows, factor, columns, factor, *image.shape[2:]).mean(axis=(1, 3))
-    )
+    rows, columns = (size // factor * factor for size in image.shape[:2])
+    parts = [
+        image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)
+    ]
+    return np.asarray(sum(parts[1:], parts[0]) * image.dtype.type(factor**-2))
 
 
 def _whole_pixels(
@@ -111,19 +111,18 @@ def _whole_pixels(
     """
     height, width = first.shape[:2]
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
-    energies = [np.einsum("yxt,yxt->yx", it, it).astype(np.float64) for it in (padded, *others)]
+    energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *others)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
-    windows = (0.0, WINDOW, WINDOW)
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
         rows = slice(down, down + height)
-        gain = np.zeros((2 * reach[1] + 1, height, width))
+        gain = np.zeros((height, width, 2 * reach[1] + 1))
         for part in others:
             pairs = padded[rows] @ part.transpose(0, 2, 1)
-            cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(len(gain))])
-            gain += np.maximum(gaussian_filter(cross.astype(np.float64), windows), 0.0) ** 2
-        there = [energies[0][rows, right : right + width] for right in range(len(gain))]
-        gain /= np.maximum(gaussian_filter(np.stack(there), windows), freedom)
-        right, highest = gain.argmax(axis=0), gain.max(axis=0)
+            cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(gain.shape[2])], -1)
+            gain += np.maximum(blurred(cross, WINDOW), 0.0) ** 2
+        there = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
+        gain /= np.maximum(blurred(np.stack(there, axis=-1), WINDOW), freedom)
+        right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
@@ -160,46 +159,53 @@ def _information(movies: Movies, shift: Array) -> Information:
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     noise = movies.noise[0] * _VALUE_NOISE
-    tensor, gradient, chance = (np.zeros((size, *used.shape)) for size in (3, 2, 1))
+    total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(movies.first, movies.others, places) * used
+    moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
     for parts, level in zip(moments, movies.noise[1:], strict=True):
-        yy, yx, my, yh, xx, mx, xh, mm, mh, hh = parts
+        yy, yx, my, yh, xx, mx, xh, mm, mh, hh = np.moveaxis(parts, 2, 0)
+        auto, both = np.moveaxis(blurred(parts[..., [7, 8]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
-        auto = gaussian_filter(mm, WINDOW) - number * noise**2
-        ratio = gaussian_filter(mh, WINDOW) / np.maximum(auto, 0.1 * number * noise**2)
+        auto -= number * noise**2
+        ratio = both / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         # Of all freedom, of which that outside the planes holds noise.
         excess = residual / (variance * _VALUE_NOISE**2) - number
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
-        weight = used / (misfit * variance)
-        less = movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
-        tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
-        gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
-        chance += weight * ratio**2 * less
-    tensor, gradient, (less,) = (
-        gaussian_filter(part, WINDOW, axes=(-2, -1)) for part in (tensor, gradient, chance)
-    )
+        weight = used * ratio / (misfit * variance)
+        less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        tensor = [ratio * yy - less, ratio * yx, ratio * xx - less]
+        gradient = [yh - ratio * my, xh - ratio * mx]
+        total += weight[..., np.newaxis] * np.stack([*tensor, *gradient, less], axis=-1)
+    total = np.moveaxis(blurred(total, WINDOW), 2, 0)
+    tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
-    total = tensor[0] + tensor[2]
-    share = np.maximum(total, 0.0) / np.maximum(total + less, 1e-300)
+    size = tensor[0] + tensor[2]
+    share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
 
 
+def eigenvalues(tensor: Array) -> tuple[Array, Array]:
+    """Larger and smaller eigenvalue (y, x) of tensors (3, y, x)."""
+    down, both, right = tensor
+    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), both)
+    return middle + root, middle - root
+
+
 def _positive(tensor: Array) -> Array:
     """Tensors (3, y, x) without their negative eigenvalues."""
-    values, vectors = np.linalg.eigh(np.moveaxis(tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1)))
-    result = (vectors * np.maximum(values, 0.0)[..., np.newaxis, :]) @ vectors.mT
-    return np.stack([result[..., 0, 0], result[..., 0, 1], result[..., 1, 1]])
+    high, low = eigenvalues(tensor)
+    share = np.maximum(high, 0.0) / np.maximum(high - low, np.finfo(np.float64).tiny)
+    unit = np.array([1.0, 0.0, 1.0])[:, np.newaxis, np.newaxis]
+    return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
-def start(
-    movies: Movies, films: list[Movie], freedom: float, spline: Spline, reach: tuple[int, int]
-) -> Field | None:
+def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
     """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
+    reach = movies.shape[0] // 3, movies.shape[1] // 3
     # Changes as large as there are seldom are cut: an object's, if rapid.
     first, *others = (
         part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
@@ -260,12 +266,11 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     """
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    sums = products(movies.first, movies.others, places, rate) * used
+    sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
     gradient, information, explained, energy = np.zeros((4, *movies.shape))
     for part, level in zip(sums, movies.noise[1:], strict=True):
-        yy, yx, yt, ym, yh, xx, xt, xm, xh, tt, tm, th, mm, mh, hh = gaussian_filter(
-            part, WINDOW, axes=(-2, -1)
-        )
+        windows = np.moveaxis(blurred(part, WINDOW), 2, 0)
+        yy, yx, yt, ym, yh, xx, xt, xm, xh, tt, tm, th, mm, mh, hh = windows
         # Noise of the slopes: half of them at most.
         less = gaussian_filter(used * 1.0, WINDOW) * movies.freedom
         less *= (movies.noise[0] * _SLOPE_NOISE) ** 2

@@ -1,6 +1,6 @@
 """Images on splines: blurred, moved to other places with their slopes, and products of these."""
 
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -10,19 +10,21 @@ from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
 
 Movie = npt.NDArray[np.float32]
+Image = TypeVar("Image", bound=npt.NDArray[Any])
 
 _ROWS: Final = 32  # rows that are moved at a time
 _EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
 
-def blurred(movie: Movie, width: float) -> Movie:
-    """Movie (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
+def blurred(image: Image, width: float) -> Image:
+    """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
     impulse = np.zeros(2 * int(4.0 * width + 0.5) + 1)
     impulse[impulse.size // 2] = 1.0
-    weights = gaussian_filter(impulse, width).astype(np.float32)
-    lines = movie.reshape(1, len(movie), -1)
-    return _blurred(_blurred(lines, weights).reshape(movie.shape), weights)
+    weights = gaussian_filter(impulse, width).astype(image.dtype)
+    lines = np.ascontiguousarray(image).reshape(1, len(image), -1)
+    result: Image = _blurred(_blurred(lines, weights).reshape(image.shape), weights)
+    return result
 
 
 def splines(movie: Movie, width: float) -> Movie:
@@ -35,7 +37,7 @@ def splines(movie: Movie, width: float) -> Movie:
 
 
 def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
-    """Sums over planes (other, pair, y, x) of the products of signals at places (2, y, x).
+    """Sums over planes (other, y, x, pair) of the products of signals at places (2, y, x).
 
     Signals are the slopes down and right of the moved movie, of `splines`, the moved movie and
     another one, each with all that follow: 10 pairs. With a matrix (plane, plane) of the rate of
@@ -44,7 +46,7 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
     shape, planes = places.shape[1:], movie.shape[2]
     order = [1, 2, 0] if rate is None else [1, 2, 3, 0]
     count = len(order) + 1
-    result = np.zeros((len(others), count * (count + 1) // 2, *shape))
+    result = np.zeros((len(others), *shape, count * (count + 1) // 2))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
         signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
@@ -53,13 +55,13 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
         for other, out in zip(others, result, strict=True):
             pixels = other[rows].reshape(1, -1, planes)
             sums = _pairs(np.concatenate([signals[order], pixels]))
-            out[:, rows] = sums.reshape(len(out), -1, shape[1])
+            out[rows] = sums.reshape(out[rows].shape)
     return result
 
 
 @compiled
-def _blurred(movie: Movie, weights: Movie) -> Movie:
-    """Movie (line, place, plane) with weighted means over the places of each line."""
+def _blurred(movie: Any, weights: Any) -> Any:
+    """Image (line, place, plane) with weighted means over the places of each line."""
     lines, size, planes = movie.shape
     reach, result = weights.size // 2, np.zeros_like(movie)
     for line, place in np.ndindex(lines, size):
@@ -116,9 +118,9 @@ def _weigh(away: float, out: Any) -> None:
 
 @compiled
 def _pairs(signals: Movie) -> Array:
-    """Sums over planes (pair, pixel) of the products of signals (signal, pixel, plane)."""
+    """Sums over planes (pixel, pair) of the products of signals (signal, pixel, plane)."""
     count, pixels, planes = signals.shape
-    result = np.empty((count * (count + 1) // 2, pixels))
+    result = np.empty((pixels, count * (count + 1) // 2))
     for p in range(pixels):
         place = 0
         for i in range(count):
@@ -127,6 +129,6 @@ def _pairs(signals: Movie) -> Array:
                 other, total = signals[j, p], np.float32(0.0)
                 for t in range(planes):
                     total += one[t] * other[t]
-                result[place, p] = total
+                result[p, place] = total
                 place += 1
     return result

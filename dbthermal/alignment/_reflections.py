@@ -26,6 +26,7 @@ from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
+_START: Final = 20  # the same of the image on which whole pixels are matched
 _ROWS: Final = 32  # that are read at a time
 _FOR_EACH: Final = 8  # pixels that tell a function of time
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
@@ -141,34 +142,32 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
     capture, signals, period, field = _coarse(capture, spline, factor)
-    functions = capture.functions(signals, period)
-    freedom, fine = _freedom(functions), capture.planes(functions)
-    while True:
-        factor = max(1, factor // 2)
-        pictures = [matching.binned(movie, factor) for movie in fine]
-        level = Movies.blurred(
-            pictures,
-            capture.valid,
-            capture.noise,
-            freedom,
-            factor,
-            _white(capture.frames.size, period),
-        )
-        field, data = matching.refine(level, field)
-        if factor == 1:
-            # The delay is seen in slower changes, too, in which there is more than noise.
-            spread = _variances(field, level, _told(data), _squares(data))
-            functions = capture.functions(signals, max(period, _PERIODS[2]))
-            freedom, pictures = _freedom(functions), capture.planes(functions)
-            level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
-            times = corrected["time"].values[capture.frames]
-            # What a rate's planes are of these, by its functions.
-            change = np.gradient(np.eye(times.size), times, axis=0).T @ functions
-            rate = np.linalg.lstsq(functions, change)[0].astype(np.float32)
-            late, std, energy = matching.delay(level, rate, field.on(level.centres()))
-            result = _result(corrected, capture, field, data, spread)
-            result["energy"] = ("part", "y", "x"), energy
-            return result.assign_attrs(delay=late, delay_std=std)
+    # The delay is seen in slower changes, too, in which there is more than noise.
+    periods = sorted({period, max(period, _PERIODS[2])})
+    functions = [capture.functions(signals, one) for one in periods]
+    movies, white = capture.planes(functions), _white(capture.frames.size, period)
+
+    def level(place: int, factor: int) -> Movies:
+        """Movies of the changes within one of the periods, of coarser pixels."""
+        pictures = [matching.binned(movie, factor) for movie in movies[place]]
+        freedom = _freedom(functions[place])
+        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
+
+    while factor > 2:
+        factor //= 2
+        field, _ = matching.refine(level(0, factor), field)
+    fine = level(0, 1)
+    field, data = matching.refine(fine, field)
+    spread = _variances(field, fine, _told(data), _squares(data))
+    # What a rate's planes are of the delay's, by its functions.
+    times = corrected["time"].values[capture.frames]
+    change = np.gradient(np.eye(times.size), times, axis=0).T @ functions[-1]
+    rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
+    slower = fine if len(movies) == 1 else level(-1, 1)
+    late, std, energy = matching.delay(slower, rate, field.on(fine.centres()))
+    result = _result(corrected, capture, field, data, spread)
+    result["energy"] = ("part", "y", "x"), energy
+    return result.assign_attrs(delay=late, delay_std=std)
 
 
 def seen_apart(field: xr.Dataset) -> bool:
@@ -217,16 +216,17 @@ class _Capture:
         rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
         return cls(counts, order, slopes[order], noise[order], valid, frames, rough)
 
-    def blocks(self, height: int) -> Iterator[tuple[slice, Movie, Mask]]:
-        """Rows, their films (band, time, y, x) [K] in the frames, and pixels that lack few."""
+    def blocks(self, height: int) -> Iterator[tuple[slice, list[Movie], Mask]]:
+        """Rows, their films (time, y, x) [count] in the frames, and pixels that lack few."""
+        whole = self.frames.size == self.counts.sizes["time"]
         for start in range(0, self.valid.shape[0], height):
             rows = slice(start, start + height)
-            films = self.counts.isel(y=rows).values[self.bands][:, self.frames]
-            films = films.astype(np.float32, copy=False)
-            filled, share = bridged(films.reshape(*films.shape[:2], -1))
-            filled = filled / self.slopes.astype(np.float32)[:, None, None]
+            films = self.counts.isel(y=rows).values
+            films = films if whole else films[:, self.frames]
+            flat = films.astype(np.float32, copy=False).reshape(*films.shape[:2], -1)
+            filled, share = bridged(flat)
             few = np.all(share >= 1.0 - _MISSING, axis=0).reshape(films.shape[2:])
-            yield rows, filled.reshape(films.shape), few
+            yield rows, [filled[band].reshape(films.shape[1:]) for band in self.bands], few
 
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
@@ -245,19 +245,21 @@ class _Capture:
         functions = _rapid(smooth.leading(_rapid(some, smoothing), _PLANES).T, smoothing).T
         return np.ascontiguousarray(functions, np.float32)
 
-    def planes(self, functions: Movie) -> list[Movie]:
-        """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""
-        result = np.empty((self.bands.size, *self.valid.shape, functions.shape[1]), np.float32)
+    def planes(self, functions: list[Movie]) -> list[list[Movie]]:
+        """Parts (y, x, plane) [K] of the bands along each of some functions of time."""
+        together = np.concatenate(functions, axis=1)
+        result = np.empty((self.bands.size, *self.valid.shape, together.shape[1]), np.float32)
         for rows, films, _ in self.blocks(_ROWS):
-            for movie, film in zip(result, films, strict=True):
-                planes = film.reshape(len(film), -1).T @ functions
+            for movie, film, slope in zip(result, films, self.slopes, strict=True):
+                planes = film.reshape(len(film), -1).T @ (together / np.float32(slope))
                 movie[rows] = planes.reshape(movie[rows].shape)
         if not self.valid.all():
             nearest = distance_transform_edt(
                 ~self.valid, return_distances=False, return_indices=True
             )
             result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
-        return list(result)
+        ends = np.cumsum([part.shape[1] for part in functions])
+        return [list(part) for part in np.split(result, ends[:-1], axis=3)]
 
     def binned(self, factor: int) -> tuple[list[Movie], Mask]:
         """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
@@ -266,20 +268,25 @@ class _Capture:
             valid[rows] &= few
             here = valid[rows, :, np.newaxis].astype(np.float64)
             share = np.maximum(matching.binned(here, factor), factor**-2)
-            films = films if valid[rows].all() else np.where(valid[rows], films, np.float32(0.0))
-            squares = sum(
-                films[:, :, i : films.shape[2] // factor * factor : factor]
-                [..., j : films.shape[3] // factor * factor : factor]
-                for i, j in np.ndindex(factor, factor)
-            ) / np.float32(factor**2)
-            parts.append(np.moveaxis(squares, 1, -1) / share.astype(np.float32))
+            squares = [_sums(film, None if here.all() else here, factor) for film in films]
+            share = self.slopes[:, None, None, None] * factor**2 * share
+            parts.append(np.stack(squares) / share.astype(np.float32))
         return list(np.concatenate(parts, axis=1)), valid
+
+
+def _sums(film: Movie, here: Array | None, factor: int) -> Movie:
+    """Sums (y, x, time) of a film (time, y, x) over squares of pixels, of those that are here."""
+    film = film if here is None else np.where(here[..., 0] > 0.0, film, np.float32(0.0))
+    rows, columns = (size // factor * factor for size in film.shape[1:])
+    parts = (
+        film[:, i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)
+    )
+    return np.moveaxis(sum(parts), 0, -1)
 
 
 def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, Array, float, Field]:
     """Capture with its valid pixels, coarse signals, the period that tells most, rough field."""
     signals, valid = capture.binned(factor)
-    reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, result = capture.frames.size, None
     before, seen, sizes, limit = None, np.False_, np.inf, np.inf  # of the field that was taken
     for period in _PERIODS:
@@ -292,10 +299,17 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         )
         begin = None if result is None else result[-1]
         if begin is None:
-            # Whole frames: what is rare in a pixel's time is cut.
+            # Whole frames, of which what is rare in a pixel's time is cut.
+            half = 2 if min(level.shape) >= 2 * _START else 1
+            rough = replace(
+                level,
+                valid=matching.binned(level.valid * 1.0, half) > 0.5,
+                noise=level.noise / half,
+                factor=factor * half,
+            )
             smoothing = capture.smoothing(period)
-            films = [_rapid(part, smoothing).astype(np.float32) for part in signals]
-            begin = matching.start(level, films, _white(frames, period), spline, reach)
+            films = [_rapid(matching.binned(part, half), smoothing) for part in signals]
+            begin = matching.start(rough, films, _white(frames, period), spline)
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
@@ -309,7 +323,7 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         better = gain > np.log(_MORE) or (gain > 0.0 and told.sum() > _MORE * seen.sum())
         if better and apart < limit:
             before, seen, sizes = data, told, size
-            limit = _AGREE * max(squares[:, told].mean(), 1.0)
+            limit = min(limit, _AGREE * max(squares[:, told].mean(), 1.0))
             result = (replace(capture, valid=valid), signals[0], period, field)
     if result is None:
         raise ValueError(
@@ -321,9 +335,8 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
 
 def _told(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
-    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW * factor) ** 2)
-    largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
-    return np.asarray(largest > 1.0 / _KNOWN**2)
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
 
 
 def _squares(data: Information, factor: int = 1) -> Array:
