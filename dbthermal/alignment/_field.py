@@ -117,17 +117,9 @@ class Spline:
         ]
 
     def fitted(
-        self,
-        data: Information,
-        centres: list[Array],
-        around: "Field | None" = None,
-        *,
-        search: bool = True,
+        self, data: Information, centres: list[Array], around: "Field | None" = None
     ) -> "Field":
-        """Field of information at places, which is on steps from another field, or from 0.
-
-        With the penalty of that other field, or one that is searched near it.
-        """
+        """Field of information at places, which is on steps from another field, or from 0."""
         rows, columns = self.values(centres)
         matrix = _normal(data.tensor, rows, columns)
         target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
@@ -135,17 +127,16 @@ class Spline:
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if around is not None:
             target += matrix @ around.nodes
-            sharp, trials = around.sharpness, around.penalty * (_STEPS if search else np.ones(1))
+            sharp, trials = around.sharpness, around.penalty * _STEPS
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
             before = block_diag(*(trial * blocks + self.before))
             trial_factor = self.factored(matrix + before)
-            trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
-            if len(trials) > 1:
-                logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
-                likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
+            trial_nodes = self.solved(trial_factor, target)
+            logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
+            likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])

@@ -28,9 +28,8 @@ _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE / (np.sqrt(2.0) * BLUR)
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
-_ROBUST: Final = 7  # rounds of the weights of whole-pixel matches
-_SEARCHED: Final = 9  # rounds in which the field's penalty is searched
-_CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
+_ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
+_CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
@@ -232,18 +231,18 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
         step = target - field.on(centres)
         kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
         data = Information(np.stack([kept, zero, kept]), kept * step)
-        field = spline.fitted(data, centres, field, search=False)
+        field = spline.fitted(data, centres, field)
     return field
 
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    for turn in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data = _information(movies, shift)
-        field = field.spline.fitted(data, movies.centres(), field, search=turn < _SEARCHED)
+        field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
-        if change.mean() < _CONVERGED * movies.factor:
+        if change.mean() < _CONVERGED * movies.factor**2:
             break
     return field, data
 

@@ -39,6 +39,7 @@ _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # .054 pixel in the mean (by .065 with 32, by .074 with whole films).
 _PLANES: Final = 128
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
+_SLOW: Final = 20.0  # those of a delay, at least
 _MORE: Final = 1.25
 _AGREE: Final = 2.25
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
@@ -141,10 +142,10 @@ def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
-    capture, signals, period, field = _coarse(capture, spline, factor)
+    capture, tried, period, field = _coarse(capture, spline, factor)
     # The delay is seen in slower changes, too, in which there is more than noise.
-    periods = sorted({period, max(period, _PERIODS[2])})
-    functions = [capture.functions(signals, one) for one in periods]
+    slow = min((one for one in tried if one >= max(period, _SLOW)), default=max(tried))
+    functions = [tried[one] for one in sorted({period, slow})]
     movies, white = capture.planes(functions), _white(capture.frames.size, period)
 
     def level(place: int, factor: int) -> Movies:
@@ -284,15 +285,18 @@ def _sums(film: Movie, here: Array | None, factor: int) -> Movie:
     return np.moveaxis(sum(parts), 0, -1)
 
 
-def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, Array, float, Field]:
-    """Capture with its valid pixels, coarse signals, the period that tells most, rough field."""
+def _coarse(
+    capture: _Capture, spline: Spline, factor: int
+) -> tuple[_Capture, dict[float, Movie], float, Field]:
+    """Capture with its valid pixels, functions of all periods, the best period, rough field."""
     signals, valid = capture.binned(factor)
-    frames, result = capture.frames.size, None
+    frames, tried, result = capture.frames.size, dict[float, Movie](), None
+    refusal: ValueError | None = None
     before, seen, sizes, limit = None, np.False_, np.inf, np.inf  # of the field that was taken
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        functions = capture.functions(signals[0], period)
+        functions = tried[period] = capture.functions(signals[0], period)
         pictures = [part @ functions for part in signals]
         level = Movies.blurred(
             pictures, valid, capture.noise, _freedom(functions), factor, _white(frames, period)
@@ -309,7 +313,10 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
             )
             smoothing = capture.smoothing(period)
             films = [_rapid(matching.binned(part, half), smoothing) for part in signals]
-            begin = matching.start(rough, films, _white(frames, period), spline)
+            try:
+                begin = matching.start(rough, films, _white(frames, period), spline)
+            except ValueError as error:  # slower changes may tell more
+                refusal = error
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
@@ -320,13 +327,13 @@ def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, A
         gain = np.mean((sizes - size)[told | seen]) if told.any() else 0.0
         # A field of slower changes must fit the data of the more robust one.
         apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
-        better = gain > np.log(_MORE) or (gain > 0.0 and told.sum() > _MORE * seen.sum())
+        better = gain > np.log(_MORE) or told.sum() > _MORE * seen.sum()
         if better and apart < limit:
             before, seen, sizes = data, told, size
             limit = min(limit, _AGREE * max(squares[:, told].mean(), 1.0))
-            result = (replace(capture, valid=valid), signals[0], period, field)
+            result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
-        raise ValueError(
+        raise refusal or ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "
             "Must be seen in both to find their shift; let somebody walk by."
         )
@@ -408,7 +415,7 @@ def _rapid(signal: Array, smoothing: Array) -> Array:
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
     """Frames in which most of the pixels that every band ever measures are measured."""
-    step = max(1, int(np.sqrt(counts[0, 0].size / 4096)))
+    step = max(1, int(np.sqrt(counts[0, 0].size / 1024)))
     some = schema.measured(counts[:, :, ::step, ::step].values)
     ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
     share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
