@@ -11,7 +11,7 @@ one body to the next: differences follow Student's distribution, not a normal on
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
@@ -110,9 +110,7 @@ class Spline:
     def values(self, centres: list[Array]) -> list[Array]:
         """Splines (place, node) at rows and at columns."""
         return [
-            BSpline.design_matrix(
-                place / (size - 1) * (count - 3), np.arange(count + 4) - 3.0, 3
-            ).toarray()
+            _splines(place.tobytes(), size, count)
             for place, size, count in zip(centres, self.shape, self.nodes, strict=True)
         ]
 
@@ -127,21 +125,24 @@ class Spline:
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if around is not None:
             target += matrix @ around.nodes
-            sharp, trials = around.sharpness, around.penalty * _STEPS
+            steps = _STEPS[1:2] if around.settled else _STEPS
+            sharp, trials = around.sharpness, around.penalty * steps
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
             before = block_diag(*(trial * blocks + self.before))
             trial_factor = self.factored(matrix + before)
-            trial_nodes = self.solved(trial_factor, target)
-            logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
-            likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
+            trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
+            if trials.size > 1:
+                logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
+                likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
         sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        return Field(self, nodes, factor, float(penalty), sharp)
+        settled = around is not None and penalty == around.penalty
+        return Field(self, nodes, factor, float(penalty), sharp, settled)
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,7 @@ class Field:
     factor: Array  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
+    settled: bool  # the penalty is the best of those near it
 
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""
@@ -178,6 +180,14 @@ class Field:
         blocks = self.covariance.reshape(2, height, width, 2, height, width)
         parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
+
+
+@lru_cache(maxsize=16)  # of the levels from coarse to fine
+def _splines(places: bytes, size: int, count: int) -> Array:
+    """Splines (place, node) along a side of so many pixels and nodes."""
+    knots, inner = np.arange(count + 4) - 3.0, np.frombuffer(places) / (size - 1) * (count - 3)
+    result: Array = BSpline.design_matrix(inner, knots, 3).toarray()
+    return result
 
 
 def _pairs(values: Array) -> Array:

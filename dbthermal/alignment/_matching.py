@@ -5,7 +5,7 @@ whole pixels that explain most, then Gauss-Newton from coarse images to fine one
 much later the others show what the first shows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -162,8 +162,8 @@ def _information(movies: Movies, shift: Array) -> Information:
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
     moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
     for parts, level in zip(moments, movies.noise[1:], strict=True):
-        yy, yx, my, yh, xx, mx, xh, mm, mh, hh = np.moveaxis(parts, 2, 0)
-        auto, both = np.moveaxis(blurred(parts[..., [7, 8]], WINDOW), 2, 0)
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(parts, 2, 0)
+        auto, both = np.moveaxis(blurred(parts[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = both / np.maximum(auto, 0.1 * number * noise**2)
@@ -237,6 +237,7 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
+    field = replace(field, settled=False)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data = _information(movies, shift)
@@ -269,7 +270,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     gradient, information, explained, energy = np.zeros((4, *movies.shape))
     for part, level in zip(sums, movies.noise[1:], strict=True):
         windows = np.moveaxis(blurred(part, WINDOW), 2, 0)
-        yy, yx, yt, ym, yh, xx, xt, xm, xh, tt, tm, th, mm, mh, hh = windows
+        mm, my, mx, mt, mh, yy, yx, yt, yh, xx, xt, xh, tt, th, hh = windows
         # Noise of the slopes: half of them at most.
         less = gaussian_filter(used * 1.0, WINDOW) * movies.freedom
         less *= (movies.noise[0] * _SLOPE_NOISE) ** 2
@@ -278,9 +279,9 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         ridge = _RIDGE * (yy + xx).max()
         both = np.moveaxis(np.array([[yy + ridge, yx], [yx, xx + ridge]]), (0, 1), (-2, -1))
         cross, slope = np.stack([yt, xt], axis=-1), np.stack([yh, xh], axis=-1)
-        slope -= ratio[..., np.newaxis] * np.stack([ym, xm], axis=-1)
+        slope -= ratio[..., np.newaxis] * np.stack([my, mx], axis=-1)
         share = np.linalg.solve(both, cross[..., np.newaxis])[..., 0]
-        late = th - ratio * tm - (share * slope).sum(axis=-1)
+        late = th - ratio * mt - (share * slope).sum(axis=-1)
         explained += np.where(used, ratio * np.maximum(mh, 0.0) / level**2, 0.0)
         energy += np.where(used, hh / level**2, 0.0)
         gradient += np.where(used, ratio / level**2 * late, 0.0)

@@ -12,7 +12,7 @@ from dbthermal._compiled import compiled
 Movie = npt.NDArray[np.float32]
 Image = TypeVar("Image", bound=npt.NDArray[Any])
 
-_ROWS: Final = 32  # rows that are moved at a time
+_ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
 _EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
@@ -39,13 +39,12 @@ def splines(movie: Movie, width: float) -> Movie:
 def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
     """Sums over planes (other, y, x, pair) of the products of signals at places (2, y, x).
 
-    Signals are the slopes down and right of the moved movie, of `splines`, the moved movie and
-    another one, each with all that follow: 10 pairs. With a matrix (plane, plane) of the rate of
-    change the rate follows the slopes: 15 pairs.
+    Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
+    with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
+    the rate follows the slopes: 15 pairs.
     """
     shape, planes = places.shape[1:], movie.shape[2]
-    order = [1, 2, 0] if rate is None else [1, 2, 3, 0]
-    count = len(order) + 1
+    count = 4 if rate is None else 5
     result = np.zeros((len(others), *shape, count * (count + 1) // 2))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
@@ -53,9 +52,7 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
         for other, out in zip(others, result, strict=True):
-            pixels = other[rows].reshape(1, -1, planes)
-            sums = _pairs(np.concatenate([signals[order], pixels]))
-            out[rows] = sums.reshape(out[rows].shape)
+            _sum_pairs(signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2]))
     return result
 
 
@@ -117,18 +114,16 @@ def _weigh(away: float, out: Any) -> None:
 
 
 @compiled
-def _pairs(signals: Movie) -> Array:
-    """Sums over planes (pixel, pair) of the products of signals (signal, pixel, plane)."""
+def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
+    """Sums over planes (pixel, pair) of the products of signals, in place."""
     count, pixels, planes = signals.shape
-    result = np.empty((pixels, count * (count + 1) // 2))
     for p in range(pixels):
         place = 0
-        for i in range(count):
-            one = signals[i, p]
-            for j in range(i, count):
-                other, total = signals[j, p], np.float32(0.0)
+        for i in range(count + 1):
+            one = signals[i, p] if i < count else last[p]
+            for j in range(i, count + 1):
+                other, total = signals[j, p] if j < count else last[p], np.float32(0.0)
                 for t in range(planes):
                     total += one[t] * other[t]
-                result[p, place] = total
+                out[p, place] = total
                 place += 1
-    return result

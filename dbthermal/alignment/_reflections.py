@@ -38,6 +38,7 @@ _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Functions of time that are matched: of 220 to 300 frames, fields of 36 simulated scenes are off by
 # .054 pixel in the mean (by .065 with 32, by .074 with whole films).
 _PLANES: Final = 128
+_FEW: Final = 64  # of them, on the coarsest image
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _SLOW: Final = 20.0  # those of a delay, at least
 _MORE: Final = 1.25
@@ -296,7 +297,8 @@ def _coarse(
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        functions = tried[period] = capture.functions(signals[0], period)
+        tried[period] = capture.functions(signals[0], period)
+        functions = tried[period][:, :_FEW]
         pictures = [part @ functions for part in signals]
         level = Movies.blurred(
             pictures, valid, capture.noise, _freedom(functions), factor, _white(frames, period)
