@@ -29,6 +29,11 @@ _FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
 _MAPS: WeakSet[mmap.mmap] = WeakSet()
 
 
+def spacing(size: int, number: int) -> int:
+    """Step along either side of an image of a size [pixel] that leaves about so many pixels."""
+    return max(1, int(np.sqrt(size / number)))
+
+
 def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:
     """Quotient where the denominator is positive, and another value elsewhere."""
     positive = denominator > 0

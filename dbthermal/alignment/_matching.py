@@ -6,16 +6,15 @@ much later the others show what the first shows.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import Movie, blurred, products, splines
+from dbthermal.alignment._products import Movie, binned, blurred, products, splines
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
@@ -88,15 +87,6 @@ class Movies:
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
         return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.shape]
-
-
-def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
-    """Means (y, x, ...) over squares of pixels, in memory of their own."""
-    rows, columns = (size // factor * factor for size in image.shape[:2])
-    parts = [
-        image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)
-    ]
-    return np.asarray(sum(parts[1:], parts[0]) * image.dtype.type(factor**-2))
 
 
 def _whole_pixels(
@@ -252,10 +242,10 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     r"""
     Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What moves one way only
-    is shifted or late. One Newton step of both, the shift free in each window: with the slopes g of
-    the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the others over their
-    ratio to it, and sums over time and a window,
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What
+    moves one way only is shifted or late. One Newton step of both, the shift free in each window:
+    with the slopes g of the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the
+    others over their ratio to it, and sums over time and a window,
 
     .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) / \sum (\dot h^2 - c^T A^{-1} c),
               \quad A = g g^T, \; c = g \dot h

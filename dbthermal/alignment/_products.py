@@ -17,6 +17,13 @@ _EDGE: Final = 3  # pixels by which an image on splines is mirrored at its borde
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
 
+def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
+    """Means (y, x, ...) over squares of pixels, in memory of their own."""
+    rows, columns = (size // factor * factor for size in image.shape[:2])
+    parts = [image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)]
+    return np.asarray(sum(parts[1:], parts[0]) * image.dtype.type(factor**-2))
+
+
 def blurred(image: Image, width: float) -> Image:
     """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
     impulse = np.zeros(2 * int(4.0 * width + 0.5) + 1)
@@ -52,7 +59,9 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
         for other, out in zip(others, result, strict=True):
-            _sum_pairs(signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2]))
+            _sum_pairs(
+                signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2])
+            )
     return result
 
 
