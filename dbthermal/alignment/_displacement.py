@@ -78,8 +78,7 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
         whole, share = bridged(film.reshape(2, time.size, -1))
-        used = share.min(axis=0) > _COMMON * share.min(axis=0).max()
-        whole = np.where(used, whole, 0.0) / scale.slopes[bands, np.newaxis, np.newaxis]
+        whole = np.where(share > _COMMON * share.max(), whole, 0.0) / scale.slopes[bands, np.newaxis, np.newaxis]
         return whole.astype(np.float32).reshape(film.shape)
 
     # Functions of time of what changes rapidly in the quietest band.

@@ -24,7 +24,7 @@ BLUR: Final = 1.2
 
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
-_SLOPE_NOISE: Final = _VALUE_NOISE / (np.sqrt(2.0) * BLUR)
+_SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
 _ROBUST: Final = 4  # rounds of the weights of whole-pixel matches

@@ -116,7 +116,7 @@ class Capture:
             films = films if whole else films[:, self.frames]
             flat = films.astype(np.float32, copy=False).reshape(*films.shape[:2], -1)
             filled, share = bridged(flat)
-            few = np.all(share >= 1.0 - _MISSING, axis=0).reshape(films.shape[2:])
+            few = (share >= 1.0 - _MISSING).reshape(films.shape[2:])
             yield rows, [filled[band].reshape(films.shape[1:]) for band in self.bands], few
 
     def smoothing(self, period: float) -> Array:
@@ -182,26 +182,24 @@ def white(frames: int, period: float) -> float:
 def bridged(films: Movie) -> tuple[Movie, Array]:
     """Films (band, time, pixel) with missing samples on the line between those before and after.
 
-    And the share of the samples (band, pixel) that are measured; a pixel without any is zero.
+    Missing of one band is missing of all. Second, the share of samples (pixel) that all have; a
+    pixel without any is zero.
     """
-    known = schema.measured(films)
-    if known.all():
-        return films, np.ones((len(films), films.shape[2]))
-    bands, pixels = np.nonzero(~known.all(axis=1))
-    film, here = films[bands, :, pixels], known[bands, :, pixels]
-    frame = np.arange(film.shape[1])
-    before = np.maximum.accumulate(np.where(here, frame, -1), axis=1)
-    after = np.minimum.accumulate(np.where(here, frame, frame.size)[:, ::-1], axis=1)[:, ::-1]
-    before, after = (
-        np.clip(np.where(before < 0, after, before), 0, frame.size - 1),
-        np.where(after == frame.size, np.maximum(before, 0), after),
-    )
-    film = np.where(here, film, np.float32(0.0))
-    low, high = (np.take_along_axis(film, place, axis=1) for place in (before, after))
-    weight = (frame - before) / np.maximum(after - before, 1)
-    result = films.copy()
-    result[bands, :, pixels] = low + weight.astype(np.float32) * (high - low)
-    return result, known.mean(axis=1)
+    known = schema.measured(films).all(axis=0)
+    pixels = np.flatnonzero(~known.all(axis=0))
+    if not pixels.size:
+        return films, np.ones(films.shape[2])
+    here, frame = known[:, pixels], np.arange(len(known))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(here, frame, -1), axis=0)
+    after = np.minimum.accumulate(np.where(here, frame, frame.size)[::-1], axis=0)[::-1]
+    # Before the first and after the last sample their values go on.
+    first, last = after[0] % frame.size, before[-1].clip(0)
+    before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
+    weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
+    result, measured = films.copy(), np.where(here, films[:, :, pixels], np.float32(0.0))
+    low, high = (np.take_along_axis(measured, place[np.newaxis], 1) for place in (before, after))
+    result[:, :, pixels] = low + weight * (high - low)
+    return result, known.mean(axis=0)
 
 
 def rapid(signal: Array, smoothing: Array) -> Array:

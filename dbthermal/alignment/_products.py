@@ -84,21 +84,23 @@ def _blurred(movie: Any, weights: Any) -> Any:
 
 @compiled
 def sampled(splines: Any, places: Array) -> Any:
-    """Values, slopes down and right (3, place, plane) of splines (y, x, plane) at rows, columns."""
+    """Values, slopes over a pixel down and right (3, place, plane) of splines at rows, columns."""
     count, planes = places.shape[1], splines.shape[2]
     result = np.zeros((3, count, planes), splines.dtype)
     along, slope = np.empty(planes, splines.dtype), np.empty(planes, splines.dtype)
-    first, weights = np.empty(2, np.intp), np.empty((2, 2, 4), splines.dtype)
+    first, weights = np.empty(2, np.intp), np.empty((2, 2, 5), splines.dtype)
     for p in range(count):
         for axis in range(2):
-            low = int(np.floor(places[axis, p])) - 1
-            first[axis] = min(max(low, 0), splines.shape[axis] - 4)
-            for i in range(4):
-                _weigh(first[axis] + i - places[axis, p], weights[axis, :, i])
-        for i in range(4):
+            low = int(np.floor(places[axis, p] - 0.5)) - 1
+            first[axis] = min(max(low, 0), splines.shape[axis] - 5)
+            for i in range(5):
+                away = first[axis] + i - places[axis, p]
+                weights[axis, 0, i] = _cubic(away)
+                weights[axis, 1, i] = _cubic(away - 0.5) - _cubic(away + 0.5)
+        for i in range(5):
             along[:] = 0.0
             slope[:] = 0.0
-            for j in range(4):
+            for j in range(5):
                 value, steep = weights[1, 0, j], weights[1, 1, j]
                 pixel = splines[first[0] + i, first[1] + j]
                 for t in range(planes):
@@ -113,13 +115,10 @@ def sampled(splines: Any, places: Array) -> Any:
 
 
 @compiled
-def _weigh(away: float, out: Any) -> None:
-    """Value, and slope at the origin, of a cubic B-spline about a place so far away, in place."""
-    far, sign = abs(away), 1.0 if away > 0.0 else -1.0
-    rest = max(2.0 - far, 0.0)
-    inner = max(1.0 - far, 0.0)
-    out[0] = (rest**3 - 4.0 * inner**3) / 6.0
-    out[1] = sign * (0.5 * rest**2 - 2.0 * inner**2)
+def _cubic(away: float) -> float:
+    """Cubic B-spline at a distance from its middle [pixel]."""
+    far = abs(away)
+    return (max(2.0 - far, 0.0) ** 3 - 4.0 * max(1.0 - far, 0.0) ** 3) / 6.0
 
 
 @compiled
