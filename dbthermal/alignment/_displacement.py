@@ -18,7 +18,7 @@ from dbthermal import schema
 from dbthermal._arrays import Array, spacing
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._planes import SMALLEST, Scale, bridged
-from dbthermal.alignment._products import blurred, products, splines
+from dbthermal.alignment._products import blurred, normal_equations, products, splines
 
 # Frames, windows along either side, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
@@ -78,7 +78,10 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
         whole, share = bridged(film.reshape(2, time.size, -1))
-        whole = np.where(share > _COMMON * share.max(), whole, 0.0) / scale.slopes[bands, np.newaxis, np.newaxis]
+        whole = (
+            np.where(share > _COMMON * share.max(), whole, 0.0)
+            / scale.slopes[bands, np.newaxis, np.newaxis]
+        )
         return whole.astype(np.float32).reshape(film.shape)
 
     # Functions of time of what changes rapidly in the quietest band.
@@ -108,24 +111,14 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
             pairs = products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
             within = (slice(left, left + side) for left in lefts - columns.start)
             part.extend(pairs[one].sum(axis=0) for one in within)
-    level = side**2 * noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
-    return [_normal(np.array(part), level, rate) for part, rate in zip(sums, rates, strict=True)]
-
-
-def _normal(sums: Array, noise: float, rate: Array) -> Array:
-    """Normal equations (window, 4, 3) of sums (window, pair), see `products`, less the noise's."""
-    normal = np.zeros((len(sums), 5, 5))
-    lower, right = np.triu_indices(5)
-    normal[:, lower, right] = normal[:, right, lower] = sums
-    # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a gradient 1 / (2 b^2) of that.
-    slope = len(rate) * 0.5 / _BLUR**2
-    each = noise * np.array([len(rate), slope, slope, np.sum(rate**2), 0.0])
-    normal = (normal - np.diag(each))[normal[:, 0, 0] > (_STRONG + 1.0) * each[0]]
-    size, cross, target = normal[:, :1, :1], normal[:, :1, 1:4], normal[:, :1, 4:]
-    ratio = target / size
-    tensor = ratio**2 * (normal[:, 1:4, 1:4] - cross.mT * cross / size)
-    rest = ratio * (normal[:, 4:, 1:4] - ratio * cross)
-    return np.concatenate([tensor, rest], axis=1)
+    # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
+    level = _PLANES * side**2 * noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
+    slope, result = 0.5 / _BLUR**2, []
+    for part, rate in zip(map(np.array, sums), rates, strict=True):
+        each = level * np.array([1.0, slope, slope, np.sum(rate**2) / len(rate)])
+        strong = part[:, 0] > (_STRONG + 1.0) * level
+        result.append(normal_equations(part[strong], each))
+    return result
 
 
 def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:

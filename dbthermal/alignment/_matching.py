@@ -14,7 +14,14 @@ from scipy.ndimage import gaussian_filter
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import Movie, binned, blurred, products, splines
+from dbthermal.alignment._products import (
+    Movie,
+    binned,
+    blurred,
+    normal_equations,
+    products,
+    splines,
+)
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
@@ -257,25 +264,23 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
-    gradient, information, explained, energy = np.zeros((4, *movies.shape))
+    # Noise of the slopes and of the moved movie.
+    number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
+    less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
+    totals = np.zeros((4, *movies.shape))
     for part, level in zip(sums, movies.noise[1:], strict=True):
-        windows = np.moveaxis(blurred(part, WINDOW), 2, 0)
-        mm, my, mx, mt, mh, yy, yx, yt, yh, xx, xt, xh, tt, th, hh = windows
-        # Noise of the slopes: half of them at most.
-        less = gaussian_filter(used * 1.0, WINDOW) * movies.freedom
-        less *= (movies.noise[0] * _SLOPE_NOISE) ** 2
-        yy, xx = (one - np.minimum(less, 0.5 * one) for one in (yy, xx))
-        ratio = mh / np.maximum(mm, np.finfo(np.float64).tiny)
-        ridge = _RIDGE * (yy + xx).max()
-        both = np.moveaxis(np.array([[yy + ridge, yx], [yx, xx + ridge]]), (0, 1), (-2, -1))
-        cross, slope = np.stack([yt, xt], axis=-1), np.stack([yh, xh], axis=-1)
-        slope -= ratio[..., np.newaxis] * np.stack([my, mx], axis=-1)
-        share = np.linalg.solve(both, cross[..., np.newaxis])[..., 0]
-        late = th - ratio * mt - (share * slope).sum(axis=-1)
-        explained += np.where(used, ratio * np.maximum(mh, 0.0) / level**2, 0.0)
-        energy += np.where(used, hh / level**2, 0.0)
-        gradient += np.where(used, ratio / level**2 * late, 0.0)
-        information += np.where(used, ratio**2 / level**2 * (tt - (share * cross).sum(-1)), 0.0)
+        windows = blurred(part, WINDOW)
+        equations = normal_equations(windows, less)
+        # The shift of each window is eliminated.
+        tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
+        ridge = _RIDGE * np.trace(tensor, axis1=-2, axis2=-1).max()
+        share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
+        late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
+        seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
+        moved, both, other = (windows[..., place] for place in (0, 4, 14))
+        alike = np.maximum(both, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
+        totals += np.where(used, np.stack([late, seen, alike, other]), 0.0) / level**2
+    gradient, information, *energy = totals
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
     of_parts = [
         np.add.reduceat(np.add.reduceat(part, starts[0], axis=0), starts[1], axis=1)
@@ -285,4 +290,4 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
     std = np.sqrt((without.size - 1) * np.var(without))
     late = float(gradient.sum() / information.sum())
-    return late, float(std), np.stack([explained, energy])
+    return late, float(std), np.stack(energy)

@@ -65,6 +65,27 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
     return result
 
 
+def normal_equations(sums: Array, noise: Array) -> Array:
+    """Normal equations A d = g (..., 4, 3) of steps down, right and in time, see `products`.
+
+    Of sums (..., 15) over pixels, with a rate; the noise's part of the squares of the moved movie
+    and of its changes (..., 4) is subtracted, half of them at most. The other movie is a ratio of
+    the moved one, which is eliminated.
+    """
+    rows, columns = np.triu_indices(5)
+    full = np.zeros((*sums.shape[:-1], 5, 5))
+    full[..., rows, columns] = full[..., columns, rows] = sums
+    places = np.arange(4)
+    squares = full[..., places, places]
+    full[..., places, places] -= np.minimum(noise, 0.5 * squares)
+    size, cross = full[..., :1, :1], full[..., :1, 1:4]
+    size = np.maximum(size, np.finfo(np.float64).tiny)
+    ratio = full[..., :1, 4:] / size
+    tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
+    rest = ratio * (full[..., 4:, 1:4] - ratio * cross)
+    return np.concatenate([tensor, rest], axis=-2)
+
+
 @compiled
 def _blurred(movie: Any, weights: Any) -> Any:
     """Image (line, place, plane) with weighted means over the places of each line."""
