@@ -18,7 +18,7 @@ from dbthermal import schema
 from dbthermal._arrays import Array, spacing
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._planes import SMALLEST, Scale, bridged
-from dbthermal.alignment._products import blurred, normal_equations, products, splines
+from dbthermal.alignment._products import Movie, blurred, normal_equations, products, splines
 
 # Frames, windows along either side, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
@@ -72,23 +72,21 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
     noise = scale.noise_of(corrected)
     bands, time = np.argsort(noise, kind="stable")[:2], corrected["time"].values[every]
+    slopes = scale.slopes[bands].astype(np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
     counts, (rows, columns) = corrected["counts"].variable[:, every], _measured(corrected)
 
-    def films(rows: slice, columns: slice) -> Array:
+    def films(rows: slice, columns: slice) -> Movie:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
         whole, share = bridged(film.reshape(2, time.size, -1))
-        whole = (
-            np.where(share > _COMMON * share.max(), whole, 0.0)
-            / scale.slopes[bands, np.newaxis, np.newaxis]
-        )
-        return whole.astype(np.float32).reshape(film.shape)
+        whole = np.where(share > _COMMON * share.max(), whole, np.float32(0.0))
+        return whole.reshape(film.shape) / slopes
 
     # Functions of time of what changes rapidly in the quietest band.
     height, width = rows.stop - rows.start, columns.stop - columns.start
     step = spacing(height * width, _PIXELS)
-    some = films(slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step))
-    some = some[0].reshape(time.size, -1).T.astype(np.float64)
+    grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
+    some = films(*grid)[0].reshape(time.size, -1).T.astype(np.float64)
     segment = clocks.segments(corrected)[every]
     orders = min(_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
@@ -112,12 +110,12 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
             within = (slice(left, left + side) for left in lefts - columns.start)
             part.extend(pairs[one].sum(axis=0) for one in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
-    level = _PLANES * side**2 * noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2)
-    slope, result = 0.5 / _BLUR**2, []
-    for part, rate in zip(map(np.array, sums), rates, strict=True):
-        each = level * np.array([1.0, slope, slope, np.sum(rate**2) / len(rate)])
-        strong = part[:, 0] > (_STRONG + 1.0) * level
-        result.append(normal_equations(part[strong], each))
+    level, slope, result = noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2), 0.5 / _BLUR**2, []
+    for windows, rate in zip(sums, rates, strict=True):
+        squares = np.array([len(rate), len(rate) * slope, len(rate) * slope, np.sum(rate**2)])
+        squares *= side**2 * level
+        strong = [window for window in windows if window[0] > (_STRONG + 1.0) * squares[0]]
+        result.append(normal_equations(np.reshape(strong, (-1, 15)), squares))
     return result
 
 

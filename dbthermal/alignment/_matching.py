@@ -172,9 +172,9 @@ def _information(movies: Movies, shift: Array) -> Information:
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
-        tensor = [ratio * yy - less, ratio * yx, ratio * xx - less]
-        gradient = [yh - ratio * my, xh - ratio * mx]
-        total += weight[..., np.newaxis] * np.stack([*tensor, *gradient, less], axis=-1)
+        squares = ratio * yy - less, ratio * yx, ratio * xx - less
+        both = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
+        total += weight[..., np.newaxis] * both
     total = np.moveaxis(blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
@@ -208,9 +208,9 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
         for part, level in zip((blurred(film, BLUR) for film in films), movies.noise, strict=True)
     )
     functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES).astype(np.float32)
-    first, *others = (part @ functions for part in (first, *others))
+    pictures = [np.asarray(part @ functions, np.float32) for part in (first, *others)]
     freedom *= functions.shape[1] / functions.shape[0]
-    rough, share = _whole_pixels(first, others, freedom, reach)
+    rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
     share *= movies.valid
     if not share.any():
         return None

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -129,7 +129,7 @@ class Capture:
         penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
-    def functions(self, signals: Array, period: float) -> Movie:
+    def functions(self, signals: Movie, period: float) -> Movie:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
         some = signals.reshape(-1, signals.shape[-1])
@@ -168,7 +168,7 @@ class Capture:
         return list(np.concatenate(parts, axis=1)), valid
 
 
-def freedom(functions: Array) -> float:
+def freedom(functions: Movie) -> float:
     """Degrees of freedom of white noise along functions of time (time, plane)."""
     return float(np.sum(functions**2))
 
@@ -203,7 +203,7 @@ def bridged(films: Movie) -> tuple[Movie, Array]:
     return result, known.mean(axis=0)
 
 
-def rapid(signal: Array, smoothing: Array) -> Array:
+def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:
     """Signal (y, x, time) less what a smoother passes."""
     flat = signal.reshape(-1, signal.shape[-1]).T
     flat = flat - flat.mean(axis=0)

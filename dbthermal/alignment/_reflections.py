@@ -80,10 +80,14 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
     return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # on any number of cores the same field
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
-    capture = Capture.of(corrected, scale)
+    with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
+        return _matched(corrected, Capture.of(corrected, scale))
+
+
+def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
+    """Field of a checked capture, from coarse to fine, and the delay beside it."""
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
@@ -109,7 +113,7 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     spread = _variances(field, fine, _told(data), _squares(data))
     # What a rate's planes are of the delay's, by its functions.
     times = corrected["time"].values[capture.frames]
-    change = np.gradient(np.eye(times.size), times, axis=0).T @ functions[-1]
+    change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
     rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
     slower = fine if len(movies) == 1 else level(-1, 1)
     late, std, energy = matching.delay(slower, rate, field.on(fine.centres()))
@@ -135,7 +139,8 @@ def _coarse(
     signals, valid = capture.binned(factor)
     frames, tried, result = capture.frames.size, dict[float, Movie](), None
     refusal: ValueError | None = None
-    before, seen, sizes, limit = None, np.False_, np.inf, np.inf  # of the field that was taken
+    # Of the field that was taken: its data, the pixels that they tell, deviations, chi-square.
+    before, seen, sizes, limit = None, np.zeros((1, 1), bool), np.inf, np.inf
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
