@@ -78,8 +78,11 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     def films(rows: slice, columns: slice) -> Movie:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
-        whole, share = bridged(film.reshape(2, time.size, -1))
-        whole = np.where(share > _COMMON * share.max(), whole, np.float32(0.0))
+        film[:, ~schema.measured(film).all(axis=0)] = np.nan  # of both the same samples
+        flat = film.reshape(2, time.size, -1)
+        (first, share), (second, _) = (bridged(part) for part in flat)
+        used = share > _COMMON * share.max()
+        whole = np.where(used, np.stack([first, second]), np.float32(0.0))
         return whole.reshape(film.shape) / slopes
 
     # Functions of time of what changes rapidly in the quietest band.

@@ -116,9 +116,9 @@ class Capture:
             films = self.counts.isel(y=rows).values
             films = films if whole else films[:, self.frames]
             flat = films.astype(np.float32, copy=False).reshape(*films.shape[:2], -1)
-            filled, share = bridged(flat)
-            few = (share >= 1.0 - _MISSING).reshape(films.shape[2:])
-            yield rows, [filled[band].reshape(films.shape[1:]) for band in self.bands], few
+            filled, shares = zip(*(bridged(flat[band]) for band in self.bands), strict=True)
+            few = (np.min(shares, axis=0) >= 1.0 - _MISSING).reshape(films.shape[2:])
+            yield rows, [film.reshape(films.shape[1:]) for film in filled], few
 
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
@@ -180,26 +180,25 @@ def white(frames: int, period: float) -> float:
     return float(np.sum((ratio / (1.0 + ratio)) ** 2))
 
 
-def bridged(films: Movie) -> tuple[Movie, Array]:
-    """Films (band, time, pixel) with missing samples on the line between those before and after.
+def bridged(film: Movie) -> tuple[Movie, Array]:
+    """Film (time, pixel) with missing samples on the line between those before and after.
 
-    Missing of one band is missing of all. Second, the share of samples (pixel) that all have; a
-    pixel without any is zero.
+    Second, the share of samples (pixel) that are measured; a pixel without any is zero.
     """
-    known = schema.measured(films).all(axis=0)
+    known = schema.measured(film)
     pixels = np.flatnonzero(~known.all(axis=0))
     if not pixels.size:
-        return films, np.ones(films.shape[2])
-    here, frame = known[:, pixels], np.arange(len(known))[:, np.newaxis]
+        return film, np.ones(film.shape[1])
+    here, frame = known[:, pixels], np.arange(len(film))[:, np.newaxis]
     before = np.maximum.accumulate(np.where(here, frame, -1), axis=0)
     after = np.minimum.accumulate(np.where(here, frame, frame.size)[::-1], axis=0)[::-1]
     # Before the first and after the last sample their values go on.
     first, last = after[0] % frame.size, before[-1].clip(0)
     before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
     weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
-    result, measured = films.copy(), np.where(here, films[:, :, pixels], np.float32(0.0))
-    low, high = (np.take_along_axis(measured, place[np.newaxis], 1) for place in (before, after))
-    result[:, :, pixels] = low + weight * (high - low)
+    result, measured = film.copy(), np.where(here, film[:, pixels], np.float32(0.0))
+    low, high = (np.take_along_axis(measured, place, 0) for place in (before, after))
+    result[:, pixels] = low + weight * (high - low)
     return result, known.mean(axis=0)
 
 
