@@ -20,7 +20,7 @@ import xarray as xr
 from scipy.ndimage import uniform_filter
 from scipy.special import bdtrc, ndtri
 
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, spacing
 from dbthermal.noise import MINIMUM_FRAMES
 
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
@@ -172,7 +172,7 @@ def _roughness(counts: npt.NDArray[Any]) -> Array:
 
 def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
     """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / pixels)))
+    step = spacing(counts.sizes["y"] * counts.sizes["x"], pixels)
     some = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
     return np.asarray(some.reshape(*some.shape[:2], -1))
 

@@ -44,23 +44,23 @@ def share_displaced(corrected: xr.Dataset, scale: Scale) -> float:
     return max(_share(windows) for windows in _equations(corrected, scale))
 
 
-def _share(each: Array) -> float:
+def _share(windows: Array) -> float:
     """Share of windows whose bands are apart, from normal equations A d = g (window, 4, 3)."""
-    windows, whole, size = len(each), each.sum(axis=0), each.shape[2]
+    number, whole, size = len(windows), windows.sum(axis=0), windows.shape[2]
     # All windows, and those without one after another, have to tell a displacement.
-    sums = np.concatenate([whole[np.newaxis], whole - each])
-    if windows < _FEWEST or np.linalg.eigvalsh(sums[:, :size]).min() <= 0.0:
+    sums = np.concatenate([whole[np.newaxis], whole - windows])
+    if number < _FEWEST or np.linalg.eigvalsh(sums[:, :size]).min() <= 0.0:
         return 0.0
     shift, *without = np.linalg.solve(sums[:, :size], sums[:, size, :, np.newaxis])[..., 0]
-    covariance = (windows - 1) ** 2 / windows * np.cov(np.transpose(without))
-    square, free = shift @ np.linalg.solve(covariance, shift), windows - size
-    chance = fdtrc(size, free, free / (windows - 1) / size * square)
+    covariance = (number - 1) ** 2 / number * np.cov(np.transpose(without))
+    square, free = shift @ np.linalg.solve(covariance, shift), number - size
+    chance = fdtrc(size, free, free / (number - 1) / size * square)
     in_image = np.linalg.solve(whole[:2, :2], whole[size, :2])
     in_time = whole[size, 2] / whole[2, 2]
     if chance > _CHANCE or (np.hypot(*in_image) < _LEAST and abs(in_time) < _LEAST_LATE):
         return 0.0
     # Windows whose residual is smaller with it: 2 d g - d A d > 0.
-    return float(np.mean((2.0 * each[:, size] - each[:, :size] @ shift) @ shift > 0.0))
+    return float(np.mean((2.0 * windows[:, size] - windows[:, :size] @ shift) @ shift > 0.0))
 
 
 def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
@@ -69,11 +69,11 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     Down and right in the image [pixel], and in time [frame]; the ratio of a window is eliminated,
     and what noise adds is subtracted.
     """
-    every = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
+    frames = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
     noise = scale.noise_of(corrected)
-    bands, time = np.argsort(noise, kind="stable")[:2], corrected["time"].values[every]
+    bands, time = np.argsort(noise, kind="stable")[:2], corrected["time"].values[frames]
     slopes = scale.slopes[bands].astype(np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
-    counts, (rows, columns) = corrected["counts"].variable[:, every], _measured(corrected)
+    counts, (rows, columns) = corrected["counts"].variable[:, frames], _measured(corrected)
 
     def films(rows: slice, columns: slice) -> Movie:
         """Films (band, time, y, x) [K] of some rows and columns."""
@@ -83,14 +83,14 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         (first, share), (second, _) = (bridged(part) for part in flat)
         used = share > _COMMON * share.max()
         whole = np.where(used, np.stack([first, second]), np.float32(0.0))
-        return whole.reshape(film.shape) / slopes
+        return np.asarray(whole.reshape(film.shape) / slopes, np.float32)
 
     # Functions of time of what changes rapidly in the quietest band.
     height, width = rows.stop - rows.start, columns.stop - columns.start
     step = spacing(height * width, _PIXELS)
     grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
     some = films(*grid)[0].reshape(time.size, -1).T.astype(np.float64)
-    segment = clocks.segments(corrected)[every]
+    segment = clocks.segments(corrected)[frames]
     orders = min(_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
     functions = [smooth.leading(some - some @ part @ part.T, _PLANES) for part in curves]
@@ -99,8 +99,8 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     # Sums over the windows of rows of windows.
     side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
     tops, lefts = (
-        one.start + np.linspace(0, size - side, min(_ALONG, size // side)).astype(int)
-        for one, size in ((rows, height), (columns, width))
+        span.start + np.linspace(0, size - side, min(_ALONG, size // side)).astype(int)
+        for span, size in ((rows, height), (columns, width))
     )
     sums: list[list[Array]] = [[] for _ in functions]
     for top in tops:
@@ -111,7 +111,7 @@ def _equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
             first, second = splines(planes[0], _BLUR), blurred(planes[1], _BLUR)
             pairs = products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
             within = (slice(left, left + side) for left in lefts - columns.start)
-            part.extend(pairs[one].sum(axis=0) for one in within)
+            part.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
     level, slope, result = noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2), 0.5 / _BLUR**2, []
     for windows, rate in zip(sums, rates, strict=True):

@@ -61,9 +61,9 @@ class Scale:
         if self.noise is not None:
             return np.asarray(self.noise * _noise_factor(corrected))
         signals = sample(corrected)
-        here = np.all(np.isfinite(signals), axis=(0, 2))
-        parts = [signal[here] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
-        return noises.estimate_bands(parts, corrected["time"].values[here])
+        frames = np.all(np.isfinite(signals), axis=(0, 2))
+        parts = [signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
+        return noises.estimate_bands(parts, corrected["time"].values[frames])
 
 
 def _noise_factor(corrected: xr.Dataset) -> Array:
@@ -158,11 +158,11 @@ class Capture:
         valid, parts = self.valid.copy(), []
         for rows, films, few in self.blocks(max(1, _ROWS // factor) * factor):
             valid[rows] &= few
-            here = valid[rows, :, np.newaxis]
-            share = np.maximum(binned(here.astype(np.float64), factor), factor**-2)
+            used = valid[rows, :, np.newaxis]
+            share = np.maximum(binned(used.astype(np.float64), factor), factor**-2)
             signals = [np.moveaxis(film, 0, -1) for film in films]
-            if not here.all():
-                signals = [np.where(here, signal, np.float32(0.0)) for signal in signals]
+            if not used.all():
+                signals = [np.where(used, signal, np.float32(0.0)) for signal in signals]
             scale = (self.slopes[:, None, None, None] * share).astype(np.float32)
             parts.append(np.stack([binned(signal, factor) for signal in signals]) / scale)
         return list(np.concatenate(parts, axis=1)), valid
@@ -185,21 +185,21 @@ def bridged(film: Movie) -> tuple[Movie, Array]:
 
     Second, the share of samples (pixel) that are measured; a pixel without any is zero.
     """
-    known = schema.measured(film)
-    pixels = np.flatnonzero(~known.all(axis=0))
+    measured = schema.measured(film)
+    pixels = np.flatnonzero(~measured.all(axis=0))
     if not pixels.size:
         return film, np.ones(film.shape[1])
-    here, frame = known[:, pixels], np.arange(len(film))[:, np.newaxis]
-    before = np.maximum.accumulate(np.where(here, frame, -1), axis=0)
-    after = np.minimum.accumulate(np.where(here, frame, frame.size)[::-1], axis=0)[::-1]
+    present, frame = measured[:, pixels], np.arange(len(film))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(present, frame, -1), axis=0)
+    after = np.minimum.accumulate(np.where(present, frame, frame.size)[::-1], axis=0)[::-1]
     # Before the first and after the last sample their values go on.
     first, last = after[0] % frame.size, before[-1].clip(0)
     before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
     weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
-    result, measured = film.copy(), np.where(here, film[:, pixels], np.float32(0.0))
-    low, high = (np.take_along_axis(measured, place, 0) for place in (before, after))
+    result, samples = film.copy(), np.where(present, film[:, pixels], np.float32(0.0))
+    low, high = (np.take_along_axis(samples, place, 0) for place in (before, after))
     result[:, pixels] = low + weight * (high - low)
-    return result, known.mean(axis=0)
+    return result, measured.mean(axis=0)
 
 
 def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:

@@ -149,10 +149,10 @@ def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
     for p in range(pixels):
         place = 0
         for i in range(count + 1):
-            one = signals[i, p] if i < count else last[p]
+            first = signals[i, p] if i < count else last[p]
             for j in range(i, count + 1):
-                other, total = signals[j, p] if j < count else last[p], np.float32(0.0)
+                second, total = signals[j, p] if j < count else last[p], np.float32(0.0)
                 for t in range(planes):
-                    total += one[t] * other[t]
+                    total += first[t] * second[t]
                 out[p, place] = total
                 place += 1

@@ -94,8 +94,8 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     capture, tried, period, field = _coarse(capture, spline, factor)
     # Planes in one look at the films. The delay is seen in slower changes, too, in which there is
     # more than noise.
-    slow = min((one for one in tried if one >= max(period, _SLOW)), default=max(tried))
-    functions = [tried[one] for one in sorted({period, slow})]
+    slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
+    functions = [tried[length] for length in sorted({period, slow})]
     movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
 
     def level(place: int, factor: int) -> Movies:
@@ -110,7 +110,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
         field, _ = matching.refine(level(0, factor), field)
     fine = level(0, 1)
     field, data = matching.refine(fine, field)
-    spread = _variances(field, fine, _told(data), _squares(data))
+    spread = _variances(field, fine, _resolved(data), _squares(data))
     # What a rate's planes are of the delay's, by its functions.
     times = corrected["time"].values[capture.frames]
     change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
@@ -140,7 +140,7 @@ def _coarse(
     frames, tried, result = capture.frames.size, dict[float, Movie](), None
     refusal: ValueError | None = None
     # Of the field that was taken: its data, the pixels that they tell, deviations, chi-square.
-    before, seen, sizes, limit = None, np.zeros((1, 1), bool), np.inf, np.inf
+    before, earlier, sizes, limit = None, np.zeros((1, 1), bool), np.inf, np.inf
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -168,17 +168,17 @@ def _coarse(
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        told, squares = _told(data, factor), _squares(data, factor)
-        variance = _variances(field, level, told, squares)
+        resolved, squares = _resolved(data, factor), _squares(data, factor)
+        variance = _variances(field, level, resolved, squares)
         # Deviations of the field in the pixels in which one of both is known by its data.
         size = 0.25 * np.log(variance).sum(axis=0)
-        gain = np.mean((sizes - size)[told | seen]) if told.any() else 0.0
+        gain = np.mean((sizes - size)[resolved | earlier]) if resolved.any() else 0.0
         # A field of slower changes must fit the data of the more robust one.
         apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
-        better = gain > np.log(_MORE) or told.sum() > _MORE * seen.sum()
+        better = gain > np.log(_MORE) or resolved.sum() > _MORE * earlier.sum()
         if better and apart < limit:
-            before, seen, sizes = data, told, size
-            limit = min(limit, _AGREE * max(squares[:, told].mean(), 1.0))
+            before, earlier, sizes = data, resolved, size
+            limit = min(limit, _AGREE * max(squares[:, resolved].mean(), 1.0))
             result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
         raise refusal or ValueError(
@@ -188,7 +188,7 @@ def _coarse(
     return result
 
 
-def _told(data: Information, factor: int = 1) -> Mask:
+def _resolved(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
     area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
     return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
@@ -203,15 +203,15 @@ def _squares(data: Information, factor: int = 1) -> Array:
     return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
 
 
-def _variances(field: Field, level: Movies, told: Mask, squares: Array) -> Array:
+def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> Array:
     """
     Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
     sums = [
-        gaussian_filter(part * told, _WIDE / level.factor, axes=(-2, -1))
-        for part in (squares, np.ones(told.shape))
+        gaussian_filter(part * resolved, _WIDE / level.factor, axes=(-2, -1))
+        for part in (squares, np.ones(resolved.shape))
     ]
     chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
@@ -225,7 +225,7 @@ def _result(
     centres = [np.arange(size, dtype=np.float64) for size in shape]
     shift = field.on(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
-    known = _told(data) & reached
+    known = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~known))
     near = (distance <= _NEAR * min(shape)) & reached & known.any()
     # Away from where it is known the field may change as much as it does there.

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _rows, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, spacing
 from dbthermal._coordinates import laid_on
 
 Integers = npt.NDArray[np.int64]
@@ -163,7 +163,7 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
 
 def _copies(counts: xr.DataArray) -> Mask:
     """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / _SAMPLE)))
+    step = spacing(counts.sizes["y"] * counts.sizes["x"], _SAMPLE)
     sample = counts.isel(y=slice(None, None, step), x=slice(None, None, step)).values
     changed, valid = _changed(sample[:-1], sample[1:])
     moving = changed.any(axis=0)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, spacing
 from dbthermal._coordinates import laid_on
 from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
@@ -233,7 +233,7 @@ class View:
         """
         pane, (frames, pixels) = self.pane(name), _LOOKED_AT
         times = slice(0, None, -(-self.time.size // frames))
-        step = max(1, int(np.sqrt(np.prod(self.shape) / pixels)))
+        step = spacing(int(np.prod(self.shape)), pixels)
         some = slice(0, None, step)
         values, good = pane.read(times, some, some), self.counted("measured")[some, some]
         for part in (values[:, good], values):
