@@ -21,14 +21,14 @@ _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at l
 _FEW: Final = 64  # functions of time on the coarsest image
 _START: Final = 20  # the same of the image on which whole pixels are matched
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
-# rapidly enters. A longer one is taken that tells so many times more pixels, or with so many times
-# smaller deviations (in the twin of the wineglass 20 frames tell 2.7 times those of 10), and
-# a chi-square by the shorter one's data of no more than so many times that of the shorter one's own
-# windows: of a field with rims it is 3 to 9, and objects that heat rapidly gave 30 to 8000.
+# rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
+# shorter one is known, and a chi-square by the shorter one's data below so much: of people before
+# glass, a wineglass and a coffee pot it was .1 to 3.0, and 6 to 3000 where an object's own changes
+# entered.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _SLOW: Final = 20.0  # those of a delay, at least
 _MORE: Final = 1.25
-_AGREE: Final = 2.25
+_AGREE: Final = 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
@@ -139,8 +139,8 @@ def _coarse(
     signals, valid = capture.binned(factor)
     frames, tried, result = capture.frames.size, dict[float, Movie](), None
     refusal: ValueError | None = None
-    # Of the field that was taken: its data, the pixels that they tell, deviations, chi-square.
-    before, earlier, sizes, limit = None, np.zeros((1, 1), bool), np.inf, np.inf
+    # Of the field that was taken: its data, the pixels that they resolve, and its deviations.
+    before, earlier, sizes = None, np.zeros((1, 1), bool), np.zeros((1, 1))
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -170,15 +170,14 @@ def _coarse(
         field, data = matching.refine(level, begin)
         resolved, squares = _resolved(data, factor), _squares(data, factor)
         variance = _variances(field, level, resolved, squares)
-        # Deviations of the field in the pixels in which one of both is known by its data.
         size = 0.25 * np.log(variance).sum(axis=0)
-        gain = np.mean((sizes - size)[resolved | earlier]) if resolved.any() else 0.0
-        # A field of slower changes must fit the data of the more robust one.
-        apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
-        better = gain > np.log(_MORE) or resolved.sum() > _MORE * earlier.sum()
-        if better and apart < limit:
+        gain, apart = np.inf, 0.0
+        if before is not None:
+            gain = np.mean((sizes - size)[earlier])
+            # A field of slower changes must fit the data of the more robust one.
+            apart = begin.disagreement(before, level.centres(), field)
+        if resolved.any() and gain > np.log(_MORE) and apart < _AGREE:
             before, earlier, sizes = data, resolved, size
-            limit = min(limit, _AGREE * max(squares[:, resolved].mean(), 1.0))
             result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
         raise refusal or ValueError(
