@@ -135,12 +135,6 @@ def inside(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-def _moderate(movie: Movie) -> Movie:
-    """Weight of samples (..., time), smaller where a movie changes as it seldom does."""
-    usual = np.quantile(np.abs(movie), _USUAL, axis=-1, keepdims=True)
-    return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
-
-
 def _information(movies: Movies, shift: Array) -> Information:
     r"""
     Information on a step of the field at each pixel, by Gauss-Newton.
@@ -202,13 +196,15 @@ def _positive(tensor: Array) -> Array:
 def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
     """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
     reach = movies.shape[0] // 3, movies.shape[1] // 3
-    # Changes as large as there are seldom are cut: an object's, if rapid.
-    first, *others = (
-        part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
-        for part, level in zip((blurred(film, BLUR) for film in films), movies.noise, strict=True)
-    )
-    functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES).astype(np.float32)
-    pictures = [np.asarray(part @ functions, np.float32) for part in (first, *others)]
+    pictures = []
+    for film, level in zip(films, movies.noise, strict=True):
+        # Changes as large as there are seldom are cut: an object's, if rapid.
+        part = blurred(film, BLUR)
+        usual = np.quantile(np.abs(part), _USUAL, axis=-1, keepdims=True)
+        part /= np.sqrt(1.0 + (part / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
+        pictures.append(part)
+    functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
+    pictures = [np.asarray(part @ functions, np.float32) for part in pictures]
     freedom *= functions.shape[1] / functions.shape[0]
     rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
     share *= movies.valid
