@@ -30,6 +30,7 @@ _EXTRAS: Final = {
     **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
     **dict.fromkeys(("h5py", "tifffile"), "recordings"),
     "av": "video",
+    "cv2": "alignment",
     "matplotlib": "figures",
     "skimage": "materials",
     "torch": "torch",

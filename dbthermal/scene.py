@@ -53,7 +53,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `separation.separate`.
 
     Clocks and shift are found in a reduced picture, of means over some pixels and frames, if the
-    capture is large. Errors as the steps.
+    capture is large. Errors as the steps; ImportError without OpenCV, for a registration.
 
     Parameters
     ----------

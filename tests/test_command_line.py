@@ -352,6 +352,7 @@ def test_refusals_are_one_line(results: Path) -> None:
 @pytest.mark.parametrize(
     ("library", "extra", "command"),
     [
+        ("cv2", "alignment", "align corrected.zarr -o no.zarr"),
         ("tifffile", "recordings", "info a.tif --unit count --clock 10"),
         ("matplotlib", "figures", "export result.zarr -o no.png"),
         ("jinja2", "report", "report result.zarr -o no.html"),

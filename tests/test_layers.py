@@ -21,6 +21,7 @@ PLACES = {
     "anywidget": {"explorer"},
     "av": {"readers", "store"},
     "torch": {"separation"},
+    "cv2": {"alignment"},
     "skimage": {"separation"},
     "serial": {"instruments"},
     "usb": {"instruments"},

@@ -5,7 +5,7 @@ from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
+from scipy.ndimage import gaussian_filter, median_filter, spline_filter
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
@@ -37,6 +37,8 @@ _NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
 _RIGID: Final = 0.01
 _FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
+# Steps, and relative change of the correlation, at which the maximisation stops.
+_STEPS, _TOLERANCE = 200, 1e-7
 _LEAST_CORRELATION: Final = 0.5
 # Share of the first view that the other must show: the last rows of two views correlate by chance.
 _LEAST_OVERLAP: Final = 0.5
@@ -48,8 +50,8 @@ def register(
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
     Compared are smooth curves fitted robustly to each pixel, in which what passes by in the
-    reflection hardly counts. Their means are brought together by a translation, from coarse images
-    to finer ones, and then, to some hundredths of a pixel, the curves by robust least squares,
+    reflection hardly counts. Their means are brought together by the translation of the highest
+    correlation [1]_, and then, to some hundredths of a pixel, the curves by robust least squares,
 
     .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \right)
 
@@ -84,9 +86,16 @@ def register(
 
     Raises
     ------
+    ImportError
+        If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
         two views is below 0.5, or they share less than half the image.
+
+    References
+    ----------
+    .. [1] Evangelidis, Psarakis (2008), IEEE Transactions on Pattern Analysis and Machine
+       Intelligence 30, 1858, doi:10.1109/TPAMI.2008.113
 
     Examples
     --------
@@ -258,7 +267,7 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         matrix = matrix.copy()
         matrix[rows, columns] += found[: len(free)] * unit
         matrix /= matrix[2, 2]
-        if np.max(np.abs(found[: len(free)])) < _CONVERGED * (blur / _FINEST) ** 2:
+        if np.max(np.abs(found[: len(free)])) < _CONVERGED:
             break
     return matrix
 
@@ -290,20 +299,28 @@ def _inside(places: Array, band: str) -> Mask:
 
 
 def _start(pair: list[Array], band: str) -> tuple[float, Array]:
-    """Translation (3, 3) that matches two images (y, x) best, and their correlation with it."""
-    matrix, free = np.eye(3), _FREE["translation"]
-    for blur in np.multiply(_BLURS[:-1], len(pair[0])):
-        blurred = [gaussian_filter(image, blur)[np.newaxis] for image in pair]
-        matrix = _fitted(blurred, matrix, free, blur, band)
-    places = positions(matrix, pair[0].shape)
-    inside = _inside(places, band)
-    one, two = (gaussian_filter(image, _BLURS[-1] * len(image)) for image in pair)
-    moved = map_coordinates(two, places[:, inside], order=1)
-    correlation = float(np.corrcoef(one[inside], moved)[0, 1])
+    """Translation (3, 3) of the highest correlation of two images (y, x), and that before it."""
+    import cv2  # noqa: PLC0415  (optional: only registration needs it)
+
+    matrix, correlation = np.eye(3), 0.0
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
+    everywhere = np.ones(pair[0].shape, dtype=np.uint8)
+    for share in _BLURS:
+        one, two = (gaussian_filter(it, share * it.shape[0]).astype(np.float32) for it in pair)
+        start = matrix[:2].astype(np.float32)
+        try:
+            correlation, matrix[:2] = cv2.findTransformECC(
+                one, two, start, cv2.MOTION_TRANSLATION, stop, everywhere, 1
+            )
+        except cv2.error as error:
+            raise ValueError(
+                f"Invalid view in band '{band}': no transform to the first is found ({error.err})."
+                " Must show the same object, displaced by at most a tenth of the image."
+            ) from error
     if not correlation >= _LEAST_CORRELATION:
         raise ValueError(
             f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
             f"Must be at least {_LEAST_CORRELATION}; they do not show the same, or lie too far "
             "apart."
         )
-    return correlation, matrix
+    return float(correlation), matrix

@@ -12,6 +12,8 @@ from dbthermal.correction import correct_capture
 from dbthermal.simulation import Rig
 from reproduction.experiments import whole
 
+pytest.importorskip("cv2")
+
 RIG = Rig()
 SHAPE = (96, 128)
 
