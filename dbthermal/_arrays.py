@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from math import prod
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Lock
@@ -27,6 +28,15 @@ _LEAST: Final = 2**20  # bytes of an array that is worth a file
 _PART: Final = 2**25  # bytes of a film that are held at once
 _FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
 _MAPS: WeakSet[mmap.mmap] = WeakSet()
+
+
+def stride(shape: tuple[int, ...], number: int) -> int:
+    """Step along every axis of a shape that selects about so many values, evenly spaced.
+
+    Rounded down: at most 2^n times the number are selected along n axes.
+    """
+    step = (prod(shape) / number) ** (1.0 / len(shape))
+    return max(1, int(round(step, 9)))  # a whole root is whole
 
 
 def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:

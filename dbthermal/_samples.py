@@ -12,7 +12,6 @@ nothing can be told, and nothing is.
 """
 
 from dataclasses import dataclass
-from math import prod
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +20,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.special import bdtrc, ndtri
 
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal.noise import MINIMUM_FRAMES
 
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
@@ -171,15 +170,6 @@ def _roughness(counts: npt.NDArray[Any]) -> Array:
     sampled = slice(None, None, max(1, counts.shape[1] // _STEPS))
     steps = np.abs(counts[:, 1:][:, sampled] - counts[:, :-1][:, sampled])
     return np.asarray(np.median(steps, axis=1, overwrite_input=True))
-
-
-def stride(shape: tuple[int, ...], number: int) -> int:
-    """Step along every axis of a shape that selects about so many values, evenly spaced.
-
-    Rounded down: at most 2^n times the number are selected along n axes.
-    """
-    step = (prod(shape) / number) ** (1.0 / len(shape))
-    return max(1, int(round(step, 9)))  # a whole root is whole
 
 
 def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
@@ -354,25 +344,6 @@ def _needed(frames: int, chance: float) -> int:
         return np.iinfo(np.int32).max
     tiny = np.finfo(np.float64).tiny
     return max(FEWEST, int(np.ceil(np.log(_FALSE_ALARM / frames) / np.log(max(chance, tiny)))))
-
-
-def bridged(signal: Array, valid: Mask, time: Array) -> Array:
-    """Signal (time, ...) with its missing frames (time) on the line between the valid ones.
-
-    Before the first and behind the last valid frame it stays at their values.
-    """
-    if valid.all() or not valid.any():
-        return signal
-    # The valid frames on either side of each missing one, and the share of the later.
-    frames, missing = np.flatnonzero(valid), np.flatnonzero(~valid)
-    place = np.searchsorted(frames, missing)
-    before, after = (frames[np.clip(place + step, 0, frames.size - 1)] for step in (-1, 0))
-    gap = np.where(after > before, time[after] - time[before], 1.0)
-    share = ((time[missing] - time[before]) / gap).reshape(-1, *(1,) * (signal.ndim - 1))
-    share = np.where((after > before).reshape(share.shape), share, 0.0)
-    result = signal.copy()
-    result[missing] = (1.0 - share) * signal[before] + share * signal[after]
-    return result
 
 
 def neighbour_mean(

@@ -16,12 +16,12 @@ from dbthermal import _rows, store
 from dbthermal._arrays import made_on_disk, on_disk, release
 from dbthermal.alignment import _joint as joint
 from dbthermal.alignment import align, register
-from dbthermal.alignment._reflections import Scale
+from dbthermal.alignment._displacement import share_displaced
+from dbthermal.alignment._planes import Scale
 from dbthermal.alignment._resampling import on_one_clock
 from dbthermal.alignment._views import registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
-from dbthermal.separation._separate import cameras_apart
 from dbthermal.store._results import check_place
 
 __all__ = ["separate_capture"]
@@ -178,12 +178,12 @@ def _aligned(
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = joint.apart(corrected, scale, **options)
-        if field is not None and cameras_apart(aligned, response) > 0.0:
+        if field is not None and share_displaced(aligned, scale) > 0.0:
             return aligned, field
         return aligned, None
     found = joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    if found.field is not None and not cameras_apart(aligned, response) > 0.0:
+    if found.field is not None and not share_displaced(aligned, scale) > 0.0:
         # No delay of a shift that is not used.
         found = joint.compare(corrected, scale, **options, side_by_side=False)
         aligned = on_one_clock(corrected, **{**options, "offset": found.offset})

@@ -1,8 +1,9 @@
-"""Subsample, gaps and neighbours, by hand."""
+"""Subsample and neighbours, by hand."""
 
 import numpy as np
 import pytest
 
+from dbthermal import _arrays
 from dbthermal import _samples as samples
 
 
@@ -12,19 +13,7 @@ from dbthermal import _samples as samples
 )
 def test_stride_selects_about_the_number(shape: tuple[int, ...], number: int, step: int) -> None:
     """A stride is at least 1, and a whole root is not rounded down."""
-    assert samples.stride(shape, number) == step
-
-
-def test_gaps_are_bridged_by_lines() -> None:
-    """Missing frames lie on the line through their neighbours in time, or stay at the ends."""
-    time = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
-    valid = np.array([False, True, False, True, False])
-    signal = np.stack([time, 3.0 * time], axis=1)
-    signal[~valid] = np.nan
-    result = samples.bridged(signal, valid, time)
-    np.testing.assert_allclose(result[:, 0], [1.0, 1.0, 2.0, 4.0, 4.0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(result[:, 1], 3.0 * result[:, 0], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(samples.bridged(signal, ~(valid & False), time), signal)
+    assert _arrays.stride(shape, number) == step
 
 
 def test_neighbours_without_weight_do_not_count() -> None:

@@ -11,15 +11,18 @@ one body to the next: differences follow Student's distribution, not a normal on
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from scipy import sparse
 from scipy.interpolate import BSpline
-from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_solve_banded, cholesky_banded
 
 from dbthermal._arrays import Array
+
+Whole = npt.NDArray[np.intp]
 
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
 _SPACING: Final = 6.0
@@ -80,12 +83,34 @@ class Spline:
         )
         return np.eye(len(level)) / self.prior**2 + level / _SLOPE**2
 
+    @cached_property
+    def _order(self) -> Whole:
+        """Order of the nodes' numbers, those of near nodes near: so that matrices have a band."""
+        return np.arange(2 * len(self.before)).reshape(2, *self.nodes).transpose(2, 1, 0).ravel()
+
+    @cached_property
+    def _band(self) -> tuple[Whole, Whole]:
+        """Rows and columns of a matrix of the nodes that are its band below the diagonal."""
+        last = self._order.size - 1
+        below, column = np.indices((6 * self.nodes[0] + 8, last + 1))
+        return self._order[np.minimum(column + below, last)], self._order[column]
+
+    def factored(self, matrix: Array) -> Array:
+        """Cholesky factor of a matrix of the nodes, its band."""
+        return np.asarray(cholesky_banded(matrix[self._band], lower=True, check_finite=False))
+
+    def solved(self, factor: Array, right: Array) -> Array:
+        """Nodes of a factored matrix and a right side."""
+        result = np.empty_like(right)
+        result[self._order] = cho_solve_banded(
+            (factor, True), right[self._order], check_finite=False
+        )
+        return result
+
     def values(self, centres: list[Array]) -> list[Array]:
         """Splines (place, node) at rows and at columns."""
         return [
-            BSpline.design_matrix(
-                place / (size - 1) * (count - 3), np.arange(count + 4) - 3.0, 3
-            ).toarray()
+            _splines(place.tobytes(), size, count)
             for place, size, count in zip(centres, self.shape, self.nodes, strict=True)
         ]
 
@@ -100,22 +125,24 @@ class Spline:
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if around is not None:
             target += matrix @ around.nodes
-            sharp, trials = around.sharpness, around.penalty * _STEPS
+            steps = _STEPS[1:2] if around.settled else _STEPS
+            sharp, trials = around.sharpness, around.penalty * steps
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
-            before = trial * blocks + self.before
-            trial_factor = cho_factor(matrix + block_diag(*before))
-            trial_nodes = cho_solve(trial_factor, target)
-            roots = [np.diagonal(np.linalg.cholesky(before), 0, 1, 2), np.diag(trial_factor[0])]
-            logs = [2.0 * np.sum(np.log(part)) for part in roots]
-            likelihood = logs[0] - logs[1] + target @ trial_nodes
+            before = block_diag(*(trial * blocks + self.before))
+            trial_factor = self.factored(matrix + before)
+            trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
+            if trials.size > 1:
+                logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
+                likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
         sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        return Field(self, nodes, factor, float(penalty), sharp)
+        settled = around is not None and penalty == around.penalty
+        return Field(self, nodes, factor, float(penalty), sharp, settled)
 
 
 @dataclass(frozen=True)
@@ -124,9 +151,10 @@ class Field:
 
     spline: Spline
     nodes: Array
-    factor: tuple[Array, bool]  # of the information, by Cholesky
+    factor: Array  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
+    settled: bool  # the penalty is the best of those near it
 
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""
@@ -134,20 +162,32 @@ class Field:
         parts = self.nodes.reshape(2, *self.spline.nodes)
         return np.stack([rows @ part @ columns.T for part in parts])
 
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (node, node) [pixel^2]."""
+        return self.spline.solved(self.factor, np.eye(self.nodes.size))
+
     def disagreement(self, data: Information, centres: list[Array], other: "Field") -> float:
         """Chi-square of another field by the data of this one, over what chance makes of it."""
         matrix = _normal(data.tensor, *self.spline.values(centres))
         off = other.nodes - self.nodes
-        return float(off @ matrix @ off / np.trace(cho_solve(self.factor, matrix)))
+        return float(off @ matrix @ off / np.sum(self.covariance * matrix))
 
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(part) for part in self.spline.values(centres))
         height, width = self.spline.nodes
-        covariance = cho_solve(self.factor, np.eye(self.nodes.size))
-        blocks = covariance.reshape(2, height, width, 2, height, width)
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
         parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
+
+
+@lru_cache(maxsize=16)  # of the levels from coarse to fine
+def _splines(places: bytes, size: int, count: int) -> Array:
+    """Splines (place, node) along a side of so many pixels and nodes."""
+    knots, inner = np.arange(count + 4) - 3.0, np.frombuffer(places) / (size - 1) * (count - 3)
+    result: Array = BSpline.design_matrix(inner, knots, 3).toarray()
+    return result
 
 
 def _pairs(values: Array) -> Array:

@@ -20,7 +20,8 @@ from dbthermal._arrays import Mask, empty, quotient, release
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import SEARCH, check, measured_offset
-from dbthermal.alignment._reflections import Scale, seen_apart, shift_of
+from dbthermal.alignment._planes import Scale
+from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status
 

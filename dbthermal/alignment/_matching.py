@@ -5,18 +5,23 @@ whole pixels that explain most, then Gauss-Newton from coarse images to fine one
 much later the others show what the first shows.
 """
 
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import BORDER, ROWS, Movie, products
-from dbthermal.alignment._views import TAPS, interpolation
+from dbthermal.alignment._products import (
+    Movie,
+    binned,
+    blurred,
+    normal_equations,
+    products,
+    splines,
+)
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
@@ -26,16 +31,18 @@ BLUR: Final = 1.2
 
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
-SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+_SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
-_CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
+_ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
+_CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 _PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
+_NOISE_PIXELS: Final = 256  # that tell the noise of a movie
 _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
 
 
@@ -43,7 +50,7 @@ _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is no
 class Movies:
     """Rapid changes of one picture (y, x, time) [K], blurred alike."""
 
-    first: Movie
+    first: Movie  # its splines
     others: list[Movie]
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
@@ -61,19 +68,17 @@ class Movies:
         factor: int,
         whole: float = 0.0,
     ) -> "Movies":
-        """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
+        """Movies of pixels that are so many times coarser than the mask's."""
         mostly = binned(valid.astype(np.float64), factor) > 0.5
-        some = tuple(part[::3] for part in np.nonzero(mostly))
+        some = tuple(part[:: max(1, part.size // _NOISE_PIXELS)] for part in np.nonzero(mostly))
         if some[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
             usual = [MAD * np.median(np.abs(movie[some])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
-        for movie in movies:
-            gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
         return cls(
-            movies[0],
-            movies[1:],
+            splines(movies[0], BLUR),
+            [blurred(movie, BLUR) for movie in movies[1:]],
             mostly,
             noise / factor,
             freedom,
@@ -91,15 +96,6 @@ class Movies:
         return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.shape]
 
 
-def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
-    """Means (y, x, ...) over squares of pixels, in memory of their own."""
-    rows, columns = (size // factor for size in image.shape[:2])
-    parts = image[: rows * factor, : columns * factor]
-    return np.asarray(
-        parts.reshape(rows, factor, columns, factor, *image.shape[2:]).mean(axis=(1, 3))
-    )
-
-
 def _whole_pixels(
     first: Movie, others: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
@@ -111,19 +107,18 @@ def _whole_pixels(
     """
     height, width = first.shape[:2]
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
-    energies = [np.einsum("yxt,yxt->yx", it, it).astype(np.float64) for it in (padded, *others)]
+    energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *others)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
-    windows = (0.0, WINDOW, WINDOW)
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
         rows = slice(down, down + height)
-        gain = np.zeros((2 * reach[1] + 1, height, width))
+        gain = np.zeros((height, width, 2 * reach[1] + 1))
         for part in others:
             pairs = padded[rows] @ part.transpose(0, 2, 1)
-            cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(len(gain))])
-            gain += np.maximum(gaussian_filter(cross.astype(np.float64), windows), 0.0) ** 2
-        there = [energies[0][rows, right : right + width] for right in range(len(gain))]
-        gain /= np.maximum(gaussian_filter(np.stack(there), windows), freedom)
-        right, highest = gain.argmax(axis=0), gain.max(axis=0)
+            cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(gain.shape[2])], -1)
+            gain += np.maximum(blurred(cross, WINDOW), 0.0) ** 2
+        there = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
+        gain /= np.maximum(blurred(np.stack(there, axis=-1), WINDOW), freedom)
+        right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
@@ -140,13 +135,7 @@ def inside(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-def _moderate(movie: Movie) -> Movie:
-    """Weight of samples (..., time), smaller where a movie changes as it seldom does."""
-    usual = np.quantile(np.abs(movie), _USUAL, axis=-1, keepdims=True)
-    return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
-
-
-def _information(movies: Movies, padded: Movie, shift: Array) -> Information:
+def _information(movies: Movies, shift: Array) -> Information:
     r"""
     Information on a step of the field at each pixel, by Gauss-Newton.
 
@@ -160,53 +149,64 @@ def _information(movies: Movies, padded: Movie, shift: Array) -> Information:
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     noise = movies.noise[0] * _VALUE_NOISE
-    tensor, gradient, chance = (np.zeros((size, *used.shape)) for size in (3, 2, 1))
+    total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(padded, movies.others, places) * used
+    moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
     for parts, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = parts
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(parts, 2, 0)
+        auto, both = np.moveaxis(blurred(parts[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
-        auto = gaussian_filter(mm, WINDOW) - number * noise**2
-        ratio = gaussian_filter(mh, WINDOW) / np.maximum(auto, 0.1 * number * noise**2)
+        auto -= number * noise**2
+        ratio = both / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         # Of all freedom, of which that outside the planes holds noise.
         excess = residual / (variance * _VALUE_NOISE**2) - number
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
-        weight = used / (misfit * variance)
-        less = movies.freedom * (movies.noise[0] * SLOPE_NOISE) ** 2
-        tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
-        gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
-        chance += weight * ratio**2 * less
-    tensor, gradient, (less,) = (
-        gaussian_filter(part, WINDOW, axes=(-2, -1)) for part in (tensor, gradient, chance)
-    )
+        weight = used * ratio / (misfit * variance)
+        less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        squares = ratio * yy - less, ratio * yx, ratio * xx - less
+        both = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
+        total += weight[..., np.newaxis] * both
+    total = np.moveaxis(blurred(total, WINDOW), 2, 0)
+    tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
-    total = tensor[0] + tensor[2]
-    share = np.maximum(total, 0.0) / np.maximum(total + less, 1e-300)
+    size = tensor[0] + tensor[2]
+    share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
 
 
+def eigenvalues(tensor: Array) -> tuple[Array, Array]:
+    """Larger and smaller eigenvalue (y, x) of tensors (3, y, x)."""
+    down, both, right = tensor
+    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), both)
+    return middle + root, middle - root
+
+
 def _positive(tensor: Array) -> Array:
     """Tensors (3, y, x) without their negative eigenvalues."""
-    values, vectors = np.linalg.eigh(np.moveaxis(tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1)))
-    result = (vectors * np.maximum(values, 0.0)[..., np.newaxis, :]) @ vectors.mT
-    return np.stack([result[..., 0, 0], result[..., 0, 1], result[..., 1, 1]])
+    high, low = eigenvalues(tensor)
+    share = np.maximum(high, 0.0) / np.maximum(high - low, np.finfo(np.float64).tiny)
+    unit = np.array([1.0, 0.0, 1.0])[:, np.newaxis, np.newaxis]
+    return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
-def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | None:
-    """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
-    # Changes as large as there are seldom are cut: an object's, if rapid.
-    first, *others = (
-        part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
-        for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
-    )
-    functions = smooth.leading(first.reshape(-1, first.shape[2]), _PLANES)
-    first, *others = (part @ functions for part in (first, *others))
-    freedom = movies.freedom * functions.shape[1] / functions.shape[0]
-    rough, share = _whole_pixels(first, others, freedom, reach)
+def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
+    """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
+    reach = movies.shape[0] // 3, movies.shape[1] // 3
+    pictures = []
+    for film, level in zip(films, movies.noise, strict=True):
+        # Changes as large as there are seldom are cut: an object's, if rapid.
+        part = blurred(film, BLUR)
+        usual = np.quantile(np.abs(part), _USUAL, axis=-1, keepdims=True)
+        part /= np.sqrt(1.0 + (part / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
+        pictures.append(part)
+    functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
+    pictures = [np.asarray(part @ functions, np.float32) for part in pictures]
+    freedom *= functions.shape[1] / functions.shape[0]
+    rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
     share *= movies.valid
     if not share.any():
         return None
@@ -218,26 +218,25 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
             "third of the image."
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
-    field, centres = None, movies.centres()
-    for _ in range(8):
-        off = 0.0 if field is None else np.sum((field.on(centres) - target) ** 2, axis=0)
-        kept = weight / (1.0 + off / (1.0 * movies.factor) ** 2) ** 2
-        tensor = np.stack([kept, 0.0 * kept, kept])
-        field = spline.fitted(Information(tensor, kept * target), centres)
-    assert field is not None
+    centres, zero = movies.centres(), np.zeros_like(share)
+    field = spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
+    for _ in range(_ROBUST):
+        step = target - field.on(centres)
+        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
+        data = Information(np.stack([kept, zero, kept]), kept * step)
+        field = spline.fitted(data, centres, field)
     return field
 
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    border = (BORDER, BORDER)
-    padded = np.pad(movies.first, (border, border, (0, 0)), mode="reflect")
+    field = replace(field, settled=False)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
-        data = _information(movies, padded, shift)
+        data = _information(movies, shift)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
-        if change.mean() < _CONVERGED * movies.factor:
+        if change.mean() < _CONVERGED * movies.factor**2:
             break
     return field, data
 
@@ -246,10 +245,10 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     r"""
     Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate that of the first movie [K/s]. What moves one way only
-    is shifted or late. One Newton step of both, the shift free in each window: with the slopes g of
-    the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the others over their
-    ratio to it, and sums over time and a window,
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What
+    moves one way only is shifted or late. One Newton step of both, the shift free in each window:
+    with the slopes g of the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the
+    others over their ratio to it, and sums over time and a window,
 
     .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) / \sum (\dot h^2 - c^T A^{-1} c),
               \quad A = g g^T, \; c = g \dot h
@@ -258,49 +257,26 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
     that the moved movie explains, and all of it, in variances of noise.
     """
-    places, (_, width, count) = np.indices(movies.shape) + shift, movies.first.shape
-    steps = 0.5 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[..., np.newaxis, np.newaxis]
-    weights = [interpolation(places + step, TAPS) for step in steps]
+    places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    for part in weights:  # none near the border
-        used &= (np.diff(part.indptr) > 0).reshape(used.shape)
-    sums = np.zeros((len(movies.others), 14, *movies.shape))
-    for start in range(0, movies.shape[0], ROWS):
-        rows = slice(start, min(start + ROWS, movies.shape[0]))
-        pixels = slice(rows.start * width, rows.stop * width)
-        moved, below, above, left, right = (
-            (part[pixels] @ movies.first.reshape(-1, count)).reshape(-1, width, count)
-            for part in weights
-        )
-        change = (weights[0][pixels] @ rate.reshape(-1, count)).reshape(moved.shape)
-        four = [below - above, right - left, change, moved]
-        for other, out in zip(movies.others, sums, strict=True):
-            pairs = [(a, b) for i, a in enumerate(four) for b in four[i:]]
-            pairs += [(a, other[rows]) for a in four]
-            for place, (one, two) in enumerate(pairs):
-                out[place, rows] = np.einsum("yxt,yxt->yx", one, two)
-    gradient, information, explained, energy = np.zeros((4, *movies.shape))
-    parts = zip(sums * used, movies.others, movies.noise[1:], strict=True)
-    for part, other, level in parts:
-        yy, yx, yt, ym, xx, xt, xm, tt, tm, mm, yh, xh, th, mh = gaussian_filter(
-            part, WINDOW, axes=(-2, -1)
-        )
-        # Noise of the slopes: half of them at most.
-        less = gaussian_filter(used * 1.0, WINDOW) * movies.freedom
-        less *= (movies.noise[0] * SLOPE_NOISE) ** 2
-        yy, xx = (one - np.minimum(less, 0.5 * one) for one in (yy, xx))
-        ratio = mh / np.maximum(mm, np.finfo(np.float64).tiny)
-        ridge = _RIDGE * (yy + xx).max()
-        both = np.moveaxis(np.array([[yy + ridge, yx], [yx, xx + ridge]]), (0, 1), (-2, -1))
-        cross, slope = np.stack([yt, xt], axis=-1), np.stack([yh, xh], axis=-1)
-        slope -= ratio[..., np.newaxis] * np.stack([ym, xm], axis=-1)
-        share = np.linalg.solve(both, cross[..., np.newaxis])[..., 0]
-        late = th - ratio * tm - (share * slope).sum(axis=-1)
-        own = gaussian_filter(np.einsum("yxt,yxt->yx", other, other) * used, WINDOW)
-        explained += np.where(used, ratio * np.maximum(mh, 0.0) / level**2, 0.0)
-        energy += np.where(used, own / level**2, 0.0)
-        gradient += np.where(used, ratio / level**2 * late, 0.0)
-        information += np.where(used, ratio**2 / level**2 * (tt - (share * cross).sum(-1)), 0.0)
+    sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
+    # Noise of the slopes and of the moved movie.
+    number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
+    less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
+    totals = np.zeros((4, *movies.shape))
+    for part, level in zip(sums, movies.noise[1:], strict=True):
+        windows = blurred(part, WINDOW)
+        equations = normal_equations(windows, less)
+        # The shift of each window is eliminated.
+        tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
+        ridge = _RIDGE * np.trace(tensor, axis1=-2, axis2=-1).max()
+        share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
+        late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
+        seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
+        moved, both, other = (windows[..., place] for place in (0, 4, 14))
+        alike = np.maximum(both, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
+        totals += np.where(used, np.stack([late, seen, alike, other]), 0.0) / level**2
+    gradient, information, *energy = totals
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
     of_parts = [
         np.add.reduceat(np.add.reduceat(part, starts[0], axis=0), starts[1], axis=1)
@@ -310,4 +286,4 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
     std = np.sqrt((without.size - 1) * np.var(without))
     late = float(gradient.sum() / information.sum())
-    return late, float(std), np.stack([explained, energy])
+    return late, float(std), np.stack(energy)

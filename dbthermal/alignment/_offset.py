@@ -27,7 +27,7 @@ import xarray as xr
 from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
 from dbthermal import noise as noises
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.noise import MAD
 
@@ -230,7 +230,7 @@ def sample(corrected: xr.Dataset) -> Array:
     """
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     fitting = int(np.ceil(np.sqrt(pixels * corrected.sizes["time"] / _SAMPLES)))
-    step = max(1, int(np.sqrt(pixels / _PIXELS)), fitting)
+    step = max(stride((corrected.sizes["y"], corrected.sizes["x"]), _PIXELS), fitting)
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = part["counts"].values.astype(np.float64)
     counts[~schema.measured(counts)] = np.nan

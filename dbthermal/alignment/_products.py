@@ -1,116 +1,158 @@
-"""Products of a movie that is moved, of its slopes and of other movies, for Gauss-Newton steps."""
+"""Images on splines: blurred, moved to other places with their slopes, and products of these."""
 
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
 
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from dbthermal.alignment._views import TAPS, lagrange
 
 Movie = npt.NDArray[np.float32]
-Whole = npt.NDArray[np.int32]
+Image = TypeVar("Image", bound=npt.NDArray[Any])
 
-BORDER: Final = 4
-"""Pixels by which the movie that is moved is mirrored at the border."""
-ROWS: Final = 32
-"""Rows that are resampled at a time."""
-
-_STEP: Final = 0.5  # on either side, over which a slope is taken [pixel]
-# Neighbours along a line from which a value and a slope are made.
-_NEAR: Final = TAPS + 2
+_ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
+_EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
+_VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
 
-def products(padded: Movie, others: list[Movie], places: Array) -> Array:
-    """
-    Products (other, 10, y, x), summed over planes, of moved, its slopes, and another movie.
+def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
+    """Means (y, x, ...) over squares of pixels, in memory of their own."""
+    rows, columns = (size // factor * factor for size in image.shape[:2])
+    parts = [image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)]
+    return np.asarray(sum(parts[1:], parts[0]) * image.dtype.type(factor**-2))
 
-    Moved is the movie, mirrored at its border, at places (2, y, x).
-    """
-    shape, planes = places.shape[1:], padded.shape[2]
-    result = np.zeros((len(others), 10, *shape))
-    for start in range(0, shape[0], ROWS):
-        rows = slice(start, min(start + ROWS, shape[0]))
-        lines = [
-            _weights(place.ravel(), size)
-            for place, size in zip(places[:, rows] + BORDER, padded.shape[:2], strict=True)
-        ]
-        flat = np.zeros((3, lines[0][0].size, planes), np.float32)
-        _move(padded, *lines[0], *lines[1], flat)
-        moved = flat.reshape(3, -1, shape[1], planes)
-        for other, out in zip(others, result, strict=True):
-            _sum_products(*moved, other[rows], out[:, rows])
+
+def blurred(image: Image, width: float) -> Image:
+    """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
+    impulse = np.zeros(2 * int(4.0 * width + 0.5) + 1)
+    impulse[impulse.size // 2] = 1.0
+    weights = gaussian_filter(impulse, width).astype(image.dtype)
+    lines = np.ascontiguousarray(image).reshape(1, len(image), -1)
+    result: Image = _blurred(_blurred(lines, weights).reshape(image.shape), weights)
     return result
 
 
-def _weights(place: Array, size: int) -> tuple[Whole, Movie, Movie]:
-    """First neighbour along a line of a size (place), and weights of value and slope (place, near).
+def splines(movie: Movie, width: float) -> Movie:
+    """Coefficients of cubic B-splines that are a movie blurred by a width [pixel].
 
-    Zero for a place without so many neighbours.
+    A B-spline blurs as well: so these are blurred by less, and no filter undoes it.
     """
-    parts = [lagrange(place + step, size, TAPS) for step in (0.0, _STEP, -_STEP)]
-    start = np.floor(np.clip(place - _STEP - (TAPS // 2 - 1), 0, size - _NEAR)).astype(np.int32)
-    spread = np.zeros((3, place.size, _NEAR), np.float32)
-    for near, (inside, first, weight) in zip(spread, parts, strict=True):
-        columns = np.where(inside, first - start, 0)[:, np.newaxis] + np.arange(TAPS)
-        np.put_along_axis(near, columns, np.where(inside[:, np.newaxis], weight, 0.0), axis=1)
-    return start, spread[0], spread[1] - spread[2]
+    part = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
+    return np.pad(part, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
+
+
+def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
+    """Sums over planes (other, y, x, pair) of the products of signals at places (2, y, x).
+
+    Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
+    with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
+    the rate follows the slopes: 15 pairs.
+    """
+    shape, planes = places.shape[1:], movie.shape[2]
+    count = 4 if rate is None else 5
+    result = np.zeros((len(others), *shape, count * (count + 1) // 2))
+    for start in range(0, shape[0], _ROWS):
+        rows = slice(start, min(start + _ROWS, shape[0]))
+        signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
+        if rate is not None:
+            signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
+        for other, out in zip(others, result, strict=True):
+            _sum_pairs(
+                signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2])
+            )
+    return result
+
+
+def normal_equations(sums: Array, noise: Array) -> Array:
+    """Normal equations A d = g (..., 4, 3) of steps down, right and in time, see `products`.
+
+    Of sums (..., 15) over pixels, with a rate; the noise's part of the squares of the moved movie
+    and of its changes (..., 4) is subtracted, half of them at most. The other movie is a ratio of
+    the moved one, which is eliminated.
+    """
+    rows, columns = np.triu_indices(5)
+    full = np.zeros((*sums.shape[:-1], 5, 5))
+    full[..., rows, columns] = full[..., columns, rows] = sums
+    places = np.arange(4)
+    squares = full[..., places, places]
+    full[..., places, places] -= np.minimum(noise, 0.5 * squares)
+    size, cross = full[..., :1, :1], full[..., :1, 1:4]
+    size = np.maximum(size, np.finfo(np.float64).tiny)
+    ratio = full[..., :1, 4:] / size
+    tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
+    rest = ratio * (full[..., 4:, 1:4] - ratio * cross)
+    return np.concatenate([tensor, rest], axis=-2)
 
 
 @compiled
-def _move(
-    movie: Movie,
-    row: Whole,
-    down: Movie,
-    down_slope: Movie,
-    column: Whole,
-    right: Movie,
-    right_slope: Movie,
-    result: Movie,
-) -> None:
-    """Values, slopes down and right (3, place, time) of a movie, in place, of zeros."""
-    frames = movie.shape[2]
-    along, slope = np.empty(frames, np.float32), np.empty(frames, np.float32)
-    for p in range(row.size):
-        for i in range(down.shape[1]):
-            if down[p, i] == 0.0 and down_slope[p, i] == 0.0:
-                continue
+def _blurred(movie: Any, weights: Any) -> Any:
+    """Image (line, place, plane) with weighted means over the places of each line."""
+    lines, size, planes = movie.shape
+    reach, result = weights.size // 2, np.zeros_like(movie)
+    for line, place in np.ndindex(lines, size):
+        out = result[line, place]
+        for i in range(weights.size):
+            # A place beyond an end is mirrored, as often as needed.
+            near = (place + i - reach) % (2 * size)
+            part = movie[line, min(near, 2 * size - 1 - near)]
+            weight = weights[i]
+            for t in range(planes):
+                out[t] += weight * part[t]
+    return result
+
+
+@compiled
+def sampled(splines: Any, places: Array) -> Any:
+    """Values, slopes over a pixel down and right (3, place, plane) of splines at rows, columns."""
+    count, planes = places.shape[1], splines.shape[2]
+    result = np.zeros((3, count, planes), splines.dtype)
+    along, slope = np.empty(planes, splines.dtype), np.empty(planes, splines.dtype)
+    first, weights = np.empty(2, np.intp), np.empty((2, 2, 5), splines.dtype)
+    for p in range(count):
+        for axis in range(2):
+            low = int(np.floor(places[axis, p] - 0.5)) - 1
+            first[axis] = min(max(low, 0), splines.shape[axis] - 5)
+            for i in range(5):
+                away = first[axis] + i - places[axis, p]
+                weights[axis, 0, i] = _cubic(away)
+                weights[axis, 1, i] = _cubic(away - 0.5) - _cubic(away + 0.5)
+        for i in range(5):
             along[:] = 0.0
             slope[:] = 0.0
-            for j in range(right.shape[1]):
-                weight, steep = right[p, j], right_slope[p, j]
-                if weight == 0.0 and steep == 0.0:
-                    continue
-                pixel = movie[row[p] + i, column[p] + j]
-                for t in range(frames):
-                    along[t] += weight * pixel[t]
+            for j in range(5):
+                value, steep = weights[1, 0, j], weights[1, 1, j]
+                pixel = splines[first[0] + i, first[1] + j]
+                for t in range(planes):
+                    along[t] += value * pixel[t]
                     slope[t] += steep * pixel[t]
-            value, steep = down[p, i], down_slope[p, i]
-            for t in range(frames):
+            value, steep = weights[0, 0, i], weights[0, 1, i]
+            for t in range(planes):
                 result[0, p, t] += value * along[t]
                 result[1, p, t] += steep * along[t]
                 result[2, p, t] += value * slope[t]
+    return result
 
 
 @compiled
-def _sum_products(moved: Movie, down: Movie, right: Movie, other: Movie, out: Array) -> None:
-    """Sums (10, y, x) of `products`, in place."""
-    rows, columns, planes = moved.shape
-    for y, x in np.ndindex(rows, columns):
-        m, a, b, h = moved[y, x], down[y, x], right[y, x], other[y, x]
-        mm = my = mx = mh = yy = yx = yh = xx = xh = hh = np.float32(0.0)
-        for t in range(planes):
-            mm += m[t] * m[t]
-            my += m[t] * a[t]
-            mx += m[t] * b[t]
-            mh += m[t] * h[t]
-            yy += a[t] * a[t]
-            yx += a[t] * b[t]
-            yh += a[t] * h[t]
-            xx += b[t] * b[t]
-            xh += b[t] * h[t]
-            hh += h[t] * h[t]
-        sums = (mm, my, mx, mh, yy, yx, yh, xx, xh, hh)
-        for place in range(10):
-            out[place, y, x] = sums[place]
+def _cubic(away: float) -> float:
+    """Cubic B-spline at a distance from its middle [pixel]."""
+    far = abs(away)
+    return (max(2.0 - far, 0.0) ** 3 - 4.0 * max(1.0 - far, 0.0) ** 3) / 6.0
+
+
+@compiled
+def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
+    """Sums over planes (pixel, pair) of the products of signals, in place."""
+    count, pixels, planes = signals.shape
+    for p in range(pixels):
+        place = 0
+        for i in range(count + 1):
+            first = signals[i, p] if i < count else last[p]
+            for j in range(i, count + 1):
+                second, total = signals[j, p] if j < count else last[p], np.float32(0.0)
+                for t in range(planes):
+                    total += first[t] * second[t]
+                out[p, place] = total
+                place += 1

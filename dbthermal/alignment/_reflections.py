@@ -1,44 +1,34 @@
 """Shift between the reflections that two cameras side by side see in one surface."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
-from scipy import sparse
-from scipy.linalg import solveh_banded
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from threadpoolctl import threadpool_limits
 
-from dbthermal import _smooth as smooth
-from dbthermal import noise as noises
-from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
-from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
+from dbthermal.alignment import _planes as planes
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
-from dbthermal.alignment._offset import noise_levels, sample
-from dbthermal.alignment._products import Movie
+from dbthermal.alignment._planes import Capture, Scale
+from dbthermal.alignment._products import Movie, binned
 
-SMALLEST: Final = 24  # rows and columns of an image, at least
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
-_ROWS: Final = 32  # that are read at a time
-_COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
-_MISSING: Final = 0.1  # share of the frames that a pixel may lack
+_FEW: Final = 64  # functions of time on the coarsest image
+_START: Final = 20  # the same of the image on which whole pixels are matched
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
-# rapidly enters. A longer one is taken whose field has so many times smaller deviations, and
-# a chi-square by the shorter one's data of no more than so many times that of the shorter one's own
-# windows: of a field with rims it is 3 to 9, and objects that heat rapidly gave 30 to 8000.
-# Functions of time that are matched: of 220 to 300 frames, fields of 36 simulated scenes are off by
-# .054 pixel in the mean (by .065 with 32, by .074 with whole films).
-_PLANES: Final = 128
+# rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
+# shorter one is known, and a chi-square by the shorter one's data below so much: of people before
+# glass, a wineglass and a coffee pot it was .1 to 3.0, and 6 to 3000 where an object's own changes
+# entered.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
+_SLOW: Final = 20.0  # those of a delay, at least
 _MORE: Final = 1.25
-_AGREE: Final = 2.25
+_AGREE: Final = 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
@@ -90,86 +80,46 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
     return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Slope (band) [count/K] of each band, or another scale of its changes, and its noise."""
-
-    slopes: Array
-    noise: Array | None  # before the alignment (band) [K], estimated from the capture if None
-
-    @classmethod
-    def of_response(cls, response: xr.Dataset, names: list[str]) -> "Scale":
-        """Scale of a response, and of its noise if it states one."""
-        slopes = np.array([responses.curve(response, name).reference_slope for name in names])
-        noise = responses.noise(response, names) / slopes if "noise" in response else None
-        return cls(slopes, noise)
-
-    @classmethod
-    def of_changes(cls, corrected: xr.Dataset) -> "Scale":
-        """Scale without a response: each band's own changes in time, each on its own clock."""
-        scatter, relative = noise_levels(sample(corrected), clocks.exposure_times(corrected))
-        if not np.all(relative > 0.0):
-            raise ValueError("Missing noise of the capture. Must be seen to match reflections.")
-        return cls(scatter / relative, relative / _noise_factor(corrected))
-
-    def noise_of(self, corrected: xr.Dataset) -> Array:
-        """Noise of a capture (band) [K]."""
-        if self.noise is not None:
-            return np.asarray(self.noise * _noise_factor(corrected))
-        signals = sample(corrected)
-        here = np.all(np.isfinite(signals), axis=(0, 2))
-        parts = [signal[here] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
-        return noises.estimate_bands(parts, corrected["time"].values[here])
-
-
-def _noise_factor(corrected: xr.Dataset) -> Array:
-    """Noise (band) [1] over that before the alignment."""
-    whole = np.ones(corrected.sizes["band"])
-    return np.asarray(corrected["noise_factor"].values if "noise_factor" in corrected else whole)
-
-
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
     with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
-        return _found(corrected, _Capture.of(corrected, scale))
+        return _matched(corrected, Capture.of(corrected, scale))
 
 
-def _found(corrected: xr.Dataset, capture: "_Capture") -> xr.Dataset:
-    """Field of a checked capture, from coarse to fine."""
+def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
+    """Field of a checked capture, from coarse to fine, and the delay beside it."""
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
-    capture, signals, period, field = _coarse(capture, spline, factor)
-    functions = capture.functions(signals, period)
-    freedom, fine = _freedom(functions), capture.planes(functions)
-    while True:
-        factor = max(1, factor // 2)
-        pictures = [matching.binned(movie, factor) for movie in fine]
-        level = Movies.blurred(
-            pictures,
-            capture.valid,
-            capture.noise,
-            freedom,
-            factor,
-            _white(capture.frames.size, period),
-        )
-        field, data = matching.refine(level, field)
-        if factor == 1:
-            # The delay is seen in slower changes, too, in which there is more than noise.
-            spread = _variances(field, level, _told(data), _squares(data))
-            functions = capture.functions(signals, max(period, _PERIODS[2]))
-            freedom, pictures = _freedom(functions), capture.planes(functions)
-            level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
-            times = corrected["time"].values[capture.frames]
-            # Planes of a rate, by the functions that a rate's transpose makes of these.
-            rates = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions
-            rate = Movies.blurred(
-                capture.planes(rates)[:1], capture.valid, capture.noise, freedom, 1
-            )
-            late, std, energy = matching.delay(level, rate.first, field.on(level.centres()))
-            result = _result(corrected, capture, field, data, spread)
-            result["energy"] = ("part", "y", "x"), energy
-            return result.assign_attrs(delay=late, delay_std=std)
+    capture, tried, period, field = _coarse(capture, spline, factor)
+    # Planes in one look at the films. The delay is seen in slower changes, too, in which there is
+    # more than noise.
+    slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
+    functions = [tried[length] for length in sorted({period, slow})]
+    movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
+
+    def level(place: int, factor: int) -> Movies:
+        """Movies of the changes within one of the periods, of coarser pixels."""
+        pictures = [binned(movie, factor) for movie in movies[place]]
+        freedom = planes.freedom(functions[place])
+        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
+
+    # From coarser pixels to those of the capture.
+    while factor > 2:
+        factor //= 2
+        field, _ = matching.refine(level(0, factor), field)
+    fine = level(0, 1)
+    field, data = matching.refine(fine, field)
+    spread = _variances(field, fine, _resolved(data), _squares(data))
+    # What a rate's planes are of the delay's, by its functions.
+    times = corrected["time"].values[capture.frames]
+    change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
+    rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
+    slower = fine if len(movies) == 1 else level(-1, 1)
+    late, std, energy = matching.delay(slower, rate, field.on(fine.centres()))
+    result = _result(corrected, capture, field, data, spread)
+    result["energy"] = ("part", "y", "x"), energy
+    return result.assign_attrs(delay=late, delay_std=std)
 
 
 def seen_apart(field: xr.Dataset) -> bool:
@@ -182,132 +132,65 @@ def seen_apart(field: xr.Dataset) -> bool:
     return bool(np.any(shift > np.maximum(_SIGMAS * std, _LEAST_SHIFT)))
 
 
-@dataclass(frozen=True)
-class _Capture:
-    """Capture and all that matching needs to know of it, the quietest band first."""
-
-    counts: xr.DataArray
-    bands: npt.NDArray[np.intp]  # places in the counts
-    slopes: Array  # of the bands [count/K]
-    noise: Array  # of the bands [K]
-    valid: Mask  # pixels (y, x)
-    frames: npt.NDArray[np.intp]  # that every band has
-    rough: npt.NDArray[np.intp]  # first of four frames that follow one another evenly
-
-    @classmethod
-    def of(cls, corrected: xr.Dataset, scale: Scale) -> "_Capture":
-        """Check a capture."""
-        counts = schema.check_corrected(corrected)["counts"]
-        names = [str(name) for name in counts["band"].values]
-        if len(names) < 2:
-            raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
-        if min(counts.shape[2:]) < SMALLEST:
-            raise ValueError(
-                f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
-                f"at least {SMALLEST} of each to match reflections."
-            )
-        slopes, noise = scale.slopes, scale.noise_of(corrected)
-        order = np.argsort(noise, kind="stable")
-        valid = np.ones(counts.shape[2:], dtype=bool)
-        if "status" in corrected:
-            valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
-        frames = _frames(counts)
-        times, segment = corrected["time"].values[frames], clocks.segments(corrected)[frames]
-        steps = np.diff(times)
-        joined = (steps < 1.5 * np.median(steps)) & (np.diff(segment) == 0)
-        rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
-        return cls(counts, order, slopes[order], noise[order], valid, frames, rough)
-
-    def blocks(self, height: int) -> Iterator[tuple[slice, Array]]:
-        """Rows, and their signals (band, y, x, time) [K] in the frames, NaN where missing."""
-        for start in range(0, self.valid.shape[0], height):
-            rows = slice(start, start + height)
-            values = self.counts.isel(y=rows).values[self.bands][:, self.frames]
-            values = np.where(schema.measured(values), values, np.nan)
-            yield rows, np.moveaxis(values, 1, -1) / self.slopes[:, None, None, None]
-
-    def smoothing(self, period: float) -> Array:
-        """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
-        size, weight = self.frames.size, (2.0 * np.sin(np.pi / period)) ** -6
-        third = sparse.diags_array(
-            [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
-        )[self.rough]
-        penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
-        return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
-
-    def functions(self, signals: Array, period: float) -> Array:
-        """Functions (time, plane) of the changes within a period [frame] that signals show most."""
-        smoothing = self.smoothing(period)
-        rapid = _rapid(signals.reshape(-1, signals.shape[-1]), smoothing)
-        return _rapid(smooth.leading(rapid, _PLANES).T, smoothing).T
-
-    def planes(self, functions: Array) -> list[Movie]:
-        """Parts (y, x, plane) [K] of the bands along functions of time (time, plane)."""
-        result = np.empty((self.bands.size, *self.valid.shape, functions.shape[1]), np.float32)
-        for rows, signals in self.blocks(_ROWS):
-            for movie, signal in zip(result, signals, strict=True):
-                movie[rows] = _filled(signal) @ functions
-        nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
-        result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
-        return list(result)
-
-    def binned(self, factor: int) -> tuple[list[Array], Mask]:
-        """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
-        valid, parts = self.valid.copy(), []
-        for rows, signals in self.blocks(max(1, _ROWS // factor) * factor):
-            valid[rows] &= np.all(np.isnan(signals).mean(axis=-1) <= _MISSING, axis=0)
-            here = valid[rows, :, np.newaxis].astype(np.float64)
-            share = np.maximum(matching.binned(here, factor), factor**-2)
-            parts.append([matching.binned(_filled(s) * here, factor) / share for s in signals])
-        return [np.concatenate(band) for band in zip(*parts, strict=True)], valid
-
-
-def _coarse(capture: _Capture, spline: Spline, factor: int) -> tuple[_Capture, Array, float, Field]:
-    """Capture with its valid pixels, coarse signals, the period that tells most, rough field."""
+def _coarse(
+    capture: Capture, spline: Spline, factor: int
+) -> tuple[Capture, dict[float, Movie], float, Field]:
+    """Capture with its valid pixels, functions of all periods, the best period, rough field."""
     signals, valid = capture.binned(factor)
-    reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
-    frames, result = capture.frames.size, None
-    best, before, limit = np.inf, None, np.inf  # of the field that was taken
+    frames, tried, result = capture.frames.size, dict[float, Movie](), None
+    refusal: ValueError | None = None
+    # Of the field that was taken: its data, the pixels that they resolve, and its deviations.
+    before, earlier, sizes = None, np.zeros((1, 1), bool), np.zeros((1, 1))
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        functions = capture.functions(signals[0], period)
-        pictures = [(part @ functions).astype(np.float32) for part in signals]
-        level = Movies.blurred(
-            pictures, valid, capture.noise, _freedom(functions), factor, _white(frames, period)
-        )
+        tried[period] = capture.functions(signals[0], period)
+        functions = tried[period][:, :_FEW]
+        white, freedom = planes.white(frames, period), planes.freedom(functions)
+        pictures = [part @ functions for part in signals]
+        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
-            # Whole frames: what is rare in a pixel's time is cut.
+            # Whole frames, of which what is rare in a pixel's time is cut.
+            half = 2 if min(level.shape) >= 2 * _START else 1
+            rough = replace(
+                level,
+                valid=binned(level.valid * 1.0, half) > 0.5,
+                noise=level.noise / half,
+                factor=factor * half,
+            )
             smoothing = capture.smoothing(period)
-            pictures = [_rapid(part, smoothing).astype(np.float32) for part in signals]
-            freedom = _white(frames, period)
-            whole = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
-            begin = matching.start(whole, spline, reach)
+            films = [planes.rapid(binned(part, half), smoothing) for part in signals]
+            try:
+                begin = matching.start(rough, films, white, spline)
+            except ValueError as error:  # slower changes may tell more
+                refusal = error
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        told, squares = _told(data, factor), _squares(data, factor)
-        variance = _variances(field, level, told, squares)
-        size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
-        # A field of slower changes must fit the data of the more robust one.
-        apart = 0.0 if before is None else begin.disagreement(before, level.centres(), field)
-        if told.any() and size < best / _MORE and apart < limit:
-            best, before, limit = size, data, _AGREE * max(squares[:, told].mean(), 1.0)
-            result = (replace(capture, valid=valid), signals[0], period, field)
+        resolved, squares = _resolved(data, factor), _squares(data, factor)
+        variance = _variances(field, level, resolved, squares)
+        size = 0.25 * np.log(variance).sum(axis=0)
+        gain, apart = np.inf, 0.0
+        if before is not None:
+            gain = np.mean((sizes - size)[earlier])
+            # A field of slower changes must fit the data of the more robust one.
+            apart = begin.disagreement(before, level.centres(), field)
+        if resolved.any() and gain > np.log(_MORE) and apart < _AGREE:
+            before, earlier, sizes = data, resolved, size
+            result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
-        raise ValueError(
+        raise refusal or ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "
             "Must be seen in both to find their shift; let somebody walk by."
         )
     return result
 
 
-def _told(data: Information, factor: int = 1) -> Mask:
+def _resolved(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
-    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW * factor) ** 2)
-    largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
-    return np.asarray(largest > 1.0 / _KNOWN**2)
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
 
 
 def _squares(data: Information, factor: int = 1) -> Array:
@@ -319,73 +202,29 @@ def _squares(data: Information, factor: int = 1) -> Array:
     return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
 
 
-def _variances(field: Field, level: Movies, told: Mask, squares: Array) -> Array:
+def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> Array:
     """
     Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
     sums = [
-        gaussian_filter(part * told, _WIDE / level.factor, axes=(-2, -1))
-        for part in (squares, np.ones(told.shape))
+        gaussian_filter(part * resolved, _WIDE / level.factor, axes=(-2, -1))
+        for part in (squares, np.ones(resolved.shape))
     ]
     chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
 
 
-def _freedom(functions: Array) -> float:
-    """Degrees of freedom of white noise along functions of time (time, plane)."""
-    return float(np.sum(functions**2))
-
-
-def _white(frames: int, period: float) -> float:
-    """Degrees of freedom of white noise that a smoother leaves, see `_Capture.smoothing`."""
-    frequency = np.pi * (np.arange(frames) + 0.5) / frames
-    ratio = (np.sin(0.5 * frequency) / np.sin(np.pi / period)) ** 6
-    return float(np.sum((ratio / (1.0 + ratio)) ** 2))
-
-
-def _filled(signal: Array) -> Array:
-    """Signal (y, x, time) with missing samples on the line between those before and after."""
-    places = np.arange(signal.shape[-1])
-    for row, column in np.argwhere(np.isnan(signal).any(axis=-1)):
-        part = signal[row, column]
-        here = np.isfinite(part)
-        part[:] = np.interp(places, places[here], part[here]) if here.any() else 0.0
-    return signal
-
-
-def _rapid(signal: Array, smoothing: Array) -> Array:
-    """Signal (y, x, time) less what a smoother passes."""
-    flat = signal.reshape(-1, signal.shape[-1]).T
-    flat = flat - flat.mean(axis=0)
-    return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
-
-
-def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
-    """Frames in which most of the pixels that every band ever measures are measured."""
-    step = max(1, int(np.sqrt(counts[0, 0].size / 4096)))
-    some = schema.measured(counts[:, :, ::step, ::step].values)
-    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
-    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
-    used = np.flatnonzero(share > _COMMON)
-    if used.size < noises.MINIMUM_FRAMES:
-        raise ValueError(
-            f"Invalid capture of {used.size} frames that all bands have. Must be at least "
-            f"{noises.MINIMUM_FRAMES}."
-        )
-    return used
-
-
 def _result(
-    corrected: xr.Dataset, capture: _Capture, field: Field, data: Information, variance: Array
+    corrected: xr.Dataset, capture: Capture, field: Field, data: Information, variance: Array
 ) -> xr.Dataset:
     """Field as a dataset, NaN far from where it is known."""
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
     shift = field.on(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
-    known = _told(data) & reached
+    known = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~known))
     near = (distance <= _NEAR * min(shape)) & reached & known.any()
     # Away from where it is known the field may change as much as it does there.

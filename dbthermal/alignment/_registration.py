@@ -9,9 +9,9 @@ from scipy.ndimage import gaussian_filter, median_filter, spline_filter
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._compiled import compiled
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment._products import sampled
 from dbthermal.alignment._views import TRANSFORM, positions
 from dbthermal.noise import MAD
 
@@ -234,7 +234,7 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         places = positions(matrix, shape)
         inside = _inside(places, band)
         first = pair[0][:, inside]
-        values, *slopes = np.matmul(white, _sampled(splines, places[:, inside]))
+        values, *slopes = white @ sampled(splines, places[:, inside]).swapaxes(1, 2)
         # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
         motion = _motion(matrix, places, inside)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = np.concatenate(
@@ -270,41 +270,6 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         if np.max(np.abs(found[: len(free)])) < _CONVERGED:
             break
     return matrix
-
-
-@compiled
-def _sampled(splines: Array, places: Array) -> Array:
-    """Values, and slopes over a pixel down and right (3, time, pixel), of splines (y, x, time)."""
-    pixels, times = places.shape[1], splines.shape[2]
-    result, first = np.zeros((3, times, pixels)), np.empty(2, np.intp)
-    weight, steep = np.empty((2, 5)), np.empty((2, 5))  # of a value and a slope, down and right
-    for p in range(pixels):
-        for axis in range(2):
-            first[axis] = int(np.floor(places[axis, p] - 0.5)) - 1
-            for i in range(5):
-                away = first[axis] + i - places[axis, p]
-                weight[axis, i] = _cubic(away)
-                steep[axis, i] = _cubic(away - 0.5) - _cubic(away + 0.5)
-        for t in range(times):
-            for i in range(5):
-                value = slope = 0.0
-                for j in range(5):
-                    part = splines[first[0] + i, first[1] + j, t]
-                    value += weight[1, j] * part
-                    slope += steep[1, j] * part
-                result[0, t, p] += weight[0, i] * value
-                result[1, t, p] += steep[0, i] * value
-                result[2, t, p] += weight[0, i] * slope
-    return result
-
-
-@compiled
-def _cubic(away: float) -> float:
-    """Cubic B-spline at a distance from its middle [pixel]."""
-    far = abs(away)
-    if far < 1.0:
-        return 2.0 / 3.0 - far**2 + 0.5 * far**3
-    return (2.0 - far) ** 3 / 6.0 if far < 2.0 else 0.0
 
 
 def _motion(matrix: Array, places: Array, inside: Mask) -> Array:

@@ -12,9 +12,8 @@ import xarray as xr
 from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
-from dbthermal._samples import stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 

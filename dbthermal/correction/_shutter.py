@@ -13,9 +13,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _rows, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
-from dbthermal._samples import stride
 
 Integers = npt.NDArray[np.int64]
 

@@ -11,9 +11,8 @@ import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
-from dbthermal._samples import stride
 from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status

@@ -8,6 +8,7 @@ from scipy.ndimage import median_filter
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._tiles import RANGE_SIGMAS
@@ -32,7 +33,7 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     counts = schema.check(corrected, "corrected")["counts"]
     if counts.dtype.kind != "f":  # raw counts of pixels that differ
         return []
-    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / _PIXELS)))
+    step = stride(counts.shape[2:], _PIXELS)
     status = corrected["status"].values if "status" in corrected else np.zeros(counts.shape[2:])
     good = (status.astype(np.uint32) & np.uint32(Status.DEAD_PIXEL))[::step, ::step] == 0
     names = [str(name) for name in counts["band"].values]
@@ -60,7 +61,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     """Doubts about a step of one band's level alone, in all pixels: a camera's, not the scene's."""
     counts, time = corrected["counts"], corrected["time"].values
     pixels = min(_PIXELS, max(_FEWEST, _SAMPLES // time.size))
-    step = max(1, int(np.sqrt(counts[0, 0].size / pixels)))
+    step = stride(counts.shape[2:], pixels)
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(time.size)
     joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
     films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)

@@ -10,7 +10,7 @@ import xarray as xr
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal.schema import Status
 
 Bits = npt.NDArray[np.uint32]
@@ -188,7 +188,7 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     length = corrected.sizes["time"]
     if length > _LONG:  # the step is rounded down: up to four times as many pixels are read
         pixels = max(1, pixels * _LONG // (4 * length))
-    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / pixels)))
+    step = stride((corrected.sizes["y"], corrected.sizes["x"]), pixels)
     every = slice(None, None, step)
     counts, valid, status = read(corrected.isel(y=every, x=every))
     good = (status & ~np.uint32(Status.FROZEN_FRAMES)) == 0

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _joint as joint
-from dbthermal.alignment._reflections import Scale
+from dbthermal.alignment._planes import Scale
 
 FRAME = 0.1  # [s]
 

@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, mini
 from scipy.special import chdtri
 
 from dbthermal._arrays import Array
+from dbthermal._samples import neighbour_mean
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart.equations import Floats, Mask
@@ -67,12 +68,12 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     ratio, variance = ratio.reshape(shape), variance.reshape(shape)
     weight = np.divide(1.0, variance, out=np.zeros(shape), where=sound & (variance > 0))
     weight[0] = sound
-    mean = _mean(ratio, weight, _WIDE)
-    chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
+    mean = neighbour_mean(ratio, weight, _WIDE)
+    chi = neighbour_mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
     around = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
     doubtful = moving & ~sound & around
     variance = np.where(
-        doubtful, _mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
+        doubtful, neighbour_mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
     )
     ratio = np.where(doubtful, mean, np.where(sound, ratio, np.nan)).reshape(len(noise), -1)
     inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
@@ -187,16 +188,16 @@ def shared(
     square = (value - _median(value, weight)) ** 2 * weight
     chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
     weight, wide = weight / chi, _AROUND * min(shape)
-    mean = _mean(value, weight, wide)
+    mean = neighbour_mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
-    prior = np.nan_to_num(_mean((value - mean) ** 2, weight, wide))
+    prior = np.nan_to_num(neighbour_mean((value - mean) ** 2, weight, wide))
     variance = np.where(known, variance * chi, np.where(prior > 0, prior, variance))
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
 def _median(values: Floats, weight: Floats) -> Floats:
     """Median (y, x) of the pixels around; one without weight counts as their mean."""
-    filled = np.where(weight > 0, values, np.nan_to_num(_mean(values, weight, _WIDE)))
+    filled = np.where(weight > 0, values, np.nan_to_num(neighbour_mean(values, weight, _WIDE)))
     reach = round(_WIDE)
     # At every few pixels, then interpolated: it changes as slowly as its window is wide.
     stride = max(1, reach // 2)
@@ -205,13 +206,3 @@ def _median(values: Floats, weight: Floats) -> Floats:
     coarse = np.median(around.reshape(*around.shape[:2], -1), axis=2)
     place = np.indices(filled.shape) / stride
     return np.asarray(map_coordinates(coarse, place, order=1, mode="nearest"))
-
-
-def _mean(part: Floats, weight: Floats, deviation: float) -> Floats:
-    """Weighted mean (..., y, x) of the pixels around; NaN without any."""
-    sums = [
-        gaussian_filter(one, deviation, mode="constant", axes=(-2, -1))
-        for one in (np.where(weight > 0, weight * part, 0.0), weight * 1.0)
-    ]
-    empty = np.full(sums[0].shape, np.nan)
-    return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))

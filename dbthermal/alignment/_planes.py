@@ -1,0 +1,224 @@
+"""Rapid changes of a capture as planes: parts along a few functions of time, one reading each."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy import sparse
+from scipy.linalg import solveh_banded
+from scipy.ndimage import distance_transform_edt
+
+from dbthermal import _smooth as smooth
+from dbthermal import noise as noises
+from dbthermal import response as responses
+from dbthermal import schema
+from dbthermal._arrays import Array, Mask, stride
+from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment._offset import noise_levels, sample
+from dbthermal.alignment._products import Movie, binned
+
+SMALLEST: Final = 24
+"""Rows and columns of an image whose bands are matched, at least."""
+
+_ROWS: Final = 32  # that are read at a time
+_COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
+_MISSING: Final = 0.1  # share of the frames that a pixel may lack
+_PIXELS: Final = 1024  # that tell the frames, about
+# Functions of time: 14 fields of 220 to 300 frames are off by .021 pixel along the baseline (.020
+# with 128, of 36 fields 1.2 and 1.4 times as much with 32 and with whole films); and pixels that
+# tell each of them.
+_PLANES: Final = 96
+_FOR_EACH: Final = 8
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Slope (band) [count/K] of each band, or another scale of its changes, and its noise."""
+
+    slopes: Array
+    noise: Array | None  # before the alignment (band) [K], estimated from the capture if None
+
+    @classmethod
+    def of_response(cls, response: xr.Dataset, names: list[str]) -> "Scale":
+        """Scale of a response, and of its noise if it states one."""
+        slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+        noise = responses.noise(response, names) / slopes if "noise" in response else None
+        return cls(slopes, noise)
+
+    @classmethod
+    def of_changes(cls, corrected: xr.Dataset) -> "Scale":
+        """Scale without a response: each band's own changes in time, each on its own clock."""
+        scatter, relative = noise_levels(sample(corrected), clocks.exposure_times(corrected))
+        if not np.all(relative > 0.0):
+            raise ValueError("Missing noise of the capture. Must be seen to match reflections.")
+        return cls(scatter / relative, relative / _noise_factor(corrected))
+
+    def noise_of(self, corrected: xr.Dataset) -> Array:
+        """Noise of a capture (band) [K]."""
+        if self.noise is not None:
+            return np.asarray(self.noise * _noise_factor(corrected))
+        signals = sample(corrected)
+        frames = np.all(np.isfinite(signals), axis=(0, 2))
+        parts = [signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
+        return noises.estimate_bands(parts, corrected["time"].values[frames])
+
+
+def _noise_factor(corrected: xr.Dataset) -> Array:
+    """Noise (band) [1] over that before the alignment."""
+    whole = np.ones(corrected.sizes["band"])
+    return np.asarray(corrected["noise_factor"].values if "noise_factor" in corrected else whole)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Capture and all that matching needs to know of it, the quietest band first."""
+
+    counts: xr.DataArray
+    bands: npt.NDArray[np.intp]  # places in the counts
+    slopes: Array  # of the bands [count/K]
+    noise: Array  # of the bands [K]
+    valid: Mask  # pixels (y, x)
+    frames: npt.NDArray[np.intp]  # that every band has
+    rough: npt.NDArray[np.intp]  # first of four frames that follow one another evenly
+
+    @classmethod
+    def of(cls, corrected: xr.Dataset, scale: Scale) -> "Capture":
+        """Check a capture."""
+        counts = schema.check_corrected(corrected)["counts"]
+        names = [str(name) for name in counts["band"].values]
+        if len(names) < 2:
+            raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
+        if min(counts.shape[2:]) < SMALLEST:
+            raise ValueError(
+                f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
+                f"at least {SMALLEST} of each to match reflections."
+            )
+        slopes, noise = scale.slopes, scale.noise_of(corrected)
+        order = np.argsort(noise, kind="stable")
+        valid = np.ones(counts.shape[2:], dtype=bool)
+        if "status" in corrected:
+            valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
+        frames = _frames(counts)
+        times, segment = corrected["time"].values[frames], clocks.segments(corrected)[frames]
+        steps = np.diff(times)
+        joined = (steps < 1.5 * np.median(steps)) & (np.diff(segment) == 0)
+        rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
+        return cls(counts, order, slopes[order], noise[order], valid, frames, rough)
+
+    def blocks(self, height: int) -> Iterator[tuple[slice, list[Movie], Mask]]:
+        """Rows, their films (time, y, x) [count] in the frames, and pixels that lack few."""
+        whole = self.frames.size == self.counts.sizes["time"]
+        for start in range(0, self.valid.shape[0], height):
+            rows = slice(start, start + height)
+            films = self.counts.isel(y=rows).values
+            films = films if whole else films[:, self.frames]
+            flat = films.astype(np.float32, copy=False).reshape(*films.shape[:2], -1)
+            filled, shares = zip(*(bridged(flat[band]) for band in self.bands), strict=True)
+            few = (np.min(shares, axis=0) >= 1.0 - _MISSING).reshape(films.shape[2:])
+            yield rows, [film.reshape(films.shape[1:]) for film in filled], few
+
+    def smoothing(self, period: float) -> Array:
+        """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
+        size, weight = self.frames.size, (2.0 * np.sin(np.pi / period)) ** -6
+        third = sparse.diags_array(
+            [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
+        )[self.rough]
+        penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
+        return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
+
+    def functions(self, signals: Movie, period: float) -> Movie:
+        """Functions (time, plane) of the changes within a period [frame] that signals show most."""
+        smoothing = self.smoothing(period)
+        some = signals.reshape(-1, signals.shape[-1])
+        some = some[:: max(1, len(some) // (_FOR_EACH * _PLANES))]
+        functions = rapid(smooth.leading(rapid(some, smoothing), _PLANES).T, smoothing).T
+        return np.ascontiguousarray(functions, np.float32)
+
+    def planes(self, functions: list[Movie]) -> list[list[Movie]]:
+        """Parts (y, x, plane) [K] of the bands along each of some functions of time."""
+        together = np.concatenate(functions, axis=1)
+        result = np.empty((self.bands.size, *self.valid.shape, together.shape[1]), np.float32)
+        for rows, films, _ in self.blocks(_ROWS):
+            for movie, film, slope in zip(result, films, self.slopes, strict=True):
+                planes = film.reshape(len(film), -1).T @ (together / np.float32(slope))
+                movie[rows] = planes.reshape(movie[rows].shape)
+        if not self.valid.all():
+            nearest = distance_transform_edt(
+                ~self.valid, return_distances=False, return_indices=True
+            )
+            result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+        ends = np.cumsum([part.shape[1] for part in functions])
+        return [list(part) for part in np.split(result, ends[:-1], axis=3)]
+
+    def binned(self, factor: int) -> tuple[list[Movie], Mask]:
+        """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
+        valid, parts = self.valid.copy(), []
+        for rows, films, few in self.blocks(max(1, _ROWS // factor) * factor):
+            valid[rows] &= few
+            used = valid[rows, :, np.newaxis]
+            share = np.maximum(binned(used.astype(np.float64), factor), factor**-2)
+            signals = [np.moveaxis(film, 0, -1) for film in films]
+            if not used.all():
+                signals = [np.where(used, signal, np.float32(0.0)) for signal in signals]
+            scale = (self.slopes[:, None, None, None] * share).astype(np.float32)
+            parts.append(np.stack([binned(signal, factor) for signal in signals]) / scale)
+        return list(np.concatenate(parts, axis=1)), valid
+
+
+def freedom(functions: Movie) -> float:
+    """Degrees of freedom of white noise along functions of time (time, plane)."""
+    return float(np.sum(functions**2))
+
+
+def white(frames: int, period: float) -> float:
+    """Degrees of freedom of white noise that a smoother leaves, see `Capture.smoothing`."""
+    frequency = np.pi * (np.arange(frames) + 0.5) / frames
+    ratio = (np.sin(0.5 * frequency) / np.sin(np.pi / period)) ** 6
+    return float(np.sum((ratio / (1.0 + ratio)) ** 2))
+
+
+def bridged(film: Movie) -> tuple[Movie, Array]:
+    """Film (time, pixel) with missing samples on the line between those before and after.
+
+    Second, the share of samples (pixel) that are measured; a pixel without any is zero.
+    """
+    measured = schema.measured(film)
+    pixels = np.flatnonzero(~measured.all(axis=0))
+    if not pixels.size:
+        return film, np.ones(film.shape[1])
+    present, frame = measured[:, pixels], np.arange(len(film))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(present, frame, -1), axis=0)
+    after = np.minimum.accumulate(np.where(present, frame, frame.size)[::-1], axis=0)[::-1]
+    # Before the first and after the last sample their values go on.
+    first, last = after[0] % frame.size, before[-1].clip(0)
+    before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
+    weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
+    result, samples = film.copy(), np.where(present, film[:, pixels], np.float32(0.0))
+    low, high = (np.take_along_axis(samples, place, 0) for place in (before, after))
+    result[:, pixels] = low + weight * (high - low)
+    return result, measured.mean(axis=0)
+
+
+def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:
+    """Signal (y, x, time) less what a smoother passes."""
+    flat = signal.reshape(-1, signal.shape[-1]).T
+    flat = flat - flat.mean(axis=0)
+    return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
+
+
+def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
+    """Frames in which most of the pixels that every band ever measures are measured."""
+    step = stride(counts.shape[2:], _PIXELS)
+    some = schema.measured(counts[:, :, ::step, ::step].values)
+    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
+    used = np.flatnonzero(share > _COMMON)
+    if used.size < noises.MINIMUM_FRAMES:
+        raise ValueError(
+            f"Invalid capture of {used.size} frames that all bands have. Must be at least "
+            f"{noises.MINIMUM_FRAMES}."
+        )
+    return used
