@@ -50,7 +50,7 @@ class Method:
     whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
     every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
     even_times: bool = False  # refuses frames at uneven times, by name
-    survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
+    pools: bool = False  # an estimate holds a `Survey`, and a covariance of the emissivities
     check_clock: Callable[..., None] | None = None  # refuses times that are not of exposure
     any_bands: bool = False  # takes more than two bands
     compiled: bool = False  # compiled, a pixel at a time
@@ -146,7 +146,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if emissivity is None and method.knows_emissivity:
         raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
     curves = [responses.curve(response, band, response_kind) for band in bands]
-    if pool is not None and method.survey is None:
+    if pool is not None and not method.pools:
         raise ValueError(f"Invalid pool for method '{name}', which does not pool.")
     capture = corrected[[variable for variable in _READ if variable in corrected]]
     _check_segment(capture)

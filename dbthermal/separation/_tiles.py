@@ -57,7 +57,7 @@ USELESS: Final = 1e6
 
 @dataclass(frozen=True)
 class Pixels:
-    """A record of arrays, optional ones among them, whose last axis is the pixel."""
+    """A record of arrays and records, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
@@ -65,16 +65,20 @@ class Pixels:
 
     def each(self, function: Callable[[Any], Any]) -> Self:
         """Return the record with a function of each of its arrays."""
-        values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        parts: dict[str, Any] = {name: v if v is None else function(v) for name, v in values}
+        parts: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            within = value.each(function) if isinstance(value, Pixels) else value
+            parts[name] = function(value) if isinstance(value, np.ndarray) else within
         return replace(self, **parts)
 
     def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
         """Replace the selected pixels by those of a part, in order, in place."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None:
-                value[..., selected] = getattr(part, field.name)
+            value, values = getattr(self, field.name), getattr(part, field.name)
+            if isinstance(value, Pixels):
+                value.replace_pixels(selected, values)
+            elif value is not None:
+                value[..., selected] = values
 
     def join(self, others: Sequence[Self]) -> Self:
         """Return the record with the pixels of others after its own."""
@@ -101,15 +105,24 @@ class Material(Pixels):
 class Survey(Pixels):
     """Contribution of each pixel to the estimate for its material."""
 
-    scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
-    frames: Array  # its degrees of freedom (pixel)
-    rapid_scatter: Array  # the same at the two largest orders looked at (2, band, band, pixel) [1]
-    rapid_frames: Array  # their degrees of freedom (2, pixel)
+    scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at the
+    # two largest ones looked at (3, band, band, pixel) [1]
+    frames: Array  # their degrees of freedom, 0 of a pixel that tells nothing (3, pixel)
     ratio: Array  # reflection ratios of the pixel alone (band, pixel) [1]
     null_weights: Array  # see `ReflectionRatio` (band, pixel) [1]
     emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined
     noise_variance: Array  # its variance from the noise, independent of other pixels' (pixel) [1]
     drift_variance: Array  # its variance from the background, common to all pixels (pixel) [1]
+
+    @classmethod
+    def empty(cls, bands: int, pixels: int) -> Self:
+        """Survey of pixels that tell nothing."""
+        scatter, frames = np.zeros((3, bands, bands, pixels)), np.zeros((3, pixels))
+        ratios, (emissivity, *variances) = (
+            np.full((2, bands, pixels), np.nan),
+            np.full((3, pixels), np.nan),
+        )
+        return cls(scatter, frames, *ratios, emissivity, *variances)
 
 
 @dataclass(frozen=True)
@@ -183,6 +196,7 @@ class Estimate(Pixels):
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    survey: Survey | None = None  # for the material, of a method that pools
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
@@ -216,7 +230,9 @@ class Estimate(Pixels):
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name in ("status", *not_estimated) or name.endswith(("_std", "_covariance")):
+            if name in ("status", "survey", *not_estimated) or name.endswith(
+                ("_std", "_covariance")
+            ):
                 continue
             if getattr(self, name) is None:
                 continue
@@ -279,6 +295,17 @@ def numbers(window: Window, width: int) -> Whole:
     return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
+def _wanted(
+    every: Iterator[Window], width: int, wanted: Mask | None
+) -> Iterator[tuple[Window, slice | Whole, Whole]]:
+    """Yield windows, which of their pixels are wanted, of the image (pixel), and their numbers."""
+    for window in every:
+        places = numbers(window, width)
+        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        if places[some].size:
+            yield window, some, places[some]
+
+
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
@@ -302,10 +329,7 @@ def cut(
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
-    for window in windows(rows, width, size):
-        places = numbers(window, width)
-        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        places = places[some]
+    for window, some, places in _wanted(windows(rows, width, size), width, wanted):
         gain = np.ones((2, places.size))
         if displacement is None:
             loaded, grains = load()

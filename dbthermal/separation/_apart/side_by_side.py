@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -33,7 +33,7 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
     each(inputs, None)
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
-    if inputs.method.survey is not None and inputs.displacement.moves:
+    if inputs.method.pools and inputs.displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
@@ -60,7 +60,7 @@ def pooled(
     result: xr.Dataset,
     each: Each,
     threads: Executor,
-    bar: Any,
+    materials: Callable[..., Material | None],
     regroup: Regroup | None = None,
 ) -> None:
     """Separate with materials, from a result of each pixel alone before.
@@ -74,8 +74,8 @@ def pooled(
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
         maps = planes.project(inputs, before, shares, threads)
-        survey = partial(neighbours.materials, planes=maps, alone=before, threads=threads, bar=bar)
-        inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
+        told = partial(neighbours.materials, planes=maps, alone=before, materials=materials)
+        inputs, material = regrouped(inputs, told, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
             each(inputs, material)
@@ -95,12 +95,12 @@ def pooled(
 
 
 def regrouped(
-    inputs: Inputs, survey: Callable[[Inputs], Material | None], regroup: Regroup | None
+    inputs: Inputs, materials: Callable[[Inputs], Material | None], regroup: Regroup | None
 ) -> tuple[Inputs, Material | None]:
-    """Inputs and a survey of their materials; of other ones, if that regroups them."""
-    material = survey(inputs)
+    """Inputs, and what is told of their materials; of others, if that regroups them."""
+    material = materials(inputs)
     labels = None if regroup is None else regroup(material)
     if labels is None or np.all(labels == inputs.labels):
         return inputs, material
     inputs = replace(inputs, labels=labels)
-    return inputs, survey(inputs)
+    return inputs, materials(inputs)

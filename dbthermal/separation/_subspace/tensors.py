@@ -47,7 +47,6 @@ class Ratio(NamedTuple):
     smoothed: Tensor  # of the null combination (column, pixel) [K]
     columns: Tensor  # whether a column is in use (column, pixel)
     scatter: Tensor
-    rapid_scatter: Tensor
     pooled: Tensor
 
 
@@ -90,9 +89,7 @@ class Emission(NamedTuple):
     restless: Tensor
 
 
-def solve(
-    device: str, tile: Tile, functions: smooth.Subspace, drift: float, least: float
-) -> Solution:
+def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> Solution:
     """As `fused.solve`, on a device; the solution is in arrays."""
 
     def tensor(values: Any) -> Any:
@@ -102,22 +99,37 @@ def solve(
     material = {} if tile.material is None else dict(vars(tile.material.each(tensor)))
     signals = tensor(tile.signals)
     result, bend, line = _steps(model, material, signals, signals)
-    removed, places = torch.zeros_like(bend), torch.arange(signals.shape[2], device=device)
+    whole, removed, places = (
+        bend,
+        torch.zeros_like(bend),
+        torch.arange(bend.shape[2], device=device),
+    )
+    known = material
     for _ in range(pixel.BENDS):
         energy = (bend - removed).var(dim=1, correction=0) * signals.shape[1]
-        bent = (energy > (least * model.noise[1:, None]) ** 2).any(dim=0)
+        bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
         if not bent.any():
             break
         # Again, on signals whose reflections are proportional.
-        least, removed, places = pixel.BEND, bend[..., bent], places[bent]
-        signals, line = signals[..., bent], Line(*(values[..., bent] for values in line))
-        material = {name: values[..., bent] for name, values in material.items()}
-        straight = torch.cat([signals[:1], signals[1:] - removed])
-        again, bend, line = _steps(model, material, signals, straight, line)
+        removed, places = bend[..., bent], places[bent]
+        line = Line(*(values[..., bent] for values in line))
+        known = {name: values[..., bent] for name, values in known.items()}
+        straight = _straight(signals[..., places], removed)
+        again, bend, line = _steps(model, known, signals[..., places], straight, line)
+        whole[..., places] = bend
         # The bend of a gray body is not known: it is told from the signals as they are.
         for name in again.keys() - {"gray"}:
             result[name][..., places] = again[name]
+    # Together pixels see a bend that is too small to be seen in each.
+    scatter = _less_noise(model, _scatter(model, _straight(signals, whole))[1], result["order"])
+    alone = material["ratio"][-1].isnan() if material else torch.ones_like(result["pooled"])
+    result["scatter"] = scatter.where(alone, result["scatter"])
     return Solution(**{name: values.cpu().numpy() for name, values in result.items()})
+
+
+def _straight(signals: Tensor, bend: Tensor) -> Tensor:
+    """Signals without the bend of the bands but the first."""
+    return torch.cat([signals[:1], signals[1:] - bend])
 
 
 def _steps(
@@ -140,7 +152,7 @@ def _steps(
     rapid = straight[0] - model.functions.T @ ratios.coefficients[0]
     curve = model.object_part.T @ ratios.smoothed
     common = ratios.null_weights[0] * model.noise[0] ** 2
-    free = signals.shape[1] - model.steps - ratios.order
+    free = signals.shape[1] - model.steps - _orders(model, ratios.order)
     parts = {**ratios._asdict(), **fit._asdict(), **emission._asdict()}
     result = {
         **{name: part for name, part in parts.items() if name in Solution.__dataclass_fields__},
@@ -152,7 +164,7 @@ def _steps(
         "freedom": free,
         "gray": _may_be_gray(model, ratios),
         "correlation": _autocorrelation(residual),
-        "delay": _delay(residual, rapid, ratios.null_variance, free * common, model.noise[0]),
+        "delay": _delay(residual, rapid, ratios.null_variance, free[0] * common, model.noise[0]),
         "unexplained": _unexplained(model, residual, rapid, ratios.null_variance, common),
         "sums": torch.stack([_block_sums(part, model.parts) for part in (residual, curve)]),
     }
@@ -202,10 +214,7 @@ def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
     """Step 1 (eq. 2 to 5), see `pixel.ratios`."""
     (bands, frames, pixels), noise = signals.shape, model.noise[:, None]
     # Eq. 3: scatter (order, pixel, band, band) of the whitened signals outside the functions.
-    held = model.functions @ signals
-    white = held / noise[..., None]
-    total = einsum("btp,ctp->pbc", signals, signals) / (noise * noise.T)
-    scatter = total - einsum("bfp,cfp->fpbc", white, white).cumsum(0)[model.steps :]
+    held, scatter = _scatter(model, signals)
     orders = torch.arange(1, len(scatter) + 1, device=signals.device)
     freedom, rows = frames - model.steps - orders, torch.arange(pixels, device=signals.device)
     # Its energy is the largest eigenvalue along the axis, noise alone across it.
@@ -247,8 +256,6 @@ def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
     error = noise**2 + (ratio * noise[0]) ** 2
     error[0] = 0.0
     columns = torch.arange(held.shape[1], device=signals.device)[:, None] < order + 1 + model.steps
-    rapid = torch.as_tensor(reflection_ratio.rapid_orders(len(scatter)) - 1, device=signals.device)
-    unit = torch.eye(bands, dtype=signals.dtype, device=signals.device)[..., None]
     return Ratio(
         ratio=ratio,
         ratio_variance=inverse * error,
@@ -261,10 +268,31 @@ def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
         coefficients=held * columns,
         smoothed=einsum("bp,bcp->cp", weights, held) * columns,
         columns=columns,
-        scatter=chosen.movedim(0, -1) - free * unit,
-        rapid_scatter=scatter[rapid].movedim(1, -1) - freedom[rapid][:, None, None, None] * unit,
+        scatter=_less_noise(model, scatter, order + 1),
         pooled=pooled,
     )
+
+
+def _scatter(model: Model, signals: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients of signals; scatter (order, pixel, band, band) outside the functions (eq. 3)."""
+    noise, held = model.noise[:, None], model.functions @ signals
+    white = held / noise[..., None]
+    total = einsum("btp,ctp->pbc", signals, signals) / (noise * noise.T)
+    return held, total - einsum("bfp,cfp->fpbc", white, white).cumsum(0)[model.steps :]
+
+
+def _orders(model: Model, order: Tensor) -> Tensor:
+    """Orders (3, pixel) of a survey: each pixel's, and `rapid_orders`."""
+    rapid = reflection_ratio.rapid_orders(len(model.functions) - model.steps)
+    return torch.stack([order, *(torch.full_like(order, int(one)) for one in rapid)])
+
+
+def _less_noise(model: Model, scatter: Tensor, order: Tensor) -> Tensor:
+    """Scatter less noise (3, band, band, pixel) at the orders of a survey."""
+    orders, unit = _orders(model, order), torch.eye(scatter.shape[-1], device=scatter.device)
+    free = model.functions.shape[1] - model.steps - orders
+    chosen = scatter[orders - 1, torch.arange(orders.shape[1], device=scatter.device)]
+    return chosen.movedim(1, -1) - free[:, None, None] * unit[..., None]
 
 
 def _order(across: Tensor, frames: int) -> Tensor:
