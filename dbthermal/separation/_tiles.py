@@ -306,6 +306,15 @@ def _wanted(
             yield window, some, places[some]
 
 
+def _picked(view: xr.Dataset, some: slice | Whole) -> xr.Dataset:
+    """Some pixels of a part of a capture, as one row."""
+    if isinstance(some, slice):
+        return view
+    places = np.divmod(some[np.newaxis], view.sizes["x"])
+    rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
+    return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
+
+
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
@@ -334,12 +343,9 @@ def cut(
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
-            view = loaded.isel(y=local, x=window[1])
+            view = _picked(loaded.isel(y=local, x=window[1]), some)
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
-            if wanted is not None:
-                samples = (counts, usable, valid, status)
-                counts, usable, valid, status = (select(one, some) for one in samples)
         else:
             counts, usable, valid, status, gain = displaced.paired(
                 load, displacement, window[0], source, some, method.minimum_frames

@@ -17,8 +17,6 @@ MOST: Final = 2048
 Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 """Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
 
-# Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
-_MOST_TOLD: Final = 0.98
 # Rounds of leaving out pixels that are not of the material.
 _ROUNDS: Final = 6
 # Share of the pixels from which those with an emissivity of their own speak for a material [1].
@@ -30,9 +28,9 @@ def materials(
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
-    Of the surveys of all pixels alone, made of some if not at hand. Those of a material that have
-    an emissivity alone are a selection by their ratios: unless they are nearly all, its pixels are
-    surveyed again, with its ratios. Those `known` stay.
+    Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
+    alone are a selection by their ratios: the others are surveyed again, with the ratios of their
+    material. Those `known` stay.
     """
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
@@ -46,16 +44,14 @@ def materials(
         return None
     image = Image(labels, places, inputs.capture.sizes["x"])
     found = estimate(image, labels[places], alone, noise, known)
-    count = int(labels.max()) + 1
-    sound = total(labels[places], (alone.frames[0] > 0) * 1.0, count)
-    told = total(labels[places], np.isfinite(alone.emissivity) * 1.0, count)
-    again = (told <= _MOST_TOLD * sound)[labels] & selected
-    if not np.any(again):
+    untold = np.isnan(alone.emissivity) & np.isfinite(found.ratio[-1, places])
+    if not np.any(untold):
         return found
+    selected[places] = untold
     # The emissivity is a guess, of constant objects alone.
-    more = survey(inputs, replace(found, noise_variance=unknown), again).select_pixels(again)
+    more = survey(inputs, replace(found, noise_variance=unknown), selected).select_pixels(selected)
     for name in ("null_weights", "emissivity", "noise_variance", "drift_variance"):
-        getattr(alone, name)[..., again[places]] = getattr(more, name)
+        getattr(alone, name)[..., untold] = getattr(more, name)
     return estimate(image, labels[places], alone, noise, known)
 
 
@@ -152,9 +148,10 @@ def _common(
 def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> Material:
     """Emissivity of the first band, its variance from noise, and that from drift [1], to ratios."""
     count = int(image.labels.max()) + 1
-    # e_1 at the common ratios: e_1 - e_1 (1 - e_1) w . kappa
+    # With p = w . kappa of the common ratios, before a background at rest the null combination has
+    # a slope of 1 - (1 - e_1) p with the object's signal, and the regression one of e_1 over that.
     product = (survey.null_weights * common.ratio[:, image.surveyed]).sum(axis=0)
-    value = survey.emissivity * (1.0 - (1.0 - survey.emissivity) * product)
+    value = survey.emissivity * (1.0 - product) / (1.0 - survey.emissivity * product)
     known = (labels >= 0) & np.isfinite(value)
     where = np.where(known, labels, -1)
     value, noise, drift = (
