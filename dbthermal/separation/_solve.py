@@ -226,33 +226,32 @@ def separated(
     if inputs.method.pools:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
-    if inputs.method.pools and not pooled:
-        surveys = Survey.empty(len(inputs.bands), result["status"].size)
-    # Cameras apart take passes that are not known beforehand.
-    total = None if apart else result["status"].size
+    # Cameras apart, and materials, take passes that are not known beforehand.
+    total = None if apart or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
 
-        def survey(inputs: Inputs, material: Material | None, wanted: Mask) -> Survey:
-            """Surveys of the wanted pixels, in those of all."""
-            part = Survey.empty(len(inputs.bands), wanted.size)
-            separate = partial(_separate, inputs, material, None, part, wanted)
-            list(threads.map(separate, inputs.blocks))
-            return part
+        def each(inputs: Inputs, material: Material | None, wanted: Mask | None = None) -> Survey:
+            """Separate all pixels into the result; or only survey those that are wanted."""
+            survey = Survey.empty(len(inputs.bands), result["status"].size)
+            into = result if wanted is None else None
+            separate = partial(_separate, inputs, material, into, survey, wanted)
+            for pixels in threads.map(separate, inputs.blocks):
+                bar.update(pixels)
+            return survey
 
-        each = partial(_separate_all, result, None if pooled else surveys, threads, bar)
-        materials = partial(pooling.materials, survey=survey, surveys=surveys)
+        materials = partial(pooling.materials, survey=each, surveys=surveys)
         if alone is not None and apart:
             side_by_side.pooled(inputs, alone, result, each, threads, materials, regroup)
         elif apart:
-            side_by_side.alone(inputs, result, each, threads)
+            surveys = side_by_side.alone(inputs, result, each, threads)
         elif pooled:
             each(*side_by_side.regrouped(inputs, materials, regroup))
         else:
-            each(inputs, None)
+            surveys = each(inputs, None)
     if inputs.method.pools:
         _withhold(result)
     sources = inputs.response.attrs, capture.attrs
@@ -333,30 +332,16 @@ def get_method(name: str) -> Method:
     return method
 
 
-def _separate_all(
-    result: xr.Dataset,
-    surveys: Survey | None,
-    threads: ThreadPoolExecutor,
-    bar: "tqdm[Any]",
-    inputs: Inputs,
-    material: Material | None,
-) -> None:
-    """Separate all blocks of rows into the result."""
-    for size in threads.map(
-        partial(_separate, inputs, material, result, surveys, None), inputs.blocks
-    ):
-        bar.update(size)
-
-
 def _separate(
     inputs: Inputs,
     material: Material | None,
     result: xr.Dataset | None,
-    surveys: Survey | None,
+    survey: Survey,
     wanted: Mask | None,
     rows: slice,
 ) -> int:
     """Separate a block of rows, or what is wanted of it, into its place; return its pixels."""
+    size = 0
     for cut in tiles.cut(inputs, rows, material, wanted):
         estimates = []
         for frames, pixels, tile in cut.parts:
@@ -364,16 +349,17 @@ def _separate(
             if estimate.status.size == pixels.size and not pixels.all():
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
-            if surveys is not None and estimate.survey is not None:
+            if estimate.survey is not None:
                 # Whitened by one noise for all, not by that of the tile.
                 scale = np.array(tile.noise) / inputs.noise[inputs.bands]
                 scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
                 part = replace(estimate.survey, scatter=scatter)
-                surveys.replace_pixels(cut.places[pixels], part)
+                survey.replace_pixels(cut.places[pixels], part)
         if result is not None:
             _write(result, inputs.bands, cut, estimates)
         release()
-    return (rows.stop - rows.start) * inputs.capture.sizes["x"]
+        size += cut.status.size
+    return size
 
 
 def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:

@@ -50,8 +50,7 @@ def materials(
     selected[places] = untold
     # The emissivity is a guess, of constant objects alone.
     more = survey(inputs, replace(found, noise_variance=unknown), selected).select_pixels(selected)
-    for name in ("null_weights", "emissivity", "noise_variance", "drift_variance"):
-        getattr(alone, name)[..., untold] = getattr(more, name)
+    alone.replace_pixels(untold, more)
     return estimate(image, labels[places], alone, noise, known)
 
 

@@ -117,14 +117,17 @@ class Solved(NamedTuple):
 
 
 @inlined
-def _energy(bend: Array, removed: Array) -> float:
-    """Energy about the mean of what a bend has changed."""
-    total, square = 0.0, 0.0
-    for t in range(bend.size):
-        change = bend[t] - removed[t]
-        total += change
-        square += change**2
-    return square - total**2 / bend.size
+def _bent(model: Model, work: Work, frames: int) -> bool:
+    """Say whether the bend has changed by more energy about its mean than `pixel.BEND`."""
+    bent = False
+    for m in range(1, model.noise.size):
+        total, square = 0.0, 0.0
+        for t in range(frames):
+            change = work.bend[m, t] - work.removed[m, t]
+            total += change
+            square += change**2
+        bent |= square - total**2 / frames > (pixel.BEND * model.noise[m]) ** 2
+    return bent
 
 
 @inlined
@@ -134,7 +137,7 @@ def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, cova
     for m in range(bands):
         kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
         kernels.fill(work.removed[m, :frames], 0.0)
-    gray, again, bent = False, 0, True
+    gray, again = False, 0
     while True:
         ratios = pixel.ratios(model, work)
         line = pixel.emission(model, ratios, work, again)
@@ -142,11 +145,7 @@ def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, cova
         # The bend of a gray body is not known: it is told from the signals as they are.
         if again == 0:
             gray = pixel.may_be_gray(model, ratios, work)
-        bent = False
-        for m in range(1, bands):
-            energy = _energy(work.bend[m, :frames], work.removed[m, :frames])
-            bent |= energy > (pixel.BEND * model.noise[m]) ** 2
-        if again == pixel.BENDS or not bent:
+        if again == pixel.BENDS or not _bent(model, work, frames):
             break
         again += 1
         _straighten(work, bands, frames)
@@ -176,13 +175,13 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
 
 @inlined
 def _scatters(model: Model, ratios: Ratio, work: Work, matrices: Any) -> None:
-    """Scatter less noise at the pixel's order and at `rapid_orders`, without any bend, in place.
+    """Scatter less noise at the pixel's order and at `rapid_orders`, in place.
 
-    Together pixels see a bend that is too small to be seen in each. Of a pixel with the ratios of a
-    material, which is not asked for its scatter, it stays as it was.
+    Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
+    emissivity of its material is not asked for its scatter.
     """
     bands, frames, orders = model.noise.size, work.first.size, len(work.scatter)
-    if np.isnan(work.material[6]):
+    if np.isnan(work.material[2]) and not _bent(model, work, frames):
         _straighten(work, bands, frames)
         pixel.scatter(model, work)
     for place in range(3):

@@ -164,11 +164,7 @@ def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
     return smooth.subspace(time, order, segment=segment)
 
 
-def _solve(
-    tile: Tile,
-    functions: smooth.Subspace,
-    settings: SubspaceSettings,
-) -> Solution:
+def _solve(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Solution:
     """Steps 1 to 4, compiled, or on a device."""
     solve = fused.solve
     if settings.device is not None:
@@ -311,15 +307,8 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         best.replace_pixels(places, again)
         cost[places] = one.cost[places]
         first[:, places] = one.first[:, places]
-    divided = first.any(axis=0)
-    if part.material is None and best.survey is not None and np.any(divided):
-        some = part.select_pixels(divided)
-        for place, number in enumerate(_NUMBERS, 1):
-            again = _report(some, _divided(some, first[:, divided], functions, settings, number))
-            assert again.survey is not None
-            best.survey.scatter[place][..., divided] = again.survey.scatter[0]
-            best.survey.frames[place][divided] = again.survey.frames[0]
-    jumping = divided & residuals.sudden(
+    _survey_divided(part, first, best, settings)
+    jumping = first.any(axis=0) & residuals.sudden(
         best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
@@ -329,6 +318,24 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
     status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
+
+
+def _survey_divided(tile: Tile, first: Mask, result: Estimate, settings: SubspaceSettings) -> None:
+    """Scatters with more polynomials in the pieces (time, pixel), in the survey, in place.
+
+    A pixel with the emissivity of its material is not asked for its scatter.
+    """
+    divided = first.any(axis=0)
+    if tile.material is not None:
+        divided &= np.isnan(tile.material.noise_variance)
+    if result.survey is None or not np.any(divided):
+        return
+    part, functions = tile.select_pixels(divided), _functions(tile)
+    for place, number in enumerate(_NUMBERS, 1):
+        more = _report(part, _divided(part, first[:, divided], functions, settings, number)).survey
+        assert more is not None
+        result.survey.scatter[place][..., divided] = more.scatter[0]
+        result.survey.frames[place][divided] = more.frames[0]
 
 
 def _divided(

@@ -122,7 +122,7 @@ def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> 
             result[name][..., places] = again[name]
     # Together pixels see a bend that is too small to be seen in each.
     scatter = _less_noise(model, _scatter(model, _straight(signals, whole))[1], result["order"])
-    alone = material["ratio"][-1].isnan() if material else torch.ones_like(result["pooled"])
+    alone = material["noise_variance"].isnan() if material else torch.ones_like(result["pooled"])
     result["scatter"] = scatter.where(alone, result["scatter"])
     return Solution(**{name: values.cpu().numpy() for name, values in result.items()})
 
