@@ -11,12 +11,14 @@ from dbthermal.separation._pooling import gradients, ratios
 from dbthermal.separation._pooling.ratios import Common, Image, Ratios, total
 from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
-MOST: Final = 2048
-"""Pixels of one material that are surveyed: more would not lower its systematic error."""
+MOST: Final = 1024
+"""Pixels of one material that are surveyed: of 2048, or all 5120, objects are nearer by 0.4 %."""
 
 Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 """Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
 
+# Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
+_MOST_TOLD: Final = 0.98
 # Rounds of leaving out pixels that are not of the material.
 _ROUNDS: Final = 6
 # Share of the pixels from which those with an emissivity of their own speak for a material [1].
@@ -29,8 +31,8 @@ def materials(
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
     Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
-    alone are a selection by their ratios: the others are surveyed again, with the ratios of their
-    material. Those `known` stay.
+    alone are a selection by their ratios: unless they are nearly all of their material, all of it
+    are surveyed again, with its ratios. Those `known` stay.
     """
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
@@ -44,13 +46,18 @@ def materials(
         return None
     image = Image(labels, places, inputs.capture.sizes["x"])
     found = estimate(image, labels[places], alone, noise, known)
-    untold = np.isnan(alone.emissivity) & np.isfinite(found.ratio[-1, places])
-    if not np.any(untold):
+    count = int(labels.max()) + 1
+    sound, told = (
+        total(labels[places], 1.0 * part, count)
+        for part in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
+    )
+    again = (told <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(found.ratio[-1, places])
+    if not np.any(again):
         return found
-    selected[places] = untold
+    selected[places] = again
     # The emissivity is a guess, of constant objects alone.
     more = survey(inputs, replace(found, noise_variance=unknown), selected).select_pixels(selected)
-    alone.replace_pixels(untold, more)
+    alone.replace_pixels(again, more)
     return estimate(image, labels[places], alone, noise, known)
 
 
