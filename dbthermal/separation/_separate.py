@@ -137,8 +137,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         doubts = _unexplained(alone)
     result = alone
-    shared = {"alone": alone, "surveys": surveys, "workers": workers, "progress": progress}
-    again = partial(separated, **shared)
+    again = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
         result, _ = again(replace(known, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:

@@ -117,12 +117,16 @@ class Survey(Pixels):
     @classmethod
     def empty(cls, bands: int, pixels: int) -> Self:
         """Survey of pixels that tell nothing."""
-        scatter, frames = np.zeros((3, bands, bands, pixels)), np.zeros((3, pixels))
-        ratios, (emissivity, *variances) = (
-            np.full((2, bands, pixels), np.nan),
-            np.full((3, pixels), np.nan),
+        none = np.full((bands, pixels), np.nan)
+        return cls(
+            scatter=np.zeros((3, bands, bands, pixels)),
+            frames=np.zeros((3, pixels)),
+            ratio=none,
+            null_weights=none.copy(),
+            emissivity=none[0].copy(),
+            noise_variance=none[0].copy(),
+            drift_variance=none[0].copy(),
         )
-        return cls(scatter, frames, *ratios, emissivity, *variances)
 
 
 @dataclass(frozen=True)
@@ -208,15 +212,12 @@ class Estimate(Pixels):
         covariance = self.emissivity_covariance
         if covariance is not None:
             covariance = np.where(no_emissivity, np.nan, covariance)
-        return replace(
-            self,
-            emissivity_covariance=covariance,
-            **{
-                name + ending: np.where(where, np.nan, getattr(self, name + ending))
-                for name, where in undefined.items()
-                for ending in ("", "_std")
-            },
-        )
+        parts: dict[str, Any] = {
+            name + ending: np.where(where, np.nan, getattr(self, name + ending))
+            for name, where in undefined.items()
+            for ending in ("", "_std")
+        }
+        return replace(self, emissivity_covariance=covariance, **parts)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
@@ -226,7 +227,7 @@ class Estimate(Pixels):
         that the method has `not_estimated` may be NaN without a flag. A quantity that is NaN in all
         samples of a pixel with another status bit needs no further bit.
         """
-        values: dict[str, Array] = {}
+        values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name

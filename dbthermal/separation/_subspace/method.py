@@ -325,7 +325,7 @@ def _survey_divided(tile: Tile, first: Mask, result: Estimate, settings: Subspac
 
     A pixel with the emissivity of its material is not asked for its scatter.
     """
-    divided = first.any(axis=0)
+    divided = np.asarray(first.any(axis=0))
     if tile.material is not None:
         divided &= np.isnan(tile.material.noise_variance)
     if result.survey is None or not np.any(divided):
