@@ -11,8 +11,8 @@ from dbthermal.separation._pooling import gradients, ratios
 from dbthermal.separation._pooling.ratios import Common, Image, Ratios, total
 from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
-MOST: Final = 1024
-"""Pixels of one material that are surveyed: of 2048, or all 5120, objects are nearer by 0.4 %."""
+MOST: Final = 2048
+"""Pixels of one material that are surveyed: more would not lower its systematic error."""
 
 Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 """Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
