@@ -213,7 +213,7 @@ def separated(
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
     """
-    Separate checked inputs; and the surveys of each pixel alone, of a method that pools.
+    Separate checked inputs; and the surveys of each pixel alone, of cameras at one place.
 
     To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
     What is told of the materials may `regroup` them.
@@ -221,8 +221,7 @@ def separated(
     variables, capture = schema.STAGES["separated"], inputs.capture
     apart, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and apart and pooled:
-        single = replace(inputs, labels=None)
-        alone, surveys = separated(single, workers=workers, progress=progress)
+        alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     if inputs.method.pools:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
@@ -247,7 +246,7 @@ def separated(
         if alone is not None and apart:
             side_by_side.pooled(inputs, alone, result, each, threads, materials, regroup)
         elif apart:
-            surveys = side_by_side.alone(inputs, result, each, threads)
+            side_by_side.alone(inputs, result, each, threads)
         elif pooled:
             each(*side_by_side.regrouped(inputs, materials, regroup))
         else:

@@ -16,10 +16,10 @@ import xarray as xr
 
 from dbthermal.separation._apart import joint, neighbours, planes
 from dbthermal.separation._inputs import Inputs, Labels
-from dbthermal.separation._tiles import Material, Survey
+from dbthermal.separation._tiles import Material
 
-Each: TypeAlias = Callable[[Inputs, Material | None], Survey]
-"""Separates each pixel alone, into the result and its survey."""
+Each: TypeAlias = Callable[[Inputs, Material | None], object]
+"""Separates each pixel alone, into the result."""
 Regroup: TypeAlias = Callable[[Material | None], Labels]
 """Labels (pixel) of materials, of what is told of those before."""
 
@@ -27,32 +27,31 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 _TURNS: Final = 2
 
 
-def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> Survey:
+def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
     """Separate without materials, then by the ratios of bands that are blurred alike."""
     assert inputs.displacement is not None
-    survey = each(inputs, None)
+    each(inputs, None)
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
     if inputs.method.pools and inputs.displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
-            survey = each(inputs, None)
+            each(inputs, None)
         shares = neighbours.emissivities(inputs, result)
         maps = planes.project(inputs, result, shares, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
         if not frames.smooth:
-            survey = each(inputs, material)
+            each(inputs, material)
     objects = joint.solve(
         inputs, result, threads, frames, maps=maps, material=material, before=objects, blur=blur
     )
     if objects is not None:
         inputs = replace(inputs, difference=objects.difference)
     if objects is not None or material is not None:
-        survey = each(inputs, material)
+        each(inputs, material)
     if objects is not None:
         objects.finish(result)
-    return survey
 
 
 def pooled(

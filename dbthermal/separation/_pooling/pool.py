@@ -32,7 +32,7 @@ def materials(
 
     Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
     alone are a selection by their ratios: unless they are nearly all of their material, all of it
-    are surveyed again, with its ratios. Those `known` stay.
+    are surveyed again, with its ratios. Those `known` stay, and pixels are surveyed with them.
     """
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
@@ -52,7 +52,7 @@ def materials(
         for part in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
     )
     again = (told <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(found.ratio[-1, places])
-    if not np.any(again):
+    if known is not None or not np.any(again):
         return found
     selected[places] = again
     # The emissivity is a guess, of constant objects alone.
