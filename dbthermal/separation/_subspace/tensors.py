@@ -98,44 +98,29 @@ def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> 
     model = pixel.Model(*map(tensor, fused.share(tile, functions, drift)))
     material = {} if tile.material is None else dict(vars(tile.material.each(tensor)))
     signals = tensor(tile.signals)
-    result, bend, line = _steps(model, material, signals, signals)
-    whole, removed, places = (
-        bend,
-        torch.zeros_like(bend),
-        torch.arange(bend.shape[2], device=device),
-    )
-    known = material
+    result, straight, bent, line = _steps(model, material, signals, signals)
+    places = torch.arange(signals.shape[2], device=device)
     for _ in range(pixel.BENDS):
-        energy = (bend - removed).var(dim=1, correction=0) * signals.shape[1]
-        bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
         if not bent.any():
             break
         # Again, on signals whose reflections are proportional.
-        removed, places = bend[..., bent], places[bent]
+        places, signals, straight = places[bent], signals[..., bent], straight[..., bent]
         line = Line(*(values[..., bent] for values in line))
-        known = {name: values[..., bent] for name, values in known.items()}
-        straight = _straight(signals[..., places], removed)
-        again, bend, line = _steps(model, known, signals[..., places], straight, line)
-        whole[..., places] = bend
+        material = {name: values[..., bent] for name, values in material.items()}
+        again, straight, bent, line = _steps(model, material, signals, straight, line)
         # The bend of a gray body is not known: it is told from the signals as they are.
         for name in again.keys() - {"gray"}:
             result[name][..., places] = again[name]
-    # Together pixels see a bend that is too small to be seen in each.
-    scatter = _less_noise(model, _scatter(model, _straight(signals, whole))[1], result["order"])
-    alone = material["noise_variance"].isnan() if material else torch.ones_like(result["pooled"])
-    result["scatter"] = scatter.where(alone, result["scatter"])
     return Solution(**{name: values.cpu().numpy() for name, values in result.items()})
-
-
-def _straight(signals: Tensor, bend: Tensor) -> Tensor:
-    """Signals without the bend of the bands but the first."""
-    return torch.cat([signals[:1], signals[1:] - bend])
 
 
 def _steps(
     model: Model, material: Known, signals: Tensor, straight: Tensor, start: Line | None = None
-) -> tuple[dict[str, Tensor], Tensor, Line]:
-    """Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend."""
+) -> tuple[dict[str, Tensor], Tensor, Tensor, Line]:
+    """Steps 1 to 4, the first three on signals whose reflections are proportional.
+
+    And the signals less the bend, and the pixels in which that has changed.
+    """
     ratios = _ratios(model, material, straight)
     fit = _alternate(model, material, ratios, straight[0], start)
     emission = _emission(model, material, ratios, fit, straight[0])
@@ -152,7 +137,12 @@ def _steps(
     rapid = straight[0] - model.functions.T @ ratios.coefficients[0]
     curve = model.object_part.T @ ratios.smoothed
     common = ratios.null_weights[0] * model.noise[0] ** 2
-    free = signals.shape[1] - model.steps - _orders(model, ratios.order)
+    further = torch.cat([signals[:1], signals[1:] - _bend(model, emission.emissivity, background)])
+    energy = (further - straight)[1:].var(dim=1, correction=0) * signals.shape[1]
+    bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
+    # Together pixels show a bend that is too small to be seen in each.
+    known = material["noise_variance"].isfinite() if material else torch.zeros_like(bent)
+    scatter, free = _less_noise(model, _scatter(model, further)[1], ratios.order)
     parts = {**ratios._asdict(), **fit._asdict(), **emission._asdict()}
     result = {
         **{name: part for name, part in parts.items() if name in Solution.__dataclass_fields__},
@@ -161,6 +151,7 @@ def _steps(
         "lost": lost.sum(dim=1),
         "beyond": beyond.any(dim=1),
         "ratio_variance": ratios.ratio_variance + emission.level**2,
+        "scatter": ratios.scatter.where(bent | known, scatter),
         "freedom": free,
         "gray": _may_be_gray(model, ratios),
         "correlation": _autocorrelation(residual),
@@ -168,7 +159,7 @@ def _steps(
         "unexplained": _unexplained(model, residual, rapid, ratios.null_variance, common),
         "sums": torch.stack([_block_sums(part, model.parts) for part in (residual, curve)]),
     }
-    return result, _bend(model, emission.emissivity, background), fit.line
+    return result, further, bent, fit.line
 
 
 def _blackbody(
@@ -268,7 +259,7 @@ def _ratios(model: Model, material: Known, signals: Tensor) -> Ratio:
         coefficients=held * columns,
         smoothed=einsum("bp,bcp->cp", weights, held) * columns,
         columns=columns,
-        scatter=_less_noise(model, scatter, order + 1),
+        scatter=_less_noise(model, scatter, order + 1)[0],
         pooled=pooled,
     )
 
@@ -281,18 +272,14 @@ def _scatter(model: Model, signals: Tensor) -> tuple[Tensor, Tensor]:
     return held, total - einsum("bfp,cfp->fpbc", white, white).cumsum(0)[model.steps :]
 
 
-def _orders(model: Model, order: Tensor) -> Tensor:
-    """Orders (3, pixel) of a survey: each pixel's, and `rapid_orders`."""
-    rapid = reflection_ratio.rapid_orders(len(model.functions) - model.steps)
-    return torch.stack([order, *(torch.full_like(order, int(one)) for one in rapid)])
-
-
-def _less_noise(model: Model, scatter: Tensor, order: Tensor) -> Tensor:
-    """Scatter less noise (3, band, band, pixel) at the orders of a survey."""
-    orders, unit = _orders(model, order), torch.eye(scatter.shape[-1], device=scatter.device)
+def _less_noise(model: Model, scatter: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
+    """Scatter less noise (3, band, band, pixel) at the orders of a survey, and its freedom."""
+    rapid = reflection_ratio.rapid_orders(len(scatter))
+    orders = torch.stack([order, *(torch.full_like(order, int(one)) for one in rapid)])
     free = model.functions.shape[1] - model.steps - orders
-    chosen = scatter[orders - 1, torch.arange(orders.shape[1], device=scatter.device)]
-    return chosen.movedim(1, -1) - free[:, None, None] * unit[..., None]
+    unit = torch.eye(scatter.shape[-1], device=scatter.device)[..., None]
+    chosen = scatter[orders - 1, torch.arange(len(order), device=scatter.device)]
+    return chosen.movedim(1, -1) - free[:, None, None] * unit, free
 
 
 def _order(across: Tensor, frames: int) -> Tensor:
