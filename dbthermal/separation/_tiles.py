@@ -219,6 +219,12 @@ class Estimate(Pixels):
         }
         return replace(self, emissivity_covariance=covariance, **parts)
 
+    def replace_scatter(self, order: int, selected: Mask, part: "Estimate") -> None:
+        """Replace a scatter of the survey by the first one of a part (pixel), in place."""
+        if self.survey is not None and part.survey is not None:
+            self.survey.scatter[order][..., selected] = part.survey.scatter[0]
+            self.survey.frames[order][selected] = part.survey.frames[0]
+
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
         Flag temperatures outside the calibrated range of a response, and values without a number.
@@ -307,10 +313,8 @@ def _wanted(
             yield window, some, places[some]
 
 
-def _picked(view: xr.Dataset, some: slice | Whole) -> xr.Dataset:
+def _picked(view: xr.Dataset, some: Whole) -> xr.Dataset:
     """Some pixels of a part of a capture, as one row."""
-    if isinstance(some, slice):
-        return view
     places = np.divmod(some[np.newaxis], view.sizes["x"])
     rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
     return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
@@ -344,7 +348,9 @@ def cut(
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
-            view = _picked(loaded.isel(y=local, x=window[1]), some)
+            view = loaded.isel(y=local, x=window[1])
+            if not isinstance(some, slice):
+                view = _picked(view, some)
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
         else:

@@ -16,7 +16,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Ratio, Work
-from dbthermal.separation._tiles import Mask, Pixels, Tile, Whole
+from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
@@ -69,6 +69,22 @@ class Solution(Pixels):
     unexplained: Mask  # the residual is not noise (pixel)
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
+    def survey(self, sound: Mask, plain: Mask) -> Survey:
+        """
+        Survey of the pixels whose model is sound, with emissivities of those without a flag.
+
+        A selection by the estimate itself would bias the sum over a material.
+        """
+        return Survey(
+            scatter=np.where(sound, self.scatter, 0.0),
+            frames=np.where(sound, self.freedom, 0.0),
+            ratio=self.ratio,
+            null_weights=self.null_weights,
+            emissivity=np.where(plain, self.emissivity[0], np.nan),
+            noise_variance=self.noise_variance,
+            drift_variance=self.drift_variance,
+        )
+
 
 @inlined
 def _film(
@@ -99,7 +115,8 @@ RECORD: Final = np.dtype(
         *((name, np.float64) for name in _NUMBERS),
         *((name, np.bool_) for name in ("pooled", "gray", "constant", "restless", "unexplained")),
         *((name, np.float64, 2) for name in ("missing", "lost")),
-        *[("order", np.intp), ("beyond", np.intp, 2)],  # no arrays of truth values in a record
+        # There are no arrays of truth values in a record.
+        *[("order", np.intp), ("freedom", np.intp, 3), ("beyond", np.intp, 2)],
     ]
 )
 """Numbers of a pixel, the fields of a `Solution` without films, sums, and those of the bands."""
@@ -174,7 +191,7 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
 
 
 @inlined
-def _scatters(model: Model, ratios: Ratio, work: Work, matrices: Any) -> None:
+def _scatters(model: Model, ratios: Ratio, work: Work, record: Any, matrices: Any) -> None:
     """Scatter less noise at the pixel's order and at `rapid_orders`, in place.
 
     Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
@@ -191,6 +208,7 @@ def _scatters(model: Model, ratios: Ratio, work: Work, matrices: Any) -> None:
         for m in range(bands):
             kernels.copy(work.scatter[order - 1, m], matrices[place, m])
             matrices[place, m, m] -= frames - model.steps - order
+        record.freedom[place] = frames - model.steps - order
 
 
 @inlined
@@ -250,7 +268,7 @@ def _separate(
             record, matrices = solved.record[here], solved.matrices[here]
             ratios = _pixel(model, work, outside[p], record, solved.vectors[here], matrices[3])
             bars.judge(model, ratios, work, record, solved.sums[..., here])
-            _scatters(model, ratios, work, matrices)
+            _scatters(model, ratios, work, record, matrices)
         _return(outside, together, solved.films)
 
 
@@ -369,21 +387,17 @@ def solve_parts(
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
-    freedom, space = np.empty((3, pixels), np.intp), _work_space(frames, bands, len(shared.rising))
+    space = _work_space(frames, bands, len(shared.rising))
     for places, own in parts:
         model, count = shared._replace(**_columns(own)), own.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((own.orders, bands, bands))
         _separate(model, signals, places, materials, Work(**space), solved)
-        freedom[0, places] = frames - own.steps - record["order"][places]
-        rapid = reflection_ratio.rapid_orders(own.orders)[:, np.newaxis]
-        freedom[1:, places] = frames - own.steps - rapid
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }
     squares = matrices.transpose(1, 2, 3, 0)
     named |= {
-        "freedom": freedom,
         "beyond": named["beyond"] > 0,
         "sums": sums,
         "scatter": squares[:3],

@@ -62,7 +62,7 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import require_device, select
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, check_fields
-from dbthermal.separation._quality import Bits, status_bits
+from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import (
     clock,
     division,
@@ -72,7 +72,7 @@ from dbthermal.separation._subspace import (
     residuals,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
+from dbthermal.separation._tiles import Estimate, Mask, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -204,28 +204,12 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
         status=status,
     )
     result = result.check_range(tile.curves[0], not_estimated=FILMS)
-    return replace(result, survey=_survey(result.status, solution))
-
-
-def _survey(status: Bits, solution: Solution) -> Survey:
-    """
-    Survey of a solution, without the pixels whose model is broken.
-
-    A selection by the estimate itself would bias the sum over a material.
-    """
+    status = result.status
     # The ratio of an object that is taken for the background is that of emissivities.
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
     sound = ((status & _BROKEN) == 0) & ~exchanged
-    return Survey(
-        scatter=np.where(sound, solution.scatter, 0.0),
-        frames=np.where(sound, solution.freedom, 0.0),
-        ratio=solution.ratio,
-        null_weights=solution.null_weights,
-        emissivity=np.where(status == 0, solution.emissivity[0], np.nan),
-        noise_variance=solution.noise_variance,
-        drift_variance=solution.drift_variance,
-    )
+    return replace(result, survey=solution.survey(sound, status == 0))
 
 
 def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
@@ -307,8 +291,15 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         best.replace_pixels(places, again)
         cost[places] = one.cost[places]
         first[:, places] = one.first[:, places]
-    _survey_divided(part, first, best, settings)
-    jumping = first.any(axis=0) & residuals.sudden(
+    divided = np.asarray(first.any(axis=0))
+    surveyed = divided.copy()
+    if part.material is not None:  # one with its emissivity is not asked for a scatter
+        surveyed &= np.isnan(part.material.noise_variance)
+    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
+        some = part.select_pixels(surveyed)
+        more = _report(some, _divided(some, first[:, surveyed], functions, settings, number))
+        best.replace_scatter(place, surveyed, more)
+    jumping = divided & residuals.sudden(
         best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
@@ -318,24 +309,6 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
     status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
-
-
-def _survey_divided(tile: Tile, first: Mask, result: Estimate, settings: SubspaceSettings) -> None:
-    """Scatters with more polynomials in the pieces (time, pixel), in the survey, in place.
-
-    A pixel with the emissivity of its material is not asked for its scatter.
-    """
-    divided = np.asarray(first.any(axis=0))
-    if tile.material is not None:
-        divided &= np.isnan(tile.material.noise_variance)
-    if result.survey is None or not np.any(divided):
-        return
-    part, functions = tile.select_pixels(divided), _functions(tile)
-    for place, number in enumerate(_NUMBERS, 1):
-        more = _report(part, _divided(part, first[:, divided], functions, settings, number)).survey
-        assert more is not None
-        result.survey.scatter[place][..., divided] = more.scatter[0]
-        result.survey.frames[place][divided] = more.frames[0]
 
 
 def _divided(
