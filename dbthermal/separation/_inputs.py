@@ -62,8 +62,8 @@ class Method:
         The method does not solve a pixel that lacks a frame of the others.
     even_times : bool
         The method refuses frames at uneven times, by name.
-    survey : callable, optional
-        `Survey` of the same arguments, for pooling.
+    pools : bool
+        An estimate holds a `Survey`, and a covariance of the emissivities.
     check_clock : callable, optional
         Refuses times that are not of exposure.
     any_bands : bool
@@ -82,7 +82,7 @@ class Method:
     whole_image: bool = False
     every_frame: bool = False
     even_times: bool = False
-    survey: Callable[..., Any] | None = None
+    pools: bool = False
     check_clock: Callable[..., None] | None = None
     any_bands: bool = False
     compiled: bool = False
@@ -178,7 +178,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if emissivity is None and method.knows_emissivity:
         raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
     curves = [responses.curve(response, band, response_kind) for band in bands]
-    if pool is not None and method.survey is None:
+    if pool is not None and not method.pools:
         raise ValueError(f"Invalid pool for method '{name}', which does not pool.")
     capture = corrected[[variable for variable in _READ if variable in corrected]]
     _check_segment(capture)

@@ -122,15 +122,16 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, known.bands[0])
         known = replace(known, displacement=shift)
+    surveys = None
     if alone is None or reflection_shift is not None:
-        alone = separated(known, workers=workers, progress=progress)
+        alone, surveys = separated(known, workers=workers, progress=progress)
     doubts = [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
     if reflection_shift is not None:
         doubts = _unexplained(alone)
     result = alone
-    again = partial(separated, alone=alone, workers=workers, progress=progress)
+    again = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
-        result = again(replace(known, labels=numbered(corrected, materials)))
+        result, _ = again(replace(known, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(again, known, corrected, alone)
     if materials is not None:
@@ -156,7 +157,10 @@ def _checked(alone: xr.Dataset, corrected: xr.Dataset, known: Inputs) -> xr.Data
 
 
 def _over_found_materials(
-    again: Callable[..., xr.Dataset], known: Inputs, corrected: xr.Dataset, alone: xr.Dataset
+    again: Callable[..., tuple[xr.Dataset, object]],
+    known: Inputs,
+    corrected: xr.Dataset,
+    alone: xr.Dataset,
 ) -> tuple[xr.Dataset, xr.DataArray]:
     """Separate over materials that are found in a result of each pixel alone, and these."""
     found = pooling.materials(alone, corrected, known.response, borders=True)
@@ -168,7 +172,7 @@ def _over_found_materials(
         groups.append(pooling.without_borders(wider, alone, known.response))
         return numbered(corrected, groups[-1])
 
-    result = again(replace(known, labels=numbered(corrected, groups[0])), regroup=joined)
+    result, _ = again(replace(known, labels=numbered(corrected, groups[0])), regroup=joined)
     return result, groups[-1]
 
 

@@ -21,7 +21,7 @@ from dbthermal.separation._apart import side_by_side
 from dbthermal.separation._apart.side_by_side import Regroup
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import Estimate, Mask, Material, Whole
+from dbthermal.separation._tiles import Estimate, Mask, Material, Survey, Whole
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance  # settings of a method from outside
@@ -194,19 +194,20 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         reflection_shift=reflection_shift,
         response_kind=response_kind,
     )
-    return separated(inputs, workers=workers, progress=progress)
+    return separated(inputs, workers=workers, progress=progress)[0]
 
 
 def separated(
     inputs: Inputs,
     *,
     alone: xr.Dataset | None = None,
+    surveys: Survey | None = None,
     regroup: Regroup | None = None,
     workers: int = 2,
     progress: bool = False,
-) -> xr.Dataset:
+) -> tuple[xr.Dataset, Survey | None]:
     """
-    Separate checked inputs.
+    Separate checked inputs; and the surveys of each pixel alone, of cameras at one place.
 
     To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
     What is told of the materials may `regroup` them.
@@ -214,28 +215,37 @@ def separated(
     variables, capture = schema.STAGES["separated"], inputs.capture
     apart, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and apart and pooled:
-        alone = separated(replace(inputs, labels=None), workers=workers, progress=progress)
-    if inputs.method.survey:
+        alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
+    if inputs.method.pools:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
-    # Cameras apart, and materials that are regrouped, take passes that are not known beforehand.
-    total = None if apart or regroup else result["status"].size * (1 + pooled)
+    # Cameras apart, and materials, take passes that are not known beforehand.
+    total = None if apart or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
-        each = partial(_separate_all, result, threads, bar)
+
+        def each(inputs: Inputs, material: Material | None, wanted: Mask | None = None) -> Survey:
+            """Separate all pixels into the result; or only survey those that are wanted."""
+            survey = Survey.empty(len(inputs.bands), result["status"].size)
+            into = result if wanted is None else None
+            separate = partial(_separate, inputs, material, into, survey, wanted)
+            for pixels in threads.map(separate, inputs.blocks):
+                bar.update(pixels)
+            return survey
+
+        materials = partial(pooling.materials, survey=each, surveys=surveys)
         if alone is not None and apart:
-            side_by_side.pooled(inputs, alone, result, each, threads, bar, regroup)
+            side_by_side.pooled(inputs, alone, result, each, threads, materials, regroup)
         elif apart:
             side_by_side.alone(inputs, result, each, threads)
         elif pooled:
-            survey = partial(pooling.materials, threads=threads, bar=bar)
-            each(*side_by_side.regrouped(inputs, survey, regroup))
+            each(*side_by_side.regrouped(inputs, materials, regroup))
         else:
-            each(inputs, None)
-    if inputs.method.survey:
+            surveys = each(inputs, None)
+    if inputs.method.pools:
         _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
@@ -244,8 +254,8 @@ def separated(
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
-    ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
-    return result.assign_attrs(
+    ratios = () if inputs.method.pools else ("reflection_ratio", "reflection_ratio_std")
+    result = result.assign_attrs(
         method=inputs.name,
         pooled=int(pooled),
         response_kind=inputs.response_kind,
@@ -257,6 +267,7 @@ def separated(
         reference_band=str(capture["band"].values[inputs.bands[0]]),
         **({} if inputs.settings is None else {"settings": repr(inputs.settings)}),
     )
+    return result, surveys
 
 
 def _withhold(result: xr.Dataset) -> None:
@@ -316,31 +327,34 @@ def get_method(name: str | Method) -> Method:
     return replace(method, name=name)
 
 
-def _separate_all(
-    result: xr.Dataset,
-    threads: ThreadPoolExecutor,
-    bar: "tqdm[Any]",
+def _separate(
     inputs: Inputs,
     material: Material | None,
-) -> None:
-    """Separate all blocks of rows into the result."""
-    list(threads.map(partial(_separate, inputs, material, result, bar), inputs.blocks))
-
-
-def _separate(
-    inputs: Inputs, material: Material | None, result: xr.Dataset, bar: "tqdm[Any]", rows: slice
-) -> None:
-    """Separate a block of rows into its place in the result."""
-    for cut in tiles.cut(inputs, rows, material):
+    result: xr.Dataset | None,
+    survey: Survey,
+    wanted: Mask | None,
+    rows: slice,
+) -> int:
+    """Separate a block of rows, or what is wanted of it, into its place; return its pixels."""
+    size = 0
+    for cut in tiles.cut(inputs, rows, material, wanted):
         estimates = []
         for frames, pixels, tile in cut.parts:
             estimate: Estimate = inputs.apply(inputs.method.separate, tile)
             if estimate.status.size == pixels.size and not pixels.all():
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
-        _write(result, inputs.bands, cut, estimates)
+            if estimate.survey is not None:
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(tile.noise) / inputs.noise[inputs.bands]
+                scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
+                part = replace(estimate.survey, scatter=scatter)
+                survey.replace_pixels(cut.places[pixels], part)
+        if result is not None:
+            _write(result, inputs.bands, cut, estimates)
         release()
-        bar.update(cut.status.size)
+        size += cut.status.size
+    return size
 
 
 def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:

@@ -62,7 +62,7 @@ WITHOUT_BACKGROUND: Final = (*WITHOUT_STD, "background_temperature")
 
 @dataclass(frozen=True)
 class Pixels:
-    """A record of arrays, optional ones among them, whose last axis is the pixel."""
+    """A record of arrays and records, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
@@ -70,16 +70,20 @@ class Pixels:
 
     def each(self, function: Callable[[Any], Any]) -> Self:
         """Return the record with a function of each of its arrays."""
-        values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        parts: dict[str, Any] = {name: v if v is None else function(v) for name, v in values}
+        parts: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            within = value.each(function) if isinstance(value, Pixels) else value
+            parts[name] = function(value) if isinstance(value, np.ndarray) else within
         return replace(self, **parts)
 
     def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
         """Replace the selected pixels by those of a part, in order, in place."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None:
-                value[..., selected] = getattr(part, field.name)
+            value, values = getattr(self, field.name), getattr(part, field.name)
+            if isinstance(value, Pixels):
+                value.replace_pixels(selected, values)
+            elif value is not None:
+                value[..., selected] = values
 
     def join(self, others: Sequence[Self]) -> Self:
         """Return the record with the pixels of others after its own."""
@@ -106,15 +110,28 @@ class Material(Pixels):
 class Survey(Pixels):
     """Contribution of each pixel to the estimate for its material."""
 
-    scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
-    frames: Array  # its degrees of freedom (pixel)
-    rapid_scatter: Array  # the same at the two largest orders looked at (2, band, band, pixel) [1]
-    rapid_frames: Array  # their degrees of freedom (2, pixel)
+    scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at the
+    # two largest ones looked at (3, band, band, pixel) [1]
+    frames: Array  # their degrees of freedom, 0 of a pixel that tells nothing (3, pixel)
     ratio: Array  # reflection ratios of the pixel alone (band, pixel) [1]
     null_weights: Array  # see `ReflectionRatio` (band, pixel) [1]
     emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined
     noise_variance: Array  # its variance from the noise, independent of other pixels' (pixel) [1]
     drift_variance: Array  # its variance from the background, common to all pixels (pixel) [1]
+
+    @classmethod
+    def empty(cls, bands: int, pixels: int) -> Self:
+        """Survey of pixels that tell nothing."""
+        none = np.full((bands, pixels), np.nan)
+        return cls(
+            scatter=np.zeros((3, bands, bands, pixels)),
+            frames=np.zeros((3, pixels)),
+            ratio=none,
+            null_weights=none.copy(),
+            emissivity=none[0].copy(),
+            noise_variance=none[0].copy(),
+            drift_variance=none[0].copy(),
+        )
 
 
 @dataclass(frozen=True)
@@ -188,6 +205,7 @@ class Estimate(Pixels):
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    survey: Survey | None = None  # for the material, of a method that pools
 
     @classmethod
     def without_std(
@@ -223,15 +241,18 @@ class Estimate(Pixels):
         covariance = self.emissivity_covariance
         if covariance is not None:
             covariance = np.where(no_emissivity, np.nan, covariance)
-        return replace(
-            self,
-            emissivity_covariance=covariance,
-            **{
-                name + ending: np.where(where, np.nan, getattr(self, name + ending))
-                for name, where in undefined.items()
-                for ending in ("", "_std")
-            },
-        )
+        parts: dict[str, Any] = {
+            name + ending: np.where(where, np.nan, getattr(self, name + ending))
+            for name, where in undefined.items()
+            for ending in ("", "_std")
+        }
+        return replace(self, emissivity_covariance=covariance, **parts)
+
+    def replace_scatter(self, order: int, selected: Mask, part: "Estimate") -> None:
+        """Replace a scatter of the survey by the first one of a part (pixel), in place."""
+        if self.survey is not None and part.survey is not None:
+            self.survey.scatter[order][..., selected] = part.survey.scatter[0]
+            self.survey.frames[order][selected] = part.survey.frames[0]
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
@@ -241,11 +262,13 @@ class Estimate(Pixels):
         that the method has `not_estimated` may be NaN without a flag. A quantity that is NaN in all
         samples of a pixel with another status bit needs no further bit.
         """
-        values: dict[str, Array] = {}
+        values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name in ("status", *not_estimated) or name.endswith(("_std", "_covariance")):
+            if name in ("status", "survey", *not_estimated) or name.endswith(
+                ("_std", "_covariance")
+            ):
                 continue
             if getattr(self, name) is None:
                 continue
@@ -308,6 +331,24 @@ def numbers(window: Window, width: int) -> Whole:
     return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
+def _wanted(
+    every: Iterator[Window], width: int, wanted: Mask | None
+) -> Iterator[tuple[Window, slice | Whole, Whole]]:
+    """Yield windows, which of their pixels are wanted, of the image (pixel), and their numbers."""
+    for window in every:
+        places = numbers(window, width)
+        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        if places[some].size:
+            yield window, some, places[some]
+
+
+def _picked(view: xr.Dataset, some: Whole) -> xr.Dataset:
+    """Some pixels of a part of a capture, as one row."""
+    places = np.divmod(some[np.newaxis], view.sizes["x"])
+    rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
+    return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
+
+
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
@@ -331,20 +372,16 @@ def cut(
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
-    for window in windows(rows, width, size):
-        places = numbers(window, width)
-        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        places = places[some]
+    for window, some, places in _wanted(windows(rows, width, size), width, wanted):
         gain = np.ones((2, places.size))
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
             view = loaded.isel(y=local, x=window[1])
+            if not isinstance(some, slice):
+                view = _picked(view, some)
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
-            if wanted is not None:
-                samples = (counts, usable, valid, status)
-                counts, usable, valid, status = (select(one, some) for one in samples)
         else:
             counts, usable, valid, status, gain = displaced.paired(
                 load, displacement, window[0], source, some, method.minimum_frames

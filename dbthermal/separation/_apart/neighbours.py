@@ -8,9 +8,9 @@ cent, which a pixel's own residual does not show. So the ratios are those of ban
 alike, in which the edges count little; and as certain as neighbours agree on them.
 """
 
-from concurrent.futures import Executor
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -93,8 +93,7 @@ def materials(
     inputs: Inputs,
     scatters: dict[float, Scatters],
     alone: xr.Dataset,
-    threads: Executor,
-    bar: Any,
+    materials: Callable[..., Material | None],
 ) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
@@ -121,7 +120,7 @@ def materials(
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
     variance, none = material.inverse_energy + material.spread, np.zeros_like(material.spread)
     material = replace(material, inverse_energy=variance, spread=none)
-    return pool.materials(inputs, threads, bar, known=material)
+    return materials(inputs, known=material)
 
 
 def _survey(
@@ -135,10 +134,8 @@ def _survey(
     scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
     frames = np.where(sound, scatters.freedom[places], 0.0)
     return Survey(
-        scatter=scatter,
-        frames=frames,
-        rapid_scatter=np.stack([scatter, scatter]),
-        rapid_frames=np.stack([frames, frames]),
+        scatter=np.stack([scatter] * 3),
+        frames=np.stack([frames] * 3),
         ratio=scatters.ratio[:, places],
         null_weights=np.zeros((len(noise), places.size)),
         emissivity=value,

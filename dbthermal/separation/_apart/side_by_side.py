@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -36,7 +36,7 @@ def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> 
     each(inputs, None)
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
-    if inputs.method.survey is not None and displacement.moves:
+    if inputs.method.pools and displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
@@ -64,7 +64,7 @@ def pooled(
     result: xr.Dataset,
     each: Each,
     threads: Executor,
-    bar: Any,
+    materials: Callable[..., Material | None],
     regroup: Regroup | None = None,
 ) -> None:
     """Separate with materials, from a result of each pixel alone before.
@@ -82,9 +82,7 @@ def pooled(
         plain = replace(inputs, difference=None) if frames.smooth else inputs
         maps = planes.project(plain, before, shares, threads)
         scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
-        survey = partial(
-            neighbours.materials, scatters=scatters, alone=before, threads=threads, bar=bar
-        )
+        survey = partial(neighbours.materials, scatters=scatters, alone=before, materials=materials)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
@@ -105,12 +103,12 @@ def pooled(
 
 
 def regrouped(
-    inputs: Inputs, survey: Callable[[Inputs], Material | None], regroup: Regroup | None
+    inputs: Inputs, materials: Callable[[Inputs], Material | None], regroup: Regroup | None
 ) -> tuple[Inputs, Material | None]:
-    """Inputs and a survey of their materials; of other ones, if that regroups them."""
-    material = survey(inputs)
+    """Inputs, and what is told of their materials; of others, if that regroups them."""
+    material = materials(inputs)
     labels = None if regroup is None else regroup(material)
     if labels is None or np.all(labels == inputs.labels):
         return inputs, material
     inputs = replace(inputs, labels=labels)
-    return inputs, survey(inputs)
+    return inputs, materials(inputs)

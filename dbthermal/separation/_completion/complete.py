@@ -29,7 +29,7 @@ _BITS: Final = {
     scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
 }
 _SPREAD: Final = (1e-3, 1e3)  # deviation of surroundings that are stated [K]
-_METHOD: Final = Method(posterior.moments, any_bands=True, survey=posterior.moments)
+_METHOD: Final = Method(posterior.moments, any_bands=True, pools=True)
 
 
 def complete(  # noqa: PLR0913 - all that is known beside the capture, by name

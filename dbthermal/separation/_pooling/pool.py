@@ -1,14 +1,11 @@
 """Reflection ratios and emissivity of each material, from the surveys of its pixels."""
 
-from concurrent.futures import Executor
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Any, Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from dbthermal._arrays import release
-from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._pooling import gradients, ratios
 from dbthermal.separation._pooling.ratios import Common, Image, Ratios, total
@@ -17,7 +14,10 @@ from dbthermal.separation._tiles import Array, Mask, Material, Survey
 MOST: Final = 2048
 """Pixels of one material that are surveyed: more would not lower its systematic error."""
 
-# Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
+Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
+"""Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
+
+# Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
 # Rounds of leaving out pixels that are not of the material.
 _ROUNDS: Final = 6
@@ -26,65 +26,39 @@ _MAJORITY: Final = 0.5
 
 
 def materials(
-    inputs: Inputs,
-    threads: Executor,
-    bar: Any,
-    *,
-    surveyed: Labels | None = None,
-    known: Material | None = None,
+    inputs: Inputs, survey: Surveyor, surveys: Survey | None, known: Material | None = None
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
-    Pixels that have an emissivity alone are a selection by their ratios: unless they are nearly
-    all, all are surveyed again with the ratios of their material. If not all are `surveyed`, the
-    labels (pixel) of those that are, -1 for others: once, for their ratios. Those `known` stay.
+    Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
+    alone are a selection by their ratios: unless they are nearly all of their material, all of it
+    are surveyed again, with its ratios. Those `known` stay, and pixels are surveyed with them.
     """
-    whole = inputs.labels
-    if whole is None:
+    labels, noise = inputs.labels, inputs.noise[inputs.bands]
+    assert labels is not None
+    selected, unknown = select(labels), np.full(labels.size, np.nan)
+    places = np.flatnonzero(selected)
+    if surveys is None:
+        before = None if known is None else replace(known, noise_variance=unknown)
+        surveys = survey(inputs, before, selected)
+    alone = surveys.select_pixels(places)
+    if not np.any(alone.frames[0] > 0):
         return None
-    labels = whole if surveyed is None else surveyed
-    selected, blocks = select(labels), inputs.blocks
-
-    def pooled(before: Material | None) -> tuple[Material | None, float]:
-        """Materials, and the share of their pixels that have an emissivity."""
-        survey = partial(_survey, inputs, selected, bar, before)
-        surveys = [part for block in threads.map(survey, blocks) for part in block]
-        if not surveys:
-            return None, 0.0
-        places = np.concatenate([place for place, _ in surveys])
-        together = surveys[0][1].join([part for _, part in surveys[1:]])
-        image = Image(whole, places, inputs.capture.sizes["x"])
-        found = estimate(image, labels[places], together, inputs.noise[inputs.bands], known)
-        told = np.isfinite(together.emissivity).sum() / max((together.frames > 0).sum(), 1)
-        return found, told
-
-    unknown = np.full(whole.size, np.nan)  # the emissivity is a guess, of constant objects alone
-    if known is not None:
-        return pooled(replace(known, noise_variance=unknown))[0]
-    material, told = pooled(None)
-    if material is None or surveyed is not None or told > _MOST_TOLD:
-        return material
-    return pooled(replace(material, noise_variance=unknown))[0]
-
-
-def _survey(
-    inputs: Inputs, selected: Mask, bar: Any, material: Material | None, rows: slice
-) -> list[tuple[Labels, Survey]]:
-    """Survey the selected pixels of a block of rows; with their numbers in the image."""
-    surveys = []
-    for cut in tiles.cut(inputs, rows, material, selected):
-        for _, pixels, tile in cut.parts:
-            survey: Survey = inputs.apply(inputs.method.survey, tile)
-            # Whitened by one noise for all, not by that of the tile.
-            scale = np.array(tile.noise) / inputs.noise[inputs.bands]
-            square = np.multiply.outer(scale, scale)[..., np.newaxis]
-            scatters = survey.scatter * square, survey.rapid_scatter * square
-            survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
-            surveys.append((cut.places[pixels], survey))
-        release()
-    if material is None:
-        bar.update((rows.stop - rows.start) * inputs.capture.sizes["x"])
-    return surveys
+    image = Image(labels, places, inputs.capture.sizes["x"])
+    found = estimate(image, labels[places], alone, noise, known)
+    count = int(labels.max()) + 1
+    sound, told = (
+        total(labels[places], 1.0 * part, count)
+        for part in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
+    )
+    again = (told <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(found.ratio[-1, places])
+    if known is not None or not np.any(again):
+        return found
+    selected[places] = again
+    # The emissivity is a guess, of constant objects alone.
+    more = survey(inputs, replace(found, noise_variance=unknown), selected).select_pixels(selected)
+    alone.replace_pixels(again, more)
+    return estimate(image, labels[places], alone, noise, known)
 
 
 def select(labels: Labels) -> Mask:
@@ -133,7 +107,7 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     found = ratios.estimate(sound, count, survey, noise, even=True)
     outliers = ratios.outliers(labels, found, found.common(labels), survey, noise)
     # Near black the few that have an emissivity alone are selected by their own ratio.
-    surveyed = np.where(survey.frames > 0, 1.0, 0.0)
+    surveyed = np.where(survey.frames[0] > 0, 1.0, 0.0)
     most = total(labels, told, count) > _MAJORITY * total(labels, surveyed, count)
     of_most = np.append(most, False)[labels]
     used = np.where(outliers & of_most, -1, labels)
@@ -180,9 +154,10 @@ def _common(
 def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> Material:
     """Emissivity of the first band, its variance from noise, and that from drift [1], to ratios."""
     count = int(image.labels.max()) + 1
-    # e_1 at the common ratios: e_1 - e_1 (1 - e_1) w . kappa
+    # With p = w . kappa of the common ratios, before a background at rest the null combination has
+    # a slope of 1 - (1 - e_1) p with the object's signal, and the regression one of e_1 over that.
     product = (survey.null_weights * common.ratio[:, image.surveyed]).sum(axis=0)
-    value = survey.emissivity * (1.0 - (1.0 - survey.emissivity) * product)
+    value = survey.emissivity * (1.0 - product) / (1.0 - survey.emissivity * product)
     known = (labels >= 0) & np.isfinite(value)
     where = np.where(known, labels, -1)
     value, noise, drift = (

@@ -90,8 +90,7 @@ def estimate(
     Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
     weights few pixels of much energy do not turn the axis: they are to be found as outliers.
     """
-    used, frames = survey.scatter, survey.frames
-    parts = [(used, frames), *zip(survey.rapid_scatter, survey.rapid_frames, strict=True)]
+    parts = [*zip(survey.scatter, survey.frames, strict=True)]
     if even:
         parts = [_even(labels, count, *part) for part in parts]
     own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
@@ -162,9 +161,9 @@ def outliers(
     axis = common.ratio / noise[:, np.newaxis]
     axis = axis / np.sqrt((axis**2).sum(axis=0))
     result = np.zeros(labels.shape, dtype=bool)
-    for large, large_frames in zip(survey.rapid_scatter, survey.rapid_frames, strict=True):
-        scatter = np.where(rapid, large, survey.scatter)
-        frames = np.where(rapid, large_frames, survey.frames)
+    for order in range(1, len(survey.frames)):
+        scatter = np.where(rapid, survey.scatter[order], survey.scatter[0])
+        frames = np.where(rapid, survey.frames[order], survey.frames[0])
         whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
         own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
         inverse = _inverse_energy(scatter, own, noise, frames)
@@ -176,15 +175,13 @@ def outliers(
         apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
         result |= apart & ~reflection_ratio.agrees(whole, axis)
     known = np.isfinite(material.variance[labels])
-    return np.asarray(result & known & (survey.frames > 0) & (labels >= 0))
+    return np.asarray(result & known & (survey.frames[0] > 0) & (labels >= 0))
 
 
 def scaled(survey: Survey, change: Array) -> Survey:
     """Survey with the rapid changes of each pixel times a factor (band, pixel), where known."""
     factor = np.where(np.isfinite(change), change, 1.0)
-    factor = factor[:, np.newaxis] * factor
-    scatter, rapid = survey.scatter * factor, survey.rapid_scatter * factor
-    return replace(survey, scatter=scatter, rapid_scatter=rapid)
+    return replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
 
 
 def graded(
@@ -203,7 +200,7 @@ def graded(
     """
     ratio, variance = image.expand(found.ratio), image.expand(found.variance)
     spread, uneven = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
-    scatter, frames = survey.rapid_scatter[1], survey.rapid_frames[1]
+    scatter, frames = survey.scatter[-1], survey.frames[-1]
     fits, at = [], []
     for label in map(int, np.flatnonzero(np.isfinite(found.variance))):
         pixels = np.flatnonzero((labels == label) & (frames > 0))

@@ -16,7 +16,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Ratio, Work
-from dbthermal.separation._tiles import Mask, Pixels, Tile, Whole
+from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
@@ -50,12 +50,12 @@ class Solution(Pixels):
     null_weights: Array  # w of eq. 5: no background, all of the object (band, pixel) [1]
     null_variance: Array
     order: Whole
-    freedom: Whole  # frames less the functions used (pixel)
+    freedom: Whole  # frames less the functions of each scatter (3, pixel)
     contrast: Array
     reduced_chi2: Array
     pooled: Mask
-    scatter: Array  # noise-whitened, of rapid changes, less noise (band, band, pixel) [1]
-    rapid_scatter: Array  # the same at the `rapid_orders` (2, band, band, pixel) [1]
+    scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at the
+    # `rapid_orders` (3, band, band, pixel) [1]
     emissivity: Array  # (band, pixel) [1]
     emissivity_covariance: Array  # (band, band, pixel) [1]
     epsilon_variance: Array  # of the error of the null combination's ratios (pixel) [1]
@@ -68,6 +68,22 @@ class Solution(Pixels):
     delay: Array  # of the bands (pixel)
     unexplained: Mask  # the residual is not noise (pixel)
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
+
+    def survey(self, sound: Mask, plain: Mask) -> Survey:
+        """
+        Survey of the pixels whose model is sound, with emissivities of those without a flag.
+
+        A selection by the estimate itself would bias the sum over a material.
+        """
+        return Survey(
+            scatter=np.where(sound, self.scatter, 0.0),
+            frames=np.where(sound, self.freedom, 0.0),
+            ratio=self.ratio,
+            null_weights=self.null_weights,
+            emissivity=np.where(plain, self.emissivity[0], np.nan),
+            noise_variance=self.noise_variance,
+            drift_variance=self.drift_variance,
+        )
 
 
 @inlined
@@ -99,7 +115,8 @@ RECORD: Final = np.dtype(
         *((name, np.float64) for name in _NUMBERS),
         *((name, np.bool_) for name in ("pooled", "gray", "constant", "restless", "unexplained")),
         *((name, np.float64, 2) for name in ("missing", "lost")),
-        *[("order", np.intp), ("beyond", np.intp, 2)],  # no arrays of truth values in a record
+        # There are no arrays of truth values in a record.
+        *[("order", np.intp), ("freedom", np.intp, 3), ("beyond", np.intp, 2)],
     ]
 )
 """Numbers of a pixel, the fields of a `Solution` without films, sums, and those of the bands."""
@@ -112,31 +129,32 @@ class Solved(NamedTuple):
     films: npt.NDArray[np.float32]  # object, deviation, background, deviation (4, time, pixel) [K]
     record: Any  # `RECORD` (pixel)
     vectors: Array  # `_VECTORS` (pixel, 4, band)
-    matrices: Array  # scatter, two rapid scatters, covariance (pixel, 4, band, band)
+    matrices: Array  # three scatters, covariance (pixel, 4, band, band)
     sums: Array  # (2, block, pixel) [K]
 
 
 @inlined
-def _energy(bend: Array, removed: Array) -> float:
-    """Energy about the mean of what a bend has changed."""
-    total, square = 0.0, 0.0
-    for t in range(bend.size):
-        change = bend[t] - removed[t]
-        total += change
-        square += change**2
-    return square - total**2 / bend.size
+def _bent(model: Model, work: Work, frames: int) -> bool:
+    """Say whether the bend has changed by more energy about its mean than `pixel.BEND`."""
+    bent = False
+    for m in range(1, model.noise.size):
+        total, square = 0.0, 0.0
+        for t in range(frames):
+            change = work.bend[m, t] - work.removed[m, t]
+            total += change
+            square += change**2
+        bent |= square - total**2 / frames > (pixel.BEND * model.noise[m]) ** 2
+    return bent
 
 
 @inlined
-def _pixel(
-    model: Model, least: float, work: Work, films: Any, record: Any, vectors: Any, matrices: Any
-) -> Any:
+def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, covariance: Any) -> Any:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
     frames, bands = work.first.size, model.noise.size
     for m in range(bands):
         kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
         kernels.fill(work.removed[m, :frames], 0.0)
-    gray, again, bent = False, 0, True
+    gray, again = False, 0
     while True:
         ratios = pixel.ratios(model, work)
         line = pixel.emission(model, ratios, work, again)
@@ -144,21 +162,12 @@ def _pixel(
         # The bend of a gray body is not known: it is told from the signals as they are.
         if again == 0:
             gray = pixel.may_be_gray(model, ratios, work)
-        bent = False
-        for m in range(1, bands):
-            energy = _energy(work.bend[m, :frames], work.removed[m, :frames])
-            bent |= energy > (least * model.noise[m]) ** 2
-        if again == pixel.BENDS or not bent:
+        if again == pixel.BENDS or not _bent(model, work, frames):
             break
-        least, again = pixel.BEND, again + 1
-        for m in range(1, bands):
-            bend, straight = work.bend[m, :frames], work.straight[m, :frames]
-            signal, removed = work.signals[m, :frames], work.removed[m, :frames]
-            for t in range(frames):
-                removed[t] = bend[t]
-                straight[t] = signal[t] - bend[t]
-    deviations = bars.bars(model, ratios, line, work, matrices[3])
-    _write(model, ratios, work, record, vectors, matrices)
+        again += 1
+        _straighten(work, bands, frames)
+    deviations = bars.bars(model, ratios, line, work, covariance)
+    _write(model, ratios, work, record, vectors)
     object_ = _film(work.temperature, work.variance, model, films[0], films[1])
     background = _film(work.background, work.background_variance, model, films[2], films[3])
     for i, judged in enumerate((object_, background)):
@@ -171,24 +180,46 @@ def _pixel(
 
 
 @inlined
-def _write(
-    model: Model, ratios: Ratio, work: Work, record: Any, vectors: Any, matrices: Any
-) -> None:
-    """Ratios, emissivities, and scatter less noise, at the pixel's order and at `rapid_orders`."""
-    noise, orders = model.noise, len(work.scatter)
-    rows = model.functions.shape[1] - model.steps
+def _straighten(work: Work, bands: int, frames: int) -> None:
+    """Take the bend out of the signals, in place."""
+    for m in range(1, bands):
+        bend, straight = work.bend[m, :frames], work.straight[m, :frames]
+        signal, removed = work.signals[m, :frames], work.removed[m, :frames]
+        for t in range(frames):
+            removed[t] = bend[t]
+            straight[t] = signal[t] - bend[t]
+
+
+@inlined
+def _scatters(model: Model, ratios: Ratio, work: Work, record: Any, matrices: Any) -> None:
+    """Scatter less noise at the pixel's order and at `rapid_orders`, in place.
+
+    Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
+    emissivity of its material is not asked for its scatter.
+    """
+    bands, frames, orders = model.noise.size, work.first.size, len(work.scatter)
+    if np.isnan(work.material[2]) and not _bent(model, work, frames):
+        _straighten(work, bands, frames)
+        pixel.scatter(model, work)
+    for place in range(3):
+        order = ratios.order
+        if place > 0:
+            order = max(1, orders - reflection_ratio.FEWER * (2 - place))
+        for m in range(bands):
+            kernels.copy(work.scatter[order - 1, m], matrices[place, m])
+            matrices[place, m, m] -= frames - model.steps - order
+        record.freedom[place] = frames - model.steps - order
+
+
+@inlined
+def _write(model: Model, ratios: Ratio, work: Work, record: Any, vectors: Any) -> None:
+    """Ratios and emissivities, and numbers of step 1."""
+    noise = model.noise
     for m in range(noise.size):
         vectors[0, m], vectors[2, m] = work.ratio[m], work.null_weights[m]
         vectors[3, m] = work.emissivity[m]
         error = noise[m] ** 2 + (work.ratio[m] * noise[0]) ** 2 if m > 0 else 0.0  # eq. 4
         vectors[1, m] = ratios.inverse_energy * error + work.level[m] ** 2 if m > 0 else 0.0
-    for place in range(3):
-        order = ratios.order
-        if place > 0:
-            order = max(1, orders - reflection_ratio.FEWER * (2 - place))
-        for m in range(noise.size):
-            kernels.copy(work.scatter[order - 1, m], matrices[place, m])
-            matrices[place, m, m] -= rows - order
     record.inverse_energy, record.null_variance = ratios.inverse_energy, ratios.null_variance
     record.order, record.pooled = ratios.order, ratios.pooled
     record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
@@ -220,7 +251,6 @@ def _separate(
     signals: Array,
     places: Whole,
     materials: Array,
-    least: float,
     work: Work,
     solved: Solved,
 ) -> None:
@@ -235,9 +265,10 @@ def _separate(
             for m in range(model.noise.size):
                 kernels.copy(inside[p, m], work.signals[m])
             kernels.copy(materials[here], work.material)
-            record, vectors = solved.record[here], solved.vectors[here]
-            ratios = _pixel(model, least, work, outside[p], record, vectors, solved.matrices[here])
+            record, matrices = solved.record[here], solved.matrices[here]
+            ratios = _pixel(model, work, outside[p], record, solved.vectors[here], matrices[3])
             bars.judge(model, ratios, work, record, solved.sums[..., here])
+            _scatters(model, ratios, work, record, matrices)
         _return(outside, together, solved.films)
 
 
@@ -324,16 +355,14 @@ def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     }
 
 
-def solve(
-    tile: Tile, functions: smooth.Subspace, drift: float, least: float = pixel.BEND
-) -> Solution:
+def solve(tile: Tile, functions: smooth.Subspace, drift: float) -> Solution:
     """
     Steps 1 to 4, where it matters again on signals with proportional reflections.
 
-    With the limit of the background's `drift` [K], and the `least` bend that matters.
+    With the limit of the background's `drift` [K].
     """
     every = np.arange(tile.signals.shape[2])
-    return solve_parts(tile, functions, [(every, functions)], drift, least)
+    return solve_parts(tile, functions, [(every, functions)], drift)
 
 
 def solve_parts(
@@ -341,7 +370,6 @@ def solve_parts(
     functions: smooth.Subspace,
     parts: Iterable[tuple[Whole, smooth.Subspace]],
     drift: float,
-    least: float = pixel.BEND,
 ) -> Solution:
     """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
 
@@ -359,23 +387,20 @@ def solve_parts(
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
-    freedom, space = np.empty(pixels, np.intp), _work_space(frames, bands, len(shared.rising))
+    space = _work_space(frames, bands, len(shared.rising))
     for places, own in parts:
         model, count = shared._replace(**_columns(own)), own.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((own.orders, bands, bands))
-        _separate(model, signals, places, materials, float(least), Work(**space), solved)
-        freedom[places] = frames - own.steps - record["order"][places]
+        _separate(model, signals, places, materials, Work(**space), solved)
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }
     squares = matrices.transpose(1, 2, 3, 0)
     named |= {
-        "freedom": freedom,
         "beyond": named["beyond"] > 0,
         "sums": sums,
-        "scatter": squares[0],
-        "rapid_scatter": squares[1:3],
+        "scatter": squares[:3],
         "emissivity_covariance": squares[3],
         **dict(zip(_VECTORS, vectors.transpose(1, 2, 0), strict=True)),
         **dict(zip(FILMS, films, strict=True)),

@@ -72,8 +72,7 @@ from dbthermal.separation._subspace import (
     residuals,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._subspace.pixel import BEND
-from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
+from dbthermal.separation._tiles import Estimate, Mask, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -104,8 +103,8 @@ _LIKELY: Final = 40.0
 _AS_GIVEN: Final = (1.0 + smooth.CHANGE_POINT / smooth.PIECE_ORDER) ** -0.5
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
 _MOST_PIECES: Final = 10
-# Polynomials of a piece in a survey: those of a pixel alone, and two larger numbers.
-_NUMBERS: Final = (smooth.PIECE_ORDER, smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
+# Polynomials of a piece in a survey, beside those of a pixel alone.
+_NUMBERS: Final = (smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
 
 
 @dataclass(frozen=True)
@@ -142,38 +141,13 @@ class SubspaceSettings:
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _followed(tile, settings)[0]
+        return _followed(tile, settings)
 
 
 def separate_smooth(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of objects that change smoothly, without pieces of time."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return _report(tile, _solve(tile, _functions(tile), settings))
-
-
-def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
-    """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        # Together the pixels see a bend that is too small to be seen in each.
-        functions = _functions(tile)
-        alone = _solve(tile, functions, settings, least=0.0)
-        result = _survey(tile, functions.orders, alone)
-        first = _followed(tile, settings, alone)[1]
-        divided = np.asarray(first.any(axis=0))
-        if np.any(divided):
-            part = tile.select_pixels(divided)
-            again, *more = (
-                _survey(
-                    part,
-                    1,
-                    _divided(part, first[:, divided], functions, settings, 0.0, number),
-                )
-                for number in _NUMBERS
-            )
-            rapid = np.stack([one.scatter for one in more]), np.stack([one.frames for one in more])
-            again = replace(again, rapid_scatter=rapid[0], rapid_frames=rapid[1])
-            result.replace_pixels(divided, again)
-        return result
 
 
 def _functions(tile: Tile) -> smooth.Subspace:
@@ -190,18 +164,13 @@ def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
     return smooth.subspace(time, order, segment=segment)
 
 
-def _solve(
-    tile: Tile,
-    functions: smooth.Subspace,
-    settings: SubspaceSettings,
-    least: float = BEND,
-) -> Solution:
+def _solve(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Solution:
     """Steps 1 to 4, compiled, or on a device."""
     solve = fused.solve
     if settings.device is not None:
         tensors = importlib.import_module("dbthermal.separation._subspace.tensors")
         solve = partial(tensors.solve, settings.device)
-    return solve(tile, functions, settings.background_drift, least)
+    return solve(tile, functions, settings.background_drift)
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -234,32 +203,13 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(solution.ratio_variance)),
         status=status,
     )
-    return result.check_range(tile.curves[0], not_estimated=FILMS)
-
-
-def _survey(tile: Tile, orders: int, solution: Solution) -> Survey:
-    """
-    Survey of a solution of some orders, without the pixels whose model is broken.
-
-    A selection by the estimate itself would bias the sum over a material.
-    """
-    status = _report(tile, solution).status
+    result = result.check_range(tile.curves[0], not_estimated=FILMS)
+    status = result.status
     # The ratio of an object that is taken for the background is that of emissivities.
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
     sound = ((status & _BROKEN) == 0) & ~exchanged
-    fewer = reflection_ratio.rapid_orders(orders)[:, np.newaxis] - solution.order
-    return Survey(
-        scatter=np.where(sound, solution.scatter, 0.0),
-        frames=sound * solution.freedom.astype(np.float64),
-        rapid_scatter=np.where(sound, solution.rapid_scatter, 0.0),
-        rapid_frames=sound * (solution.freedom - fewer).astype(np.float64),
-        ratio=solution.ratio,
-        null_weights=solution.null_weights,
-        emissivity=np.where(status == 0, solution.emissivity[0], np.nan),
-        noise_variance=solution.noise_variance,
-        drift_variance=solution.drift_variance,
-    )
+    return replace(result, survey=solution.survey(sound, status == 0))
 
 
 def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
@@ -267,7 +217,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     frames, others, emissivity = tile.time.size, len(tile.noise) - 1, solution.emissivity
     still = solution.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
     # The quietest band holds no more than its noise either.
-    still |= solution.scatter[0, 0] <= 0
+    still |= solution.scatter[0, 0, 0] <= 0
     still = (still & ~solution.pooled) | ~np.isfinite(solution.inverse_energy)
     # Ratios of 1, where eq. 5 is singular, are not excluded.
     singular = solution.epsilon_variance > 1.0 / chdtri(others, reflection_ratio.CHANCE)
@@ -283,7 +233,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     emitted = np.all((solution.ratio > _EMITTED[0]) & (solution.ratio < _EMITTED[1]), axis=0)
     swapped |= constant & emitted
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
-    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom)
+    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom[0])
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
     return {
         Status.NO_BACKGROUND_MOTION: still,
@@ -297,17 +247,10 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     }
 
 
-def _followed(
-    tile: Tile, settings: SubspaceSettings, solution: Solution | None = None
-) -> tuple[Estimate, Mask]:
-    """
-    All steps: pixels that do not fit are solved anew with polynomials in pieces of the time.
-
-    And the frames that pieces begin with (time, pixel), none where one curve is smooth.
-    """
+def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
     functions, noise = _functions(tile), np.array(tile.noise)
-    if solution is None:
-        solution = _solve(tile, functions, settings)
+    solution = _solve(tile, functions, settings)
     used = solution.order + functions.steps
     asked = pieces.asked(
         solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
@@ -315,9 +258,9 @@ def _followed(
     asked |= solution.order > functions.orders - _LAST
     result = _report(tile, solution)
     suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
-    first = np.zeros(tile.signals.shape[1:], dtype=bool)
     if suspect.size == 0:
-        return result, first
+        return result
+    first = np.zeros((tile.time.size, suspect.size), dtype=bool)
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
     white, axes = pieces.plane(part.signals, noise)
     axis = np.full((2, suspect.size), np.nan)
@@ -347,17 +290,25 @@ def _followed(
         places, again = places[better], again.select_pixels(better)
         best.replace_pixels(places, again)
         cost[places] = one.cost[places]
-        first[:, suspect[places]] = one.first[:, places]
-    jumping = first[:, suspect].any(axis=0) & residuals.sudden(
+        first[:, places] = one.first[:, places]
+    divided = np.asarray(first.any(axis=0))
+    surveyed = divided.copy()
+    if part.material is not None:  # one with its emissivity is not asked for a scatter
+        surveyed &= np.isnan(part.material.noise_variance)
+    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
+        some = part.select_pixels(surveyed)
+        more = _report(some, _divided(some, first[:, surveyed], functions, settings, number))
+        best.replace_scatter(place, surveyed, more)
+    jumping = divided & residuals.sudden(
         best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
     # A delay of the bands asks for a piece at each change of the background, which hide it.
     apart = result.status[suspect] & np.uint32(Status.BANDS_APART)
-    hidden = first[:, suspect].sum(axis=0) > _MOST_PIECES
+    hidden = first.sum(axis=0) > _MOST_PIECES
     status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
     result.replace_pixels(suspect, replace(best, status=status))
-    return result, first
+    return result
 
 
 def _divided(
@@ -365,7 +316,6 @@ def _divided(
     first: Mask,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    least: float = BEND,
     number: int = smooth.PIECE_ORDER,
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
@@ -377,8 +327,8 @@ def _divided(
     groups = pieces.alike(first)
     parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
     if settings.device is None:
-        return fused.solve_parts(tile, functions, parts, settings.background_drift, least)
-    alone = [_solve(tile.select_pixels(places), own, settings, least) for places, own in parts]
+        return fused.solve_parts(tile, functions, parts, settings.background_drift)
+    alone = [_solve(tile.select_pixels(places), own, settings) for places, own in parts]
     return alone[0].join(alone[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 
@@ -387,7 +337,7 @@ METHOD: Final = Method(
     settings=SubspaceSettings,
     minimum_frames=32,
     check_clock=clock.check,
-    survey=survey,
+    pools=True,
     any_bands=True,
     compiled=True,
 )

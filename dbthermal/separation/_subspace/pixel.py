@@ -138,7 +138,7 @@ def ratios(model: Model, work: Work) -> Ratio:
     """
     noise, material, ratio, axis = model.noise, work.material, work.ratio, work.axis
     bands, orders, frames = noise.size, len(work.scatter), work.first.size
-    _scatter(model, work)
+    scatter(model, work)
     pooled, along = False, work.material_axis
     if not np.isnan(material[6]):
         length = 0.0
@@ -149,9 +149,9 @@ def ratios(model: Model, work: Work) -> Ratio:
             along[m] /= sqrt(length)
         pooled = _agrees(work.scatter[_order(work, True, frames)], along, model.chances[0])
     order = _order(work, pooled, frames)
-    free, scatter = frames - model.steps - (order + 1.0), work.scatter[order]
-    null = _across(scatter, work, pooled)
-    largest = kernels.principal(scatter, work.turned, work.turns, axis)
+    free, chosen = frames - model.steps - (order + 1.0), work.scatter[order]
+    null = _across(chosen, work, pooled)
+    largest = kernels.principal(chosen, work.turned, work.turns, axis)
     # Eq. 4: sigma^2 of the energy along the axis less the noise's, over |v|^2.
     ratio[0], length = 1.0, 0.0
     for m in range(1, bands):
@@ -183,7 +183,7 @@ def ratios(model: Model, work: Work) -> Ratio:
 
 
 @inlined
-def _scatter(model: Model, work: Work) -> None:
+def scatter(model: Model, work: Work) -> None:
     """Scatter of the whitened signals outside the functions of each order (eq. 3)."""
     straight, coefficients = work.straight, work.coefficients
     bands, frames = model.noise.size, work.first.size

@@ -35,9 +35,7 @@ Known = dict[str, Tensor]
 einsum: Final = torch.einsum
 
 
-def solve(
-    device: str, tile: Tile, functions: smooth.Subspace, drift: float, least: float
-) -> Solution:
+def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> Solution:
     """As `fused.solve`, on a device; the solution is in arrays."""
 
     def tensor(values: Any) -> Any:
@@ -48,18 +46,15 @@ def solve(
     signals = tensor(tile.signals)
     work = _steps(model, material, signals, signals)
     result = {name: getattr(work, name) for name in Solution.__dataclass_fields__}
-    removed, places = torch.zeros_like(work.bend), torch.arange(signals.shape[2], device=device)
+    places = torch.arange(signals.shape[2], device=device)
     for _ in range(pixel.BENDS):
-        energy = (work.bend - removed).var(dim=1, correction=0) * signals.shape[1]
-        bent = (energy > (least * model.noise[1:, None]) ** 2).any(dim=0)
+        bent = work.bent
         if not bent.any():
             break
         # Again, on signals whose reflections are proportional.
-        least, removed, places = pixel.BEND, work.bend[..., bent], places[bent]
-        signals, weights = signals[..., bent], work.weights[..., bent]
+        places, signals, straight = places[bent], signals[..., bent], work.further[..., bent]
         material = {name: values[..., bent] for name, values in material.items()}
-        straight = torch.cat([signals[:1], signals[1:] - removed])
-        work = _steps(model, material, signals, straight, weights)
+        work = _steps(model, material, signals, straight, work.weights[..., bent])
         # The bend of a gray body is not known: it is told from the signals as they are.
         for name in result.keys() - {"gray"}:
             result[name][..., places] = getattr(work, name)
@@ -80,6 +75,7 @@ def _steps(
     _emission(model, material, work)
     _background(model, work)
     _films(model, work)
+    _straighten(model, material, work)
     _judge(model, work)
     return work
 
@@ -95,11 +91,21 @@ def _films(model: Model, work: Work) -> None:
     for place, name in enumerate(FILMS):
         film = (films, stds)[place % 2][place // 2]
         setattr(work, name, film.where(~lost[place // 2], np.nan))
+
+
+def _straighten(model: Model, material: Known, work: Work) -> None:
+    """Signals less the bend (eq. 11), pixels in which it has changed, and the scatter without it."""
     # Part of the reflections (band - 1, time, pixel) [K] that the responses bend, see `pixel`.
     signal, emissivity = _blackbody(model, work.background)[0], work.emissivity
     bend = (signal[1:] - signal[0]) * (1.0 - emissivity[1:, None])
     physical = ((emissivity > 0) & (emissivity < 1)).all(dim=0) & bend.isfinite().all(0).all(0)
-    work.bend = bend.where(physical, 0.0)
+    work.further = torch.cat([work.signals[:1], work.signals[1:] - bend.where(physical, 0.0)])
+    energy = (work.further - work.straight)[1:].var(dim=1, correction=0) * work.signals.shape[1]
+    work.bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
+    # Together pixels show a bend that is too small to be seen in each.
+    known = material["noise_variance"].isfinite() if material else torch.zeros_like(work.bent)
+    scatter, _ = _less_noise(model, _scatter(model, work.further)[1], work.order)
+    work.scatter = work.scatter.where(work.bent | known, scatter)
 
 
 def _blackbody(
@@ -146,10 +152,7 @@ def _ratios(model: Model, material: Known, work: Work) -> None:
     signals, noise = work.straight, model.noise[:, None]
     bands, frames, pixels = signals.shape
     # Eq. 3: scatter (order, pixel, band, band) of the whitened signals outside the functions.
-    held = model.functions @ signals
-    white = held / noise[..., None]
-    total = einsum("btp,ctp->pbc", signals, signals) / (noise * noise.T)
-    scatter = total - einsum("bfp,cfp->fpbc", white, white).cumsum(0)[model.steps :]
+    held, scatter = _scatter(model, signals)
     orders = torch.arange(1, len(scatter) + 1, device=signals.device)
     freedom, rows = frames - model.steps - orders, torch.arange(pixels, device=signals.device)
     # Its energy is the largest eigenvalue along the axis, noise alone across it.
@@ -185,7 +188,7 @@ def _ratios(model: Model, material: Known, work: Work) -> None:
     weights, variance = reflection_ratio.null_combination(ratio, model.noise)
     work.ratio, work.inverse_energy = ratio, inverse
     work.null_weights, work.null_variance = weights, variance
-    work.order, work.freedom, work.used = order + 1, free, order + 1 + model.steps
+    work.order, work.used = order + 1, order + 1 + model.steps
     work.contrast = _quotient(largest[-1] * (bands - 1), across[-1], np.inf)
     work.reduced_chi2 = across[order, rows] / ((bands - 1) * free)
     # Coefficients of the signals, and of the null combination, on the columns in use.
@@ -193,10 +196,25 @@ def _ratios(model: Model, material: Known, work: Work) -> None:
     work.columns = columns < work.used
     work.coefficients = held * work.columns
     work.smoothed = einsum("bp,bcp->cp", weights, held) * work.columns
-    rapid = torch.as_tensor(reflection_ratio.rapid_orders(len(scatter)) - 1, device=signals.device)
-    unit = torch.eye(bands, dtype=signals.dtype, device=signals.device)[..., None]
-    work.scatter = chosen.movedim(0, -1) - free * unit
-    work.rapid_scatter = scatter[rapid].movedim(1, -1) - freedom[rapid][:, None, None, None] * unit
+    work.scatter, work.freedom = _less_noise(model, scatter, work.order)
+
+
+def _scatter(model: Model, signals: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients of signals; scatter (order, pixel, band, band) outside the functions (eq. 3)."""
+    noise, held = model.noise[:, None], model.functions @ signals
+    white = held / noise[..., None]
+    total = einsum("btp,ctp->pbc", signals, signals) / (noise * noise.T)
+    return held, total - einsum("bfp,cfp->fpbc", white, white).cumsum(0)[model.steps :]
+
+
+def _less_noise(model: Model, scatter: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
+    """Scatter less noise (3, band, band, pixel) at the orders of a survey, and its freedom."""
+    rapid = reflection_ratio.rapid_orders(len(scatter))
+    orders = torch.stack([order, *(torch.full_like(order, int(one)) for one in rapid)])
+    free = model.functions.shape[1] - model.steps - orders
+    unit = torch.eye(scatter.shape[-1], device=scatter.device)[..., None]
+    chosen = scatter[orders - 1, torch.arange(len(order), device=scatter.device)]
+    return chosen.movedim(1, -1) - free[:, None, None] * unit, free
 
 
 def _order(across: Tensor, frames: int) -> Tensor:
@@ -484,8 +502,8 @@ def _judge(model: Model, work: Work) -> None:
     work.correlation = mean * np.sqrt(residuals.LAGS * len(residual))
     # A matched filter with the differences between frames, of a band that is late or early.
     common, change = work.null_weights[0] * model.noise[0] ** 2, rapid.diff(dim=0)
-    late = (residual[:-1] * change).sum(dim=0) + work.freedom * common
-    early = (residual[1:] * change).sum(dim=0) - work.freedom * common
+    late = (residual[:-1] * change).sum(dim=0) + work.freedom[0] * common
+    early = (residual[1:] * change).sum(dim=0) - work.freedom[0] * common
     variance = work.null_variance * (change**2).sum(dim=0)
     score = _quotient(torch.maximum(late.abs(), early.abs()), variance.sqrt(), 0.0)
     # Energy in the frames at a change; the cube root of a chi-square over its n degrees has the
