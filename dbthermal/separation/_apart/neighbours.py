@@ -17,7 +17,7 @@ import numpy.typing as npt
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 from dbthermal._arrays import Array
 from dbthermal._samples import neighbour_mean
@@ -29,7 +29,8 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
 from dbthermal.separation._pooling.ratios import Image
 from dbthermal.separation._quality import Bits
-from dbthermal.separation._subspace.reflection_ratio import energy_of_variance
+from dbthermal.separation._subspace.bars import NORMAL95
+from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
 from dbthermal.separation._tiles import Material, Survey
 
 BLUR: Final = 1.0
@@ -42,6 +43,8 @@ BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
+# Windows along the image's smaller side, and how many of a material have a jackknife.
+_ALONG, _FEWEST = 4, 3
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
 _SOME: Final = 0.1
 # Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
@@ -93,16 +96,18 @@ def materials(
     inputs: Inputs,
     scatters: dict[float, Scatters],
     alone: xr.Dataset,
-    materials: Callable[..., Material | None],
+    pooled: Callable[..., Material | None],
 ) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
 
-    Of the pixels that no neighbour's blur reaches. What the blur changes may be as much again
-    beyond it: a variance. A material too narrow for it has that of the others.
+    Of the pixels that no neighbour's blur reaches. Their variance is that between windows of the
+    image, and what the last blur has changed, which may be as much again beyond it. A material too
+    narrow for the blur has that of the others.
     """
     assert inputs.labels is not None
     noise, shape = inputs.noise[inputs.bands], alone["status"].shape
-    labels, material, sharp = inputs.labels.reshape(shape), None, None
+    labels, material = inputs.labels.reshape(shape), None
+    between = np.zeros(inputs.labels.size)
     for blur, scatter in scatters.items():
         size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
@@ -113,14 +118,16 @@ def materials(
             image = Image(inputs.labels, places, shape[1])
             survey = _survey(scatter, alone, noise, places)
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
-            sharp = wider if sharp is None else sharp
-            material = wider if material is None else _blurred(sharp, material, wider, inputs)
+            variance = image.expand(_between_windows(image, survey, noise, shape))
+            between = np.where(np.isfinite(variance), variance, between)
+            material = wider if material is None else _blurred(material, wider, noise)
     if material is None:
         return None
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
-    variance, none = material.inverse_energy + material.spread, np.zeros_like(material.spread)
+    variance = material.inverse_energy + material.spread + between
+    none = np.zeros_like(variance)
     material = replace(material, inverse_energy=variance, spread=none)
-    return materials(inputs, known=material)
+    return pooled(inputs, known=material)
 
 
 def _survey(
@@ -144,15 +151,39 @@ def _survey(
     )
 
 
-def _blurred(sharp: Material, less: Material, more: Material, inputs: Inputs) -> Material:
-    """Materials with the ratios at more blur, and what all of it changes as their variance."""
+def _between_windows(image: Image, survey: Survey, noise: Array, shape: tuple[int, ...]) -> Array:
+    """Variance (material) [1/K^2] of ratios by the jackknife over windows; NaN of too few of them.
+
+    A window is wider than the nodes of the shift's field, whose errors its pixels share. For few
+    of them it is widened as the interval of 95 % is, by Student's t.
+    """
+    side = -(-min(shape) // _ALONG)
+    row, column = np.divmod(image.surveyed, shape[1])
+    labels, windows = image.labels[image.surveyed], row // side * shape[1] + column // side
+    result = np.full(int(image.labels.max()) + 1, np.nan)
+    for label in np.unique(labels):
+        pixels = np.flatnonzero(labels == label)
+        every, number = np.unique(windows[pixels], return_inverse=True)
+        if every.size < _FEWEST:
+            continue
+        scatters = np.zeros((every.size, len(noise), len(noise)))
+        np.add.at(scatters, number, np.moveaxis(survey.scatter[0][..., pixels], -1, 0))
+        ratio = principal_ratio(scatters.sum(axis=0) - scatters, noise)
+        variance = (every.size - 1) * ratio.var(axis=1, keepdims=True)
+        widened = (stdtrit(every.size - 1, 0.975) / NORMAL95) ** 2
+        inverse = energy_of_variance(ratio.mean(axis=1, keepdims=True), variance, noise)
+        result[label] = widened * inverse.max()
+    return result
+
+
+def _blurred(less: Material, more: Material, noise: Array) -> Material:
+    """Materials with the ratios at more blur, and what that has changed as a variance."""
     known = np.isfinite(more.ratio[-1])
-    both = known & np.isfinite(sharp.ratio[-1])
-    change = more.ratio / sharp.ratio - 1.0
-    usual = np.median(np.abs(change[:, both]), axis=1, keepdims=True) if both.any() else 0.0
+    measured = known & np.isfinite(less.ratio[-1])
+    change = more.ratio / less.ratio - 1.0
+    usual = np.median(np.abs(change[:, measured]), axis=1, keepdims=True) if measured.any() else 0.0
     ratio = np.where(known, more.ratio, less.ratio)
-    variance = (np.where(both, change, usual) * ratio) ** 2
-    off = energy_of_variance(ratio, variance, inputs.noise[inputs.bands])
+    off = energy_of_variance(ratio, (np.where(measured, change, usual) * ratio) ** 2, noise)
     inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
     spread = np.where(known, more.spread, less.spread)
     return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)

@@ -82,7 +82,7 @@ def pooled(
         plain = replace(inputs, difference=None) if frames.smooth else inputs
         maps = planes.project(plain, before, shares, threads)
         scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
-        survey = partial(neighbours.materials, scatters=scatters, alone=before, materials=materials)
+        survey = partial(neighbours.materials, scatters=scatters, alone=before, pooled=materials)
         inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:

@@ -94,7 +94,7 @@ def _films(model: Model, work: Work) -> None:
 
 
 def _straighten(model: Model, material: Known, work: Work) -> None:
-    """Signals less the bend (eq. 11), pixels in which it has changed, and the scatter without it."""
+    """Signals less the bend (eq. 11), pixels where it changed, and the scatter without it."""
     # Part of the reflections (band - 1, time, pixel) [K] that the responses bend, see `pixel`.
     signal, emissivity = _blackbody(model, work.background)[0], work.emissivity
     bend = (signal[1:] - signal[0]) * (1.0 - emissivity[1:, None])
