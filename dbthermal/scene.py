@@ -16,8 +16,7 @@ from dbthermal import _rows, store
 from dbthermal._arrays import made_on_disk, on_disk, release
 from dbthermal.alignment import _joint as joint
 from dbthermal.alignment import align, register
-from dbthermal.alignment._displacement import share_displaced
-from dbthermal.alignment._planes import Scale
+from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._resampling import on_one_clock
 from dbthermal.alignment._views import registered
 from dbthermal.correction import correct_capture

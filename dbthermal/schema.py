@@ -399,3 +399,10 @@ def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
             f"Unordered '{dim}' of {label}: {values[place]} {units} is followed by "
             f"{values[place + 1]} {units}. Must increase strictly."
         )
+
+
+def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:
+    """Number of shutter events before each frame (time), 0 without a variable `segment`."""
+    if "segment" not in capture:
+        return np.zeros(capture.sizes["time"], dtype=np.intp)
+    return np.asarray(capture["segment"].values, dtype=np.intp)

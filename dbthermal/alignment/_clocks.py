@@ -167,13 +167,6 @@ def _check_stamps(stamps: Array, label: str) -> None:
         )
 
 
-def segments(corrected: xr.Dataset) -> Indices:
-    """Number of shutter events before each frame (time), 0 without a variable `segment`."""
-    if "segment" not in corrected:
-        return np.zeros(corrected.sizes["time"], dtype=np.intp)
-    return np.asarray(corrected["segment"].values, dtype=np.intp)
-
-
 def missing(frames: npt.NDArray[Any]) -> Mask:
     """Frames (time) that are NaN in all pixels, or a copy of the frame before.
 

@@ -186,7 +186,7 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tup
     times = f"times begin at {start[1]:.4g} and {start[0]:.4g} s"
     label = f"of band '{names[1]}' against '{names[0]}', whose {times}"
     # Frames of the one side of a pause never meet those of the other, at any lag.
-    shared = _on_one_clock(signals, stamps, clocks.segments(pair), search + 3)
+    shared = _on_one_clock(signals, stamps, schema.segments(pair), search + 3)
     lag = _peak(_covariances(shared, search, names)[0], label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
     both = lag + _delays(*_covariances(shared.shifted(lag), 1, names))

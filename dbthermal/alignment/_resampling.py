@@ -51,7 +51,7 @@ def on_one_clock(
         require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
     noise, relative = noise_levels(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
-    times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
+    times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     plans, factors, missing = [], np.ones(len(names)), _missing(counts)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))

@@ -13,8 +13,7 @@ import xarray as xr
 from dbthermal import alignment, schema
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
-from dbthermal.alignment._displacement import share_displaced
-from dbthermal.alignment._planes import Scale
+from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
@@ -23,7 +22,7 @@ from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._pooling import materials as pooling
-from dbthermal.separation._pooling.held import hold
+from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._solve import get_method, require_workers, separated
 from dbthermal.separation._tiles import Material
 

@@ -18,7 +18,6 @@ from dbthermal._arrays import empty, release
 from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
-from dbthermal.separation._apart.side_by_side import Regroup
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
 from dbthermal.separation._tiles import Estimate, Mask, Material, Survey, Whole
@@ -202,7 +201,7 @@ def separated(
     *,
     alone: xr.Dataset | None = None,
     surveys: Survey | None = None,
-    regroup: Regroup | None = None,
+    regroup: pooling.Regroup | None = None,
     workers: int = 2,
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
@@ -242,7 +241,7 @@ def separated(
         elif apart:
             side_by_side.alone(inputs, result, each, threads)
         elif pooled:
-            each(*side_by_side.regrouped(inputs, materials, regroup))
+            each(*pooling.regrouped(inputs, materials, regroup))
         else:
             surveys = each(inputs, None)
     if inputs.method.pools:

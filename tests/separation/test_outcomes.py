@@ -87,7 +87,6 @@ BOUNDS: Final[dict[str, Bounds]] = {
 }
 # Bounds that are missed since the ratios of cameras apart are those of maps.
 MISSED: Final = {
-    "two frames late": "p90 1.05 K: the field of the shift explains more of a delay",
     "slow, apart": "emissivity 0.027 off: the ratio is that of rapid changes alone",
     "rapid, nearly black, apart": "measured 0.20, and a warning: flags of a first pass are lost",
 }

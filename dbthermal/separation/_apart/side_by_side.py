@@ -11,17 +11,15 @@ from dataclasses import replace
 from functools import partial
 from typing import Final, TypeAlias
 
-import numpy as np
 import xarray as xr
 
 from dbthermal.separation._apart import joint, neighbours, planes
-from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._pooling import pool
 from dbthermal.separation._tiles import Material
 
 Each: TypeAlias = Callable[[Inputs, Material | None], object]
 """Separates each pixel alone, into the result."""
-Regroup: TypeAlias = Callable[[Material | None], Labels]
-"""Labels (pixel) of materials, of what is told of those before."""
 
 # Turns of the materials and the object of each camera's own place.
 _TURNS: Final = 2
@@ -65,7 +63,7 @@ def pooled(
     each: Each,
     threads: Executor,
     materials: Callable[..., Material | None],
-    regroup: Regroup | None = None,
+    regroup: pool.Regroup | None = None,
 ) -> None:
     """Separate with materials, from a result of each pixel alone before.
 
@@ -83,7 +81,7 @@ def pooled(
         maps = planes.project(plain, before, shares, threads)
         scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
         survey = partial(neighbours.materials, scatters=scatters, alone=before, pooled=materials)
-        inputs, material = regrouped(inputs, survey, regroup if turn == 0 else None)
+        inputs, material = pool.regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
             each(inputs, material)
@@ -100,15 +98,3 @@ def pooled(
     each(inputs, material)
     if objects is not None:
         objects.finish(result)
-
-
-def regrouped(
-    inputs: Inputs, materials: Callable[[Inputs], Material | None], regroup: Regroup | None
-) -> tuple[Inputs, Material | None]:
-    """Inputs, and what is told of their materials; of others, if that regroups them."""
-    material = materials(inputs)
-    labels = None if regroup is None else regroup(material)
-    if labels is None or np.all(labels == inputs.labels):
-        return inputs, material
-    inputs = replace(inputs, labels=labels)
-    return inputs, materials(inputs)

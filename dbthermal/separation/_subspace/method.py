@@ -69,7 +69,6 @@ from dbthermal.separation._subspace import (
     fused,
     pieces,
     reflection_ratio,
-    residuals,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
 from dbthermal.separation._tiles import Estimate, Mask, Tile
@@ -228,7 +227,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     constant = ~still & ~gray & solution.constant
     # Before an object that hardly changes, what changes would be the background: comes and goes.
     resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
-    swapped[resting] = ~residuals.returning(select(tile.signals[0], resting))
+    swapped[resting] = ~pieces.returning(select(tile.signals[0], resting))
     # Or along a ratio that is one of emissivities: of an object that is switched on and off.
     emitted = np.all((solution.ratio > _EMITTED[0]) & (solution.ratio < _EMITTED[1]), axis=0)
     swapped |= constant & emitted
@@ -299,7 +298,7 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         some = part.select_pixels(surveyed)
         more = _report(some, _divided(some, first[:, surveyed], functions, settings, number))
         best.replace_scatter(place, surveyed, more)
-    jumping = divided & residuals.sudden(
+    jumping = divided & pieces.sudden(
         best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})

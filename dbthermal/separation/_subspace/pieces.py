@@ -8,9 +8,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._subspace import reflection_ratio, residuals
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 # Functions of a piece by which the division is chosen. One more is fitted: what the choice leaves
@@ -36,6 +37,15 @@ APART: Final = 6.0
 
 Piece = tuple[slice, Array, int]
 """Frames of a piece, its functions, orthonormal, and how many of them are used to choose."""
+
+
+# Time in which a sudden step is so large a share of the object's change [s].
+_AROUND: Final = 1.0
+_MOST: Final = 2.0 / 3.0
+# Parts of the capture, and the total variation of their means over its range, from which a signal
+# returns.
+_PARTS: Final = 24
+_RETURNED: Final = 1.7
 
 
 @lru_cache(maxsize=4)
@@ -181,3 +191,37 @@ def _order(null_energy: Array, frames: int) -> Whole:
     criterion += np.arange(1, len(null_energy) + 1)[:, np.newaxis] * np.log(frames)
     lowest = min(reflection_ratio.LOWEST_ORDER, null_energy.shape[0] - 1) - 1
     return np.asarray(lowest + np.argmin(criterion[lowest:-1], axis=0) + 1)
+
+
+def returning(signal: Array) -> Mask:
+    """
+    Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
+
+    Of means over parts of the capture: their total variation over their range is 1 for a change
+    that stays, 2 for one that comes and goes.
+    """
+    parts = np.array_split(signal, min(_PARTS, len(signal)))
+    means = np.stack([part.mean(axis=0) for part in parts])
+    variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
+    return np.asarray(variation > _RETURNED * np.ptp(means, axis=0))
+
+
+def sudden(curve: Array, std: Array, time: Array) -> Mask:
+    """
+    Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
+
+    By more than most of its change within a second, and beyond its standard deviations; not over a
+    pause of the frames.
+    """
+    interval = np.diff(time)
+    usual = float(np.median(interval))
+    # A clock of bursts has a median far below its mean.
+    frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * _AROUND / usual))))
+    step = np.abs(np.diff(curve, axis=0))
+    noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
+    jumps = (step > residuals.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
+    result = np.any(jumps, axis=0)
+    some, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
+    around = maximum_filter(some, size)[1:] - minimum_filter(some, size)[1:]
+    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * around), axis=0)
+    return np.asarray(result)

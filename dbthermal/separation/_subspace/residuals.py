@@ -8,27 +8,17 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.special import chdtri
 
 from dbthermal.separation._subspace import regression
 from dbthermal.separation._subspace.reflection_ratio import CHANCE
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Whole
 
 LAGS: Final = 5
 """Frames over which a residual's mean autocorrelation is taken."""
 
-AROUND: Final = 1.0
-"""Time in which a step of the object is most of its change [s]."""
-
 # Deviations of noise from which a difference between frames is a change.
 CHANGE: Final = 5.0
-# Share of the change within a second that a sudden step makes.
-_MOST: Final = 2.0 / 3.0
-# Parts of the capture, and the total variation of their means over its range, from which a signal
-# returns.
-_PARTS: Final = 24
-_RETURNED: Final = 1.7
 # Frames of the shortest blocks of a residual.
 _BLOCK: Final = 9
 
@@ -66,37 +56,3 @@ def blocks(frames: int) -> tuple[Whole, tuple[float, float]]:
     number = 2 ** int(np.log2(frames / _BLOCK))
     edges = np.round(np.linspace(0, frames, number + 1)).astype(np.intp)
     return edges, (float(chdtri(number, CHANCE)), float(chdtri(1.0, CHANCE / (2 * number))))
-
-
-def returning(signal: Array) -> Mask:
-    """
-    Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
-
-    Of means over parts of the capture: their total variation over their range is 1 for a change
-    that stays, 2 for one that comes and goes.
-    """
-    parts = np.array_split(signal, min(_PARTS, len(signal)))
-    means = np.stack([part.mean(axis=0) for part in parts])
-    variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
-    return np.asarray(variation > _RETURNED * np.ptp(means, axis=0))
-
-
-def sudden(curve: Array, std: Array, time: Array) -> Mask:
-    """
-    Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
-
-    By more than most of its change within a second, and beyond its standard deviations; not over a
-    pause of the frames.
-    """
-    interval = np.diff(time)
-    usual = float(np.median(interval))
-    # A clock of bursts has a median far below its mean.
-    frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * AROUND / usual))))
-    step = np.abs(np.diff(curve, axis=0))
-    noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
-    jumps = (step > CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
-    result = np.any(jumps, axis=0)
-    some, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
-    around = maximum_filter(some, size)[1:] - minimum_filter(some, size)[1:]
-    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * around), axis=0)
-    return np.asarray(result)
