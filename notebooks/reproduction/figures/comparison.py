@@ -49,7 +49,11 @@ def _decades(errors: xr.DataArray) -> tuple[float, float]:
 
 
 def _lines(axis: Axes, errors: xr.DataArray) -> None:
-    """One line a variant, over the noise."""
+    """One line a variant, over the noise; a word where there is no value."""
+    noise = errors["noise"].values
+    axis.set(xscale="log", xlim=(0.8 * noise.min(), 1.25 * noise.max()))
+    if not np.isfinite(errors).any():
+        axis.text(0.5, 0.5, "flagged at every noise", ha="center", transform=axis.transAxes)
     for index, name in enumerate(errors["variant"].values):
         style = drawing.marked_line(index) | {"linestyle": "-" if index < len(COLORS) else "--"}
         axis.loglog(errors["noise"], errors.sel(variant=name), label=str(name), **style)
