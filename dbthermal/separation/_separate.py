@@ -106,91 +106,96 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
     (True, True)
     """
-    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
+    # Check the inputs, before the work.
+    context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     require_workers(workers)
-    known = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
-    response = known.response  # with one noise for all steps
+    inputs = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
+    response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
-    alone = None if alone is None else _checked(alone, corrected, known)
-    given, source, apart = alone, "given", 0.0
+    alone = None if alone is None else _checked(alone, corrected, inputs)
+    # Find the shift of the reflections, where cameras stand apart.
+    original, source, share = alone, "given", 0.0
     if reflection_shift is None:
-        reflection_shift, apart = _shift(corrected, response)
+        reflection_shift, share = _shift(corrected, response)
         source = "none" if reflection_shift is None else "found"
     if reflection_shift is not None:
-        shift = displaced.check(reflection_shift, corrected, known.bands[0])
-        known = replace(known, displacement=shift)
+        shift = displaced.check(reflection_shift, corrected, inputs.bands[0])
+        inputs = replace(inputs, displacement=shift)
+    # Separate each pixel.
     surveys = None
     if alone is None or reflection_shift is not None:
-        alone, surveys = separated(known, workers=workers, progress=progress)
-    doubts = [_UNEXPLAINED.format(apart)] if apart > 0.0 else []
+        alone, surveys = separated(inputs, workers=workers, progress=progress)
+    doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else []
     if reflection_shift is not None:
         doubts = _unexplained(alone)
+    # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
-    again = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
+    pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
-        result, _ = again(replace(known, labels=numbered(corrected, materials)))
+        result, _ = pool(replace(inputs, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:
-        result, materials = _over_found_materials(again, known, corrected, alone)
+        result, materials = _over_found_materials(pool, inputs, corrected, alone)
     if materials is not None:
         hold(alone, result, materials, apart=reflection_shift is not None)
-    if result is given:  # which is the caller's
+    if result is original:  # which is the caller's
         result = result.copy(deep=True)
-    beside = replace(beside, materials=materials, reflection_shift=reflection_shift)
-    result = filled(result, corrected, response, beside, workers)
+    # Complete what is still unknown.
+    context = replace(context, materials=materials, reflection_shift=reflection_shift)
+    result = filled(result, corrected, response, context, workers)
     if materials is not None:
         result["material"] = materials
     return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
 
 
-def _checked(alone: xr.Dataset, corrected: xr.Dataset, known: Inputs) -> xr.Dataset:
+def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr.Dataset:
     """Result of each pixel alone that is at hand, in the order of the capture."""
-    made = {"method": "subspace", "pooled": 0, "settings": repr(known.settings)}
-    if any(alone.attrs.get(name) != value for name, value in made.items()):
+    made = {"method": "subspace", "pooled": 0, "settings": repr(inputs.settings)}
+    if any(per_pixel.attrs.get(name) != value for name, value in made.items()):
         raise ValueError(
             "Invalid result alone. Must be of 'subspace', without materials, with "
             f"{made['settings']}."
         )
-    return laid_on(alone, corrected, "the result alone", "the capture")
+    return laid_on(per_pixel, corrected, "the result alone", "the capture")
 
 
 def _over_found_materials(
-    again: Callable[..., tuple[xr.Dataset, object]],
-    known: Inputs,
+    pool: Callable[..., tuple[xr.Dataset, object]],
+    inputs: Inputs,
     corrected: xr.Dataset,
-    alone: xr.Dataset,
+    per_pixel: xr.Dataset,
 ) -> tuple[xr.Dataset, xr.DataArray]:
     """Separate over materials that are found in a result of each pixel alone, and these."""
-    found = pooling.materials(alone, corrected, known.response, borders=True)
-    regions = pooling.others(found, alone)
-    groups = [pooling.without_borders(regions, alone, known.response)]
+    labels = pooling.materials(per_pixel, corrected, inputs.response, borders=True)
+    regions = pooling.others(labels, per_pixel)
+    groups = [pooling.without_borders(regions, per_pixel, inputs.response)]
 
-    def joined(told: Material | None) -> Labels:
-        wider = pooling.joined(regions, alone, told, known.response)
-        groups.append(pooling.without_borders(wider, alone, known.response))
+    def joined(material: Material | None) -> Labels:
+        wider = pooling.joined(regions, per_pixel, material, inputs.response)
+        groups.append(pooling.without_borders(wider, per_pixel, inputs.response))
         return numbered(corrected, groups[-1])
 
-    result, _ = again(replace(known, labels=numbered(corrected, groups[0])), regroup=joined)
+    result, _ = pool(replace(inputs, labels=numbered(corrected, groups[0])), regroup=joined)
     return result, groups[-1]
 
 
 def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | None, float]:
     """Shift of the reflections where cameras stand apart, else how many windows are so for none."""
     names = [str(name) for name in corrected["band"].values]
-    apart = share_displaced(corrected, Scale.of_response(response, names))
-    if apart > 0.0:
+    share = share_displaced(corrected, Scale.of_response(response, names))
+    if share > 0.0:
         with suppress(ValueError):  # no shift explains it: the pixels keep the flag
             shift = alignment.reflection_shift(corrected, response)
             if seen_apart(shift):
                 return shift, 0.0
-    return None, apart
+    return None, share
 
 
-def _unexplained(alone: xr.Dataset) -> list[str]:
+def _unexplained(per_pixel: xr.Dataset) -> list[str]:
     """Doubt about a shift of the reflections with which bands are apart in many pixels."""
-    status = alone["status"].values
+    status = per_pixel["status"].values
     moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
-    apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
-    share = apart.sum() / max(moving.sum(), 1)
+    asynchronous = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
+    share = asynchronous.sum() / max(moving.sum(), 1)
     return [_UNEXPLAINED.format(share)] if share > _MANY else []

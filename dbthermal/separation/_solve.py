@@ -212,21 +212,23 @@ def separated(
     What is told of the materials may `regroup` them.
     """
     variables, capture = schema.STAGES["separated"], inputs.capture
-    apart, pooled = inputs.displacement is not None, inputs.labels is not None
-    if alone is None and apart and pooled:
+    displaced, pooled = inputs.displacement is not None, inputs.labels is not None
+    if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     if inputs.method.pools:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
     result = _allocate(capture, variables)
     # Cameras apart, and materials, take passes that are not known beforehand.
-    total = None if apart or pooled else result["status"].size
+    total = None if displaced or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
     ):
 
-        def each(inputs: Inputs, material: Material | None, wanted: Mask | None = None) -> Survey:
+        def separate_pixels(
+            inputs: Inputs, material: Material | None, wanted: Mask | None = None
+        ) -> Survey:
             """Separate all pixels into the result; or only survey those that are wanted."""
             survey = Survey.empty(len(inputs.bands), result["status"].size)
             into = result if wanted is None else None
@@ -235,21 +237,21 @@ def separated(
                 bar.update(pixels)
             return survey
 
-        materials = partial(pooling.materials, survey=each, surveys=surveys)
-        if alone is not None and apart:
-            side_by_side.pooled(inputs, alone, result, each, threads, materials, regroup)
-        elif apart:
-            side_by_side.alone(inputs, result, each, threads)
+        materials = partial(pooling.materials, survey=separate_pixels, surveys=surveys)
+        if alone is not None and displaced:
+            side_by_side.pooled(inputs, alone, result, separate_pixels, threads, materials, regroup)
+        elif displaced:
+            side_by_side.alone(inputs, result, separate_pixels, threads)
         elif pooled:
-            each(*pooling.regrouped(inputs, materials, regroup))
+            separate_pixels(*pooling.regrouped(inputs, materials, regroup))
         else:
-            surveys = each(inputs, None)
+            surveys = separate_pixels(inputs, None)
     if inputs.method.pools:
         _withhold(result)
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     notes = [np.atleast_1d(attrs.get("warnings", [])) for attrs in sources]
-    doubts = dict.fromkeys(str(one) for note in notes for one in note)
+    doubts = dict.fromkeys(str(sentence) for note in notes for sentence in note)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
@@ -347,8 +349,8 @@ def _separate(
                 # Whitened by one noise for all, not by that of the tile.
                 scale = np.array(tile.noise) / inputs.noise[inputs.bands]
                 scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
-                part = replace(estimate.survey, scatter=scatter)
-                survey.replace_pixels(cut.places[pixels], part)
+                section = replace(estimate.survey, scatter=scatter)
+                survey.replace_pixels(cut.places[pixels], section)
         if result is not None:
             _write(result, inputs.bands, cut, estimates)
         release()
@@ -383,7 +385,7 @@ def _write(
 
     The tile's bands have these places in the capture. What has no estimate becomes NaN.
     """
-    order, shape = np.argsort(bands), tuple(part.stop - part.start for part in cut.window)
+    order, shape = np.argsort(bands), tuple(span.stop - span.start for span in cut.window)
     unestimated = np.ones(cut.status.size, dtype=bool)
     for _, pixels, _ in estimates:
         unestimated &= ~pixels

@@ -90,10 +90,10 @@ class Displacement:
         """Weights of the pixels of some rows of the source, for those of some rows."""
         width = self.shape[1]
         start = self.resample.indptr[rows.start * width : rows.stop * width + 1]
-        part = slice(start[0], start[-1])
-        columns = self.resample.indices[part] - source.start * width
+        entries = slice(start[0], start[-1])
+        columns = self.resample.indices[entries] - source.start * width
         shape = (start.size - 1, (source.stop - source.start) * width)
-        return csr_array((self.resample.data[part], columns, start - start[0]), shape=shape)
+        return csr_array((self.resample.data[entries], columns, start - start[0]), shape=shape)
 
 
 def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
@@ -111,12 +111,12 @@ def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
         raise ValueError(f"Invalid axis {field['axis'].values.tolist()} of {label}. Must be y, x.")
     shift = field["shift"].values.astype(np.float64)
     std = field["shift_std"].values.astype(np.float64)
-    known = field["known"].values
+    trusted = field["known"].values
     size = np.array(shift.shape[1:])
     finite = np.all(schema.measured(shift), axis=0)
     if not np.any(finite):
         raise ValueError(f"Invalid {label[4:]} without a number. Must be finite somewhere.")
-    if np.any(known & ~finite):
+    if np.any(trusted & ~finite):
         raise ValueError(f"Invalid {label[4:]}: no number where it is known. Must be finite there.")
     if np.any(~(std[:, finite] >= 0) | ~schema.measured(std[:, finite])):
         raise ValueError(f"Invalid shift_std of {label}. Must be zero or positive, and finite.")
@@ -129,23 +129,23 @@ def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
     # Beyond where it is known the nearest shift leads on; p is where d(p) itself is known.
     nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
     shift = shift[:, nearest[0], nearest[1]]
-    there = np.indices(finite.shape, dtype=np.float64)
-    place, solved = _inverse(shift, there)
+    pixels = np.indices(finite.shape, dtype=np.float64)
+    place, solved = _inverse(shift, pixels)
     solved &= map_coordinates(finite.astype(np.float64), place, order=0, mode="nearest") > 0
     return Displacement(
         shape=(shift.shape[1], shift.shape[2]),
         reference=reference,
         others=[band for band in range(len(names)) if band != reference],
         resample=_interpolation(place, solved),
-        onward=_interpolation(there + shift, finite),
+        onward=_interpolation(pixels + shift, finite),
         std=np.nan_to_num(std).reshape(2, -1),
     )
 
 
 def _check_bands(field: xr.Dataset, names: list[str], reference: str) -> None:
     """Check the bands that the field says it is of, where it does."""
-    others = [name for name in names if name != reference]
-    for key, rule in (("reference_band", [reference]), ("bands", others)):
+    second = [name for name in names if name != reference]
+    for key, rule in (("reference_band", [reference]), ("bands", second)):
         stated = [str(name) for name in np.atleast_1d(field.attrs.get(key, rule))]
         if sorted(stated) != sorted(rule):
             raise ValueError(
@@ -154,13 +154,13 @@ def _check_bands(field: xr.Dataset, names: list[str], reference: str) -> None:
             )
 
 
-def _inverse(shift: Array, there: Array) -> tuple[Array, Mask]:
+def _inverse(shift: Array, pixels: Array) -> tuple[Array, Mask]:
     """Places p (2, y, x) with p + d(p) = r, by iteration, and where it has come to an end."""
-    place = there - shift
+    place = pixels - shift
     for _ in range(_ROUNDS):
-        at = [map_coordinates(one, place, order=1, mode="nearest") for one in shift]
-        step = np.abs(there - at - place).max(axis=0)
-        place = there - at
+        at = [map_coordinates(component, place, order=1, mode="nearest") for component in shift]
+        step = np.abs(pixels - at - place).max(axis=0)
+        place = pixels - at
         if step.max() < _SOLVED:
             break
     return place, step < _UNSOLVED
@@ -200,7 +200,7 @@ def paired(
     displacement: Displacement,
     rows: slice,
     source: slice,
-    some: slice | npt.NDArray[np.intp],
+    selected: slice | npt.NDArray[np.intp],
     fewest: int,
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
@@ -209,28 +209,33 @@ def paired(
     pixels of any capture whose films are on disk.
     """
     films, key = displacement.read, (rows.start, rows.stop)
-    every, chosen = (*key, None), (*key, None if isinstance(some, slice) else some.tobytes())
+    every, chosen = (
+        (*key, None),
+        (*key, None if isinstance(selected, slice) else selected.tobytes()),
+    )
     if chosen in displacement.shelved:
         counts, usable, valid, status, gain = (get() for get in displacement.shelved[chosen])
         return counts, usable, valid, status, gain
     if chosen not in films:
-        found = films.get(every)
-        if found is None:
+        reading = films.get(every)
+        if reading is None:
             block, grains = load()
             counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
             counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-            found = counts, usable, valid, status, gain
+            reading = counts, usable, valid, status, gain
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
-            share, found = 1.0, tuple(select(film, some) for film in found)
+            share, reading = 1.0, tuple(select(film, selected) for film in reading)
             if displacement.shelf is not None:
                 with suppress(OSError):  # a full disk: read anew
-                    displacement.shelved[chosen] = [displacement.shelf.put(it) for it in found]
-                return found
-        size, held = (sum(film.nbytes for film in one) for one in (found, chain(*films.values())))
+                    displacement.shelved[chosen] = [displacement.shelf.put(it) for it in reading]
+                return reading
+        size, held = (
+            sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
+        )
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
-            return found
-        films[chosen] = found
+            return reading
+        films[chosen] = reading
     counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
     return counts.copy(), usable, valid, status.copy(), gain
 
@@ -249,23 +254,23 @@ def read(
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
     `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
-    reference, others = displacement.reference, displacement.others
-    own = displacement.source(rows)
+    reference, second_bands = displacement.reference, displacement.others
+    needed = displacement.source(rows)
     first = block.isel(
         band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
     )
-    weights = displacement.weights(rows, own)
-    used, place = _used(weights, slice(own.start - source.start, own.stop - source.start))
+    weights = displacement.weights(rows, needed)
+    used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
-    second = block.isel(band=others, **place)
-    seen, measured, flags = quality.read(second, fewest, [grains[band] for band in others])
+    second = block.isel(band=second_bands, **place)
+    seen, measured, flags = quality.read(second, fewest, [grains[band] for band in second_bands])
     seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
     bad = np.zeros(weights.shape[1], dtype=bool)
     bad[used] = quality.unusable(flags)
     weights = without(weights, bad, displacement.shape[1])[:, used]
-    counts = np.stack([counts[0]] * (len(others) + 1))
-    for band, one in zip(others, seen, strict=True):
-        counts[band] = (weights @ one.T).T
+    counts = np.stack([counts[0]] * (len(second_bands) + 1))
+    for band, signal in zip(second_bands, seen, strict=True):
+        counts[band] = (weights @ signal.T).T
     share = abs(weights)
     if not measured.all():  # a sample that was bridged does not count where its weight is small
         valid = valid & ((share @ ~usable.T).T <= 0.0)
@@ -284,13 +289,13 @@ def read(
     counts[:, :, quality.unusable(status)] = 0.0
     gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
     good = ~quality.unusable(flags)
-    if "noise_factor" in block and np.any(block["noise_factor"][others] < 1.0) and good.any():
+    if "noise_factor" in block and np.any(block["noise_factor"][second_bands] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
         key = (rows.start, rows.stop, source.start, source.stop)
         gain *= displacement.once(
             key,
             lambda: samples.resampled_noise(
-                seen[:, :, good], counts[others], gain, displacement.shape[1]
+                seen[:, :, good], counts[second_bands], gain, displacement.shape[1]
             ),
         )
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
@@ -303,7 +308,7 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
         return slice(None), {"y": rows}
     y, x = np.divmod(used, pixels // (rows.stop - rows.start))
     places = {"y": y + rows.start, "x": x}
-    return used, {name: xr.DataArray(one, dims="pixel") for name, one in places.items()}
+    return used, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
@@ -312,8 +317,8 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
 
     Where that part is large the weights stay as they are.
     """
-    part = abs(weights) @ bad
-    rows = np.flatnonzero((part > 0) & (part <= _LOST_WEIGHT))
+    lost = abs(weights) @ bad
+    rows = np.flatnonzero((lost > 0) & (lost <= _LOST_WEIGHT))
     if rows.size == 0:
         return weights
     weights = weights.copy()

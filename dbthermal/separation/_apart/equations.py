@@ -111,38 +111,38 @@ class Equations:
         _other_bands(np.ascontiguousarray(shares), self.bends, signal, result)
         return result
 
-    def solve(self, target: Floats, alone: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
+    def solve(self, target: Floats, start: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
         """
         Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
         """
-        own, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
-        others, back = self.shares[1:], self.shares[1:, self.backward]
-        beyond = np.asarray((self.onward @ others.T).T)
+        first, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
+        second, back = self.shares[1:], self.shares[1:, self.backward]
+        beyond = np.asarray((self.onward @ second.T).T)
         slope = beyond.sum(axis=0)[:, np.newaxis]
-        rest = np.setdiff1d(self.loose, backward)
-        signal, step = alone, np.zeros_like(alone)
+        newton = np.setdiff1d(self.loose, backward)
+        signal, step = start, np.zeros_like(start)
         for _ in range(_STEPS):
-            there = self.beside(signal, change)
-            right = target - self.other_bands(others, there)
+            at_p = self.beside(signal, change)
+            right = target - self.other_bands(second, at_p)
             following = signal.copy()
-            following[forward] = right[forward] / own[forward]
+            following[forward] = right[forward] / first[forward]
             # Newton's steps, of a slope near sum c = 1.
-            following[rest] += right[rest] - own[rest] * signal[rest]
+            following[newton] += right[newton] - first[newton] * signal[newton]
             # The same for x(p), of the equation at p + d(p).
-            right = np.asarray(self.onward @ (target - own * signal))
+            right = np.asarray(self.onward @ (target - first * signal))
             following[backward] += (right - self.other_bands(beyond, signal[backward])) / slope
             step, signal = np.abs(following - signal), following
             if step.max(initial=0.0) < CONVERGED:
                 break
-        there = self.beside(signal, change)
+        at_p = self.beside(signal, change)
         # A backward pixel's own equation holds for another x(p) than that between its neighbours.
-        right = target[backward] - own[backward] * signal[backward]
-        right -= self.other_bands(back, there[backward])
-        there[backward] += right / back.sum(axis=0)[:, np.newaxis]
-        return signal, there, step.max(axis=1)
+        right = target[backward] - first[backward] * signal[backward]
+        right -= self.other_bands(back, at_p[backward])
+        at_p[backward] += right / back.sum(axis=0)[:, np.newaxis]
+        return signal, at_p, step.max(axis=1)
 
 
 def first_emissivity(inputs: Inputs, result: xr.Dataset) -> Floats:
@@ -199,19 +199,19 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
     displacement = inputs.displacement
     assert displacement is not None
     shares = coefficients(inputs, emissivity, solved)
-    there, linked = _among(displacement.resample, solved, displacement.shape[1])
+    at_p, linked = _among(displacement.resample, solved, displacement.shape[1])
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
-    own, others = np.abs(shares[0]), shares[1:].sum(axis=0)
-    strong = np.abs(others) < own
+    size, second = np.abs(shares[0]), shares[1:].sum(axis=0)
+    strong = np.abs(second) < size
     # The error of a step: only where it contracts, with the weights' signs, are places linked.
-    forward, back = abs(there).sum(axis=1) * np.abs(others), abs(onward) @ own
-    reached &= back < _LARGEST * np.abs(onward @ others)
-    linked &= np.where(strong, forward < _LARGEST * own, reached)
+    forward, back = abs(at_p).sum(axis=1) * np.abs(second), abs(onward) @ size
+    reached &= back < _LARGEST * np.abs(onward @ second)
+    linked &= np.where(strong, forward < _LARGEST * size, reached)
     backward = np.flatnonzero(linked & ~strong)
     return Equations(
         first=np.where(solved, emissivity[0], 1.0),
         shares=shares,
-        there=csr_array(diags_array(linked.astype(np.float32)) @ there.astype(np.float32)),
+        there=csr_array(diags_array(linked.astype(np.float32)) @ at_p.astype(np.float32)),
         onward=csr_array(onward[backward].astype(np.float32)),
         forward=np.flatnonzero(linked & strong),
         backward=backward,
@@ -233,11 +233,11 @@ def bends(curves: tuple[Curve, ...]) -> Floats:
     """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
     temperature = np.linspace(first.lowest, first.highest, 64)
-    own = first.signal(temperature)
-    place = own - first.reference
+    signal = first.signal(temperature)
+    place = signal - first.reference
     result = np.zeros((len(curves) - 1, _DEGREE + 1))
-    for bend, one in zip(result, curves[1:], strict=True):
-        fit = Polynomial.fit(place, one.signal(temperature) - own, _DEGREE).convert()
+    for bend, curve in zip(result, curves[1:], strict=True):
+        fit = Polynomial.fit(place, curve.signal(temperature) - signal, _DEGREE).convert()
         bend[: fit.coef.size] = fit.coef  # without the last ones that are zero
     return result
 
@@ -264,21 +264,21 @@ def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats
     return np.asarray(1.0 - ratio * (1.0 - first)), sharp & np.isfinite(material.ratio[-1])
 
 
-def told(film: Floats) -> tuple[Mask, Mask]:
+def measured(film: Floats) -> tuple[Mask, Mask]:
     """Pixels of a film (frame, pixel) with a number in some frame, and in every one."""
-    some, every = np.zeros(film.shape[1], dtype=bool), np.ones(film.shape[1], dtype=bool)
-    for part in parts(film):
-        known = np.isfinite(film[part])
-        some |= known.any(axis=0)
-        every &= known.all(axis=0)
-    return some, every
+    sometimes, always = np.zeros(film.shape[1], dtype=bool), np.ones(film.shape[1], dtype=bool)
+    for frames in parts(film):
+        finite = np.isfinite(film[frames])
+        sometimes |= finite.any(axis=0)
+        always &= finite.all(axis=0)
+    return sometimes, always
 
 
 def bridge(film: Floats, solved: Mask) -> Floats:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
     last = np.full(solved.size, -1)
-    for part in parts(film):
-        _bridge(film, part.start, min(part.stop, len(film)), solved, last)
+    for frames in parts(film):
+        _bridge(film, frames.start, min(frames.stop, len(film)), solved, last)
     for pixel in np.flatnonzero(solved & (last >= 0) & (last < len(film) - 1)):
         film[last[pixel] + 1 :, pixel] = film[last[pixel], pixel]
     return film
@@ -345,12 +345,12 @@ def change(inputs: Inputs, loose: Whole) -> Change:
     assert displacement is not None
     functions = smooth_functions(inputs.capture)
     bad = displacement.once("bad", lambda: _bad(inputs))
-    there = without(displacement.resample[loose], bad, displacement.shape[1])
-    unknown = abs(there) @ bad > 0.0
+    at_p = without(displacement.resample[loose], bad, displacement.shape[1])
+    unknown = abs(at_p) @ bad > 0.0
     # Only the pixels that they are made of are read.
-    pixels = np.unique(np.concatenate([loose, there.indices]))
+    pixels = np.unique(np.concatenate([loose, at_p.indices]))
     film = _film(inputs, pixels).T
-    moved = there[:, pixels] @ film - film[np.searchsorted(pixels, loose)]
+    moved = at_p[:, pixels] @ film - film[np.searchsorted(pixels, loose)]
     moved[unknown] = 0.0
     curves = moved @ functions.functions
     error = moved - curves @ functions.functions.T

@@ -92,9 +92,9 @@ class Frames:
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
         weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
-        some = looked_at(time.size)
-        apart = np.abs(weights[some] @ film[nodes] - film[some]) / std[some]
-        if nodes.size == time.size or not _most(apart) < _NO_MATTER:
+        sampled = looked_at(time.size)
+        off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
+        if nodes.size == time.size or not _most(off) < _NO_MATTER:
             return cls(every, None)
         return cls(nodes, weights)
 
@@ -125,21 +125,21 @@ class Joint:
     factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, rows: slice, some: slice | Whole) -> Floats:
+    def difference(self, rows: slice, selected: slice | Whole) -> Floats:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
         width = self.inputs.capture.sizes["x"]
-        pixels = np.arange(rows.start * width, rows.stop * width)[some]
+        pixels = np.arange(rows.start * width, rows.stop * width)[selected]
         return self.at(slice(None), pixels)
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
-        signals, weights, parts = self.signals[..., pixels], self.frames.weights, []
+        signals, weights, changes = self.signals[..., pixels], self.frames.weights, []
         bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
         for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
             change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
             change = np.nan_to_num(share.astype(np.float32) * change)
-            parts.append(change[frames] if weights is None else weights[frames] @ change)
-        return np.asarray(parts)
+            changes.append(change[frames] if weights is None else weights[frames] @ change)
+        return np.asarray(changes)
 
     def finish(self, result: xr.Dataset) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
@@ -149,8 +149,8 @@ class Joint:
         background = result["background_temperature"].values
         basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
         every = []
-        for part in self.inputs.blocks:
-            film = background[:, part].reshape(time.size, -1).astype(np.float64)
+        for rows in self.inputs.blocks:
+            film = background[:, rows].reshape(time.size, -1).astype(np.float64)
             every.append(basis.T @ system.bridge(film, np.ones(film.shape[1], dtype=bool)))
             release()
         curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
@@ -164,13 +164,13 @@ class Joint:
         ).sum(0)
         off = np.nan_to_num(weight * displacement.std).reshape(2, *status.shape)
         slopes = [
-            gaussian_filter1d(curves, 1.0, axis=axis, order=1) * one
-            for axis, one in zip((1, 2), off, strict=True)
+            gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component
+            for axis, component in zip((1, 2), off, strict=True)
         ]
         factor = self.factor().reshape(status.shape)
-        for part in self.inputs.blocks:
-            squares = [np.tensordot(basis, one[:, part], 1) ** 2 for one in slopes]
-            std[:, part] = np.sqrt(factor[part] * std[:, part] ** 2 + sum(squares))
+        for rows in self.inputs.blocks:
+            squares = [np.tensordot(basis, component[:, rows], 1) ** 2 for component in slopes]
+            std[:, rows] = np.sqrt(factor[rows] * std[:, rows] ** 2 + sum(squares))
             release()
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
@@ -227,9 +227,9 @@ def solve(
         start = None
         if sampled is frames.nodes and before is not None:
             start = before.signals[0][:, places].T
-        here, beside, step = objects_at(sampled, equations, start)
-        others = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
-        share = np.abs(others[:, np.newaxis] * (beside - here)) / size[:, np.newaxis]
+        at_r, at_p, step = objects_at(sampled, equations, start)
+        second = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
+        share = np.abs(second[:, np.newaxis] * (at_p - at_r)) / size[:, np.newaxis]
         if not _most(share) > _MATTERS:
             return None
         # The emissivities, if they are not those of a material.
@@ -244,19 +244,19 @@ def solve(
             band = first[:, places], steps[:, places]
             solve_at = partial(objects_at, sampled)
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, solve_at, (here, beside), band
+                inputs, result, raw, solved, equations, solve_at, (at_r, at_p), band
             )
-            here, beside, _ = objects_at(sampled, equations, here)
-        solutions = [(slice(None), (here, beside, step))]
+            at_r, at_p, _ = objects_at(sampled, equations, at_r)
+        solutions = [(slice(None), (at_r, at_p, step))]
         if sampled is not frames.nodes:
-            parts = frames.parts()
-            results = threads.map(lambda part: objects_at(frames.nodes[part], equations), parts)
-            solutions = list(zip(parts, results, strict=True))
+            groups = frames.parts()
+            results = threads.map(lambda nodes: objects_at(frames.nodes[nodes], equations), groups)
+            solutions = list(zip(groups, results, strict=True))
         signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         weight = system.weights(inputs, emissivity)[0]
         off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
-        off *= equations.spread(np.mean((beside - here) ** 2, axis=1))
+        off *= equations.spread(np.mean((at_p - at_r) ** 2, axis=1))
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
     errors = partial(_factor, inputs, equations, np.array(sizes), change.variance, blur)
     return Joint(inputs, frames, signals, emissivity, errors, unsettled)
@@ -267,10 +267,10 @@ def _solvable(
 ) -> tuple[Floats, Mask]:
     """Emissivities (band, pixel) [1] of the equations, and the pixels that have one."""
     film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-    raw, solved = system.first_emissivity(inputs, result), system.told(film)[0]
+    raw, solved = system.first_emissivity(inputs, result), system.measured(film)[0]
     if maps is not None and material is not None:
-        raw, given = system.of_material(inputs, raw, material)
-        solved |= given & maps.usable.ravel()
+        raw, sharp = system.of_material(inputs, raw, material)
+        solved |= sharp & maps.usable.ravel()
     return raw, solved & np.all(np.isfinite(raw), axis=0)
 
 
@@ -282,8 +282,8 @@ def _spread(
     """Signals (2, node, pixel) [K] of solutions of some nodes, and the pixels that go on moving."""
     signals = np.full((2, *shape), np.nan, np.float32)
     unsettled = np.zeros(shape[1], dtype=bool)
-    for part, (*pair, step) in solutions:
-        signals[:, part, places] = np.swapaxes(pair, 1, 2)
+    for nodes, (*pair, step) in solutions:
+        signals[:, nodes, places] = np.swapaxes(pair, 1, 2)
         unsettled[places] |= step > 10.0 * system.CONVERGED
     signals[np.abs(signals) > USELESS] = np.nan
     return signals, unsettled
@@ -362,15 +362,15 @@ def _emissivities(
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
-    told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
+    measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     step = np.zeros(solved.size)
     for _ in range(_ROUNDS):
-        found = _emission(places, band, emissivity[0, solved], noise)
-        slope, variance, known = (equations.spread(one) for one in found)
+        estimates = _emission(places, band, emissivity[0, solved], noise)
+        slope, variance, sound = (equations.spread(values) for values in estimates)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
-        known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
-        slope, known = np.where(known, slope, emissivity[0]), known & (variance > 0)
-        slope, variance = neighbours.shared(slope, variance, known, result["status"].shape)
+        sound &= measured & np.all((likely > 0.0) & (likely < 1.0), axis=0)
+        slope, sound = np.where(sound, slope, emissivity[0]), sound & (variance > 0)
+        slope, variance = neighbours.shared(slope, variance, sound, result["status"].shape)
         last, step = step, slope - emissivity[0]
         step[step * last < 0] *= 0.5  # it swings to and fro
         slope = emissivity[0] + step
@@ -396,15 +396,15 @@ def _emission(
     Of the object's signals at both places (solved, frame), and those of the band and the steps of
     the camera in it (frame, solved).
     """
-    own = places[0].T.astype(np.float64)
-    line = residuals.regress(own, np.asarray(band[0], np.float64), noise)
+    signal = places[0].T.astype(np.float64)
+    line = residuals.regress(signal, np.asarray(band[0], np.float64), noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     steep = np.maximum(_slope(*places), 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
-    by_steps = (line.kernel(own) * band[1]).sum(axis=0)
+    by_steps = (line.kernel(signal) * band[1]).sum(axis=0)
     variance = (line.variance + by_steps**2) / steep**2
-    known = line.energy > _LEAST_CHANGE**2 * len(own)
-    return emissivity + (line.slope - emissivity) / steep, variance, known
+    sound = line.energy > _LEAST_CHANGE**2 * len(signal)
+    return emissivity + (line.slope - emissivity) / steep, variance, sound
 
 
 def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
@@ -433,21 +433,23 @@ def _factor(
     image = drawn.reshape(*displacement.shape, _DRAWS)
     drawn = gaussian_filter(image, blur, axes=(0, 1)).reshape(drawn.shape)
     gain = np.sqrt((drawn**2).mean(axis=1, keepdims=True))
-    alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
+    errors = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
     # Those of a material are common to its pixels.
     labels = np.arange(len(size)) if inputs.labels is None else inputs.labels
     common = rng.standard_normal((len(size), _DRAWS), dtype=np.float32)[labels]
-    target = alone + off * common
+    target = errors + off * common
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bends=np.zeros_like(equations.bends))
     places = linear.solved
-    signal, _, _ = linear.packed.solve(target[places], alone[places], change)
-    own, power = size[:, 0] > 0, linear.spread((signal.astype(np.float64) ** 2).mean(axis=1))
+    signal, _, _ = linear.packed.solve(target[places], errors[places], change)
+    sized, power = size[:, 0] > 0, linear.spread((signal.astype(np.float64) ** 2).mean(axis=1))
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
-        convolve(np.where(settled, one, 0.0).reshape(displacement.shape), np.ones((3, 3))).ravel()
-        for one in (power, size[:, 0] ** 2)
+        convolve(
+            np.where(settled, values, 0.0).reshape(displacement.shape), np.ones((3, 3))
+        ).ravel()
+        for values in (power, size[:, 0] ** 2)
     )
     factor = np.divide(energy, total, out=np.full_like(energy, np.nan), where=settled)
-    return np.where(own, factor, 1.0)
+    return np.where(sized, factor, 1.0)

@@ -73,8 +73,8 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     weight[0] = sound
     mean = neighbour_mean(ratio, weight, _WIDE)
     chi = neighbour_mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
-    around = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
-    doubtful = moving & ~sound & around
+    surrounded = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
+    doubtful = moving & ~sound & surrounded
     variance = np.where(
         doubtful, neighbour_mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
     )
@@ -95,7 +95,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
 def materials(
     inputs: Inputs,
     scatters: dict[float, Scatters],
-    alone: xr.Dataset,
+    per_pixel: xr.Dataset,
     pooled: Callable[..., Material | None],
 ) -> Material | None:
     """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
@@ -105,7 +105,7 @@ def materials(
     narrow for a blur has that of the others.
     """
     assert inputs.labels is not None
-    noise, shape = inputs.noise[inputs.bands], alone["status"].shape
+    noise, shape = inputs.noise[inputs.bands], per_pixel["status"].shape
     labels, material, sharp = inputs.labels.reshape(shape), None, None
     between = np.zeros(inputs.labels.size)
     for blur, scatter in scatters.items():
@@ -116,7 +116,7 @@ def materials(
         )
         if places.size:  # else all materials are too narrow
             image = Image(inputs.labels, places, shape[1])
-            survey = _survey(scatter, alone, noise, places)
+            survey = _survey(scatter, per_pixel, noise, places)
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
             variance = image.expand(_between_windows(image, survey, noise, shape))
             between = np.where(np.isfinite(variance), variance, between)
@@ -132,11 +132,11 @@ def materials(
 
 
 def _survey(
-    scatters: Scatters, alone: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
+    scatters: Scatters, per_pixel: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
 ) -> Survey:
     """Survey of some pixels by their planes; of those of a sound model."""
-    status = alone["status"].values.ravel()[places]
-    emissivity = alone["emissivity"].sel(band=alone.attrs["reference_band"]).values
+    status = per_pixel["status"].values.ravel()[places]
+    emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
     sound = ((status & _BROKEN) == 0) & ~scatters.apart[places]
     scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
@@ -183,15 +183,15 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
     What the last of them has, or half of what all have: of two simulated vessels 94 and 95 % of the
     intervals hold so, 90 and 94 % by the last alone, 94 and 95 % by all with 1.2 times the error.
     """
-    known = np.isfinite(more.ratio[-1])
-    measured = known & np.isfinite(less.ratio[-1])
+    wide = np.isfinite(more.ratio[-1])
+    measured = wide & np.isfinite(less.ratio[-1])
     last, whole = (np.abs(more.ratio / before.ratio - 1.0) for before in (less, sharp))
     change = np.fmax(last, 0.5 * whole)
     usual = np.median(change[:, measured], axis=1, keepdims=True) if measured.any() else 0.0
-    ratio = np.where(known, more.ratio, less.ratio)
+    ratio = np.where(wide, more.ratio, less.ratio)
     off = energy_of_variance(ratio, (np.where(measured, change, usual) * ratio) ** 2, noise)
-    inverse = np.where(known, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
-    spread = np.where(known, more.spread, less.spread)
+    inverse = np.where(wide, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
+    spread = np.where(wide, more.spread, less.spread)
     return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)
 
 
@@ -200,13 +200,13 @@ def emissivities(inputs: Inputs, result: xr.Dataset) -> Floats:
     """Emissivities (band, pixel) [1] of a result that lean on those around, inside of (0, 1)."""
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
-    known = (result["status"].values.ravel() == 0) & (variance > 0)
-    first = shared(raw[0], variance, known, result["status"].shape)[0]
+    sound = (result["status"].values.ravel() == 0) & (variance > 0)
+    first = shared(raw[0], variance, sound, result["status"].shape)[0]
     return system.inside(1.0 - system.ratio_of(raw) * (1.0 - first))
 
 
 def shared(
-    value: Floats, variance: Floats, known: Mask, shape: tuple[int, ...]
+    value: Floats, variance: Floats, sound: Mask, shape: tuple[int, ...]
 ) -> tuple[Floats, Floats]:
     """
     Values (pixel) [1] that lean on those around, the more the less they are known; and variances.
@@ -216,16 +216,16 @@ def shared(
     change of what is mirrored is no noise. To lean does not lessen them: neighbours share such
     errors. One that is not known has the neighbourhood's.
     """
-    value, variance = (one.reshape(shape) for one in (value, variance))
-    known = known.reshape(shape)
-    weight = np.divide(1.0, variance, out=np.zeros(shape), where=known)
+    value, variance = (values.reshape(shape) for values in (value, variance))
+    sound = sound.reshape(shape)
+    weight = np.divide(1.0, variance, out=np.zeros(shape), where=sound)
     square = (value - _median(value, weight)) ** 2 * weight
     chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
     weight, wide = weight / chi, _AROUND * min(shape)
     mean = neighbour_mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
     prior = np.nan_to_num(neighbour_mean((value - mean) ** 2, weight, wide))
-    variance = np.where(known, variance * chi, np.where(prior > 0, prior, variance))
+    variance = np.where(sound, variance * chi, np.where(prior > 0, prior, variance))
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
@@ -236,7 +236,7 @@ def _median(values: Floats, weight: Floats) -> Floats:
     # At every few pixels, then interpolated: it changes as slowly as its window is wide.
     stride = max(1, reach // 2)
     padded = np.pad(filled, reach, mode="edge")
-    around = sliding_window_view(padded, (1 + 2 * reach, 1 + 2 * reach))[::stride, ::stride]
-    coarse = np.median(around.reshape(*around.shape[:2], -1), axis=2)
+    windows = sliding_window_view(padded, (1 + 2 * reach, 1 + 2 * reach))[::stride, ::stride]
+    coarse = np.median(windows.reshape(*windows.shape[:2], -1), axis=2)
     place = np.indices(filled.shape) / stride
     return np.asarray(map_coordinates(coarse, place, order=1, mode="nearest"))

@@ -154,28 +154,28 @@ def project(
                 places = cut.places[pixels]
                 row, column = np.divmod(places, width)
                 # Functions of frames that some pixels lack: no longer orthogonal to the smooth.
-                few = columns.functions[frames]
-                inverse = np.linalg.solve(few.T @ few, few.T)
-                rest = rapid[frames] - few @ (inverse @ rapid[frames])
+                slow = columns.functions[frames]
+                inverse = np.linalg.solve(slow.T @ slow, slow.T)
+                quick = rapid[frames] - slow @ (inverse @ rapid[frames])
                 x = film[:, places] if frames.all() else film[np.ix_(frames, places)]
                 shares = emissivity[:, places].astype(np.float64)
                 emitted = np.empty(x.shape, np.float32)
                 _emit(np.asarray(x, np.float32), response, emitted)
-                inverse, rest = inverse.astype(np.float32), rest.astype(np.float32)
+                inverse, quick = inverse.astype(np.float32), quick.astype(np.float32)
                 signals = np.ascontiguousarray(tile.signals, np.float32)
                 _straighten(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
                     more = inputs.difference(cut.window[0], slice(None))[:, frames]
-                    there = np.searchsorted(cut.places, places)
-                    for band, part in enumerate(more, 1):
-                        straight[band][:, places] += inverse @ part[:, there]
+                    index = np.searchsorted(cut.places, places)
+                    for band, changes in enumerate(more, 1):
+                        straight[band][:, places] += inverse @ changes[:, index]
                 _without_object(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
-                    maps[band][:, row, column] = rest.T @ signal
+                    maps[band][:, row, column] = quick.T @ signal
                 noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
-                freedom[row, column] = np.sum(rest**2, dtype=np.float64)
+                freedom[row, column] = np.sum(quick**2, dtype=np.float64)
                 usable[row, column] = True
         release()
 

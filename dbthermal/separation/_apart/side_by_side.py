@@ -27,30 +27,30 @@ _TURNS: Final = 2
 _OBJECTS: Final = "objects"
 
 
-def alone(inputs: Inputs, result: xr.Dataset, each: Each, threads: Executor) -> None:
+def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Executor) -> None:
     """Separate without materials, then by the ratios of bands that are blurred alike."""
     displacement = inputs.displacement
     assert displacement is not None
-    each(inputs, None)
+    separate_pixels(inputs, None)
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
     if inputs.method.pools and displacement.moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
-            each(inputs, None)
+            separate_pixels(inputs, None)
         shares = neighbours.emissivities(inputs, result)
         maps = planes.project(inputs, result, shares, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
         if not frames.smooth:
-            each(inputs, material)
+            separate_pixels(inputs, material)
     objects = joint.solve(
         inputs, result, threads, frames, maps=maps, material=material, before=objects, blur=blur
     )
     if objects is not None:
         inputs = replace(inputs, difference=objects.difference)
     if objects is not None or material is not None:
-        each(inputs, material)
+        separate_pixels(inputs, material)
     if objects is not None:
         objects.finish(result)
     displacement.found[_OBJECTS] = objects
@@ -60,7 +60,7 @@ def pooled(
     inputs: Inputs,
     before: xr.Dataset,
     result: xr.Dataset,
-    each: Each,
+    separate_pixels: Each,
     threads: Executor,
     materials: Callable[..., Material | None],
     regroup: pool.Regroup | None = None,
@@ -80,11 +80,13 @@ def pooled(
         plain = replace(inputs, difference=None) if frames.smooth else inputs
         maps = planes.project(plain, before, shares, threads)
         scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
-        survey = partial(neighbours.materials, scatters=scatters, alone=before, pooled=materials)
+        survey = partial(
+            neighbours.materials, scatters=scatters, per_pixel=before, pooled=materials
+        )
         inputs, material = pool.regrouped(inputs, survey, regroup if turn == 0 else None)
         source = before
         if not frames.smooth:
-            each(inputs, material)
+            separate_pixels(inputs, material)
             source = result
         objects = joint.solve(
             inputs, source, threads, frames, maps=maps, material=material, before=objects
@@ -95,6 +97,6 @@ def pooled(
         shares = objects.emissivity
     if objects is not None:
         inputs = replace(inputs, difference=objects.difference)
-    each(inputs, material)
+    separate_pixels(inputs, material)
     if objects is not None:
         objects.finish(result)
