@@ -29,7 +29,7 @@ _EVEN: Final = 0.5  # difference of mean and median, relative to a step of all p
 
 def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     """Doubts about counts of a capture that do not fit its response."""
-    found = list[str]()
+    sentences = list[str]()
     counts = schema.check(corrected, "corrected")["counts"]
     if counts.dtype.kind != "f":  # raw counts of pixels that differ
         return []
@@ -41,20 +41,20 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     factors = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
     stds = np.hypot(noises * factors, patterns)
-    for name, one, std in zip(names, counts, stds, strict=True):
-        every = one[:: max(1, len(one) // _FRAMES), ::step, ::step].values[:, good]
+    for name, film, std in zip(names, counts, stds, strict=True):
+        every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
         curve = responses.curve(response, name)
         low, high = curve.counts([curve.lowest, curve.highest])
         margin = RANGE_SIGMAS * std
         outside = (every < low - margin) | (every > high + margin)
         share = float(outside.sum() / max(1, np.isfinite(every).sum()))
         if share > _OUTSIDE:
-            found.append(
+            sentences.append(
                 f"{share:.0%} of the samples of band '{name}' lie outside the {low:.0f} to "
                 f"{high:.0f} count that its response was calibrated over. Must lie within: "
                 "calibrate over the temperatures of the scene; or is it another band's response?"
             )
-    return found
+    return sentences
 
 
 def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
@@ -66,42 +66,42 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
     films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)
     # Samples of all bands: one clock's resampling leaves out those of one band where much moves.
-    known = schema.measured(films).all(axis=0)
-    known = known[1:] & known[:-1]
-    number = known.sum(axis=1)
-    seen = joined & (number > max(_FEWEST, 0.5 * known.shape[1]))
+    valid = schema.measured(films).all(axis=0)
+    valid = valid[1:] & valid[:-1]
+    number = valid.sum(axis=1)
+    seen = joined & (number > max(_FEWEST, 0.5 * valid.shape[1]))
     if not seen.any():  # too few pixels tell it
         return []
-    names, found = [str(name) for name in counts["band"].values], list[str]()
+    names, sentences = [str(name) for name in counts["band"].values], list[str]()
     slopes = np.array([[responses.curve(response, name).reference_slope] for name in names])
     with np.errstate(invalid="ignore"):
-        changes = np.where(known, np.diff(films, axis=1), np.nan)  # [count]
+        changes = np.where(valid, np.diff(films, axis=1), np.nan)  # [count]
     # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
     ordered = np.sort(changes, axis=2)  # NaN last
     ranks = (np.array([0.25, 0.5, 0.75]) * np.maximum(number[:, np.newaxis] - 1, 0)).astype(np.intp)
     quartiles = np.take_along_axis(ordered, ranks[np.newaxis], axis=2)
     low, middle, high = np.moveaxis(quartiles, 2, 0) / slopes
     mean = np.nansum(changes, axis=2, dtype=np.float64) / np.maximum(number, 1) / slopes
-    noise = 0.5 * MAD * np.median((high - low)[:, seen], axis=1) / np.sqrt(known.shape[1])
+    noise = 0.5 * MAD * np.median((high - low)[:, seen], axis=1) / np.sqrt(valid.shape[1])
     mean, median = (
-        np.where(seen, one - median_filter(one, (1, _AROUND)), 0.0)
-        for one in (np.where(seen, mean, 0.0), np.where(seen, middle, 0.0))
+        np.where(seen, film - median_filter(film, (1, _AROUND)), 0.0)
+        for film in (np.where(seen, mean, 0.0), np.where(seen, middle, 0.0))
     )
     unseen = np.abs(mean) + _SIGMAS * noise[:, np.newaxis]
     for place, size in enumerate(np.abs(mean)):
-        alone = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
-        alone &= size > _CERTAIN * noise[place]
+        single = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
+        single &= size > _CERTAIN * noise[place]
         # In proportion to what moves, as a median is not; which is the same if all pixels step.
-        alone &= np.abs(median[place] - mean[place]) < _EVEN * size
-        if alone.any():
-            frame = int(np.argmax(size * alone))
-            found.append(
+        single &= np.abs(median[place] - mean[place]) < _EVEN * size
+        if single.any():
+            frame = int(np.argmax(size * single))
+            sentences.append(
                 f"The level of band '{names[place]}' steps by "
                 f"{mean[place, frame]:.2g} K at {time[frame + 1]:g} s in all pixels, and no other "
                 "band's does: a camera's own, which no error bar holds. Must be steady, or marked "
                 "(correction.mark_shutter)."
             )
-    return found
+    return sentences
 
 
 def hardly_measured(result: xr.Dataset) -> list[str]:
@@ -118,6 +118,6 @@ def hardly_measured(result: xr.Dataset) -> list[str]:
     shares = {bit.label: float(np.mean((status & np.uint32(bit)) != 0)) for bit in bits}
     reasons = sorted(shares, key=lambda name: -shares[name])[:_REASONS]
     named = ", ".join(f"{name} {shares[name]:.0%}" for name in reasons if shares[name] > 0)
-    found = f"{share:.0%} of the {moving.size} pixels with moving reflections have no flag"
+    sentences = f"{share:.0%} of the {moving.size} pixels with moving reflections have no flag"
     rule = "What to do about each flag is in docs/status.md"
-    return [f"Hardly anything was measured: {found}. Of all pixels: {named}. {rule}."]
+    return [f"Hardly anything was measured: {sentences}. Of all pixels: {named}. {rule}."]

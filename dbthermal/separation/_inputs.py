@@ -297,8 +297,8 @@ def _noise(
             return response.assign_attrs(noise_source="response"), stated
         noise = np.where(np.isnan(larger), stated, larger)
         said = " and ".join(
-            f"{ratio * other:.3g} K in band '{name}', {ratio:.2g} times the stated {other:.3g} K"
-            for name, ratio, other in zip(names, larger / stated, stated, strict=True)
+            f"{ratio * second:.3g} K in band '{name}', {ratio:.2g} times the stated {second:.3g} K"
+            for name, ratio, second in zip(names, larger / stated, stated, strict=True)
             if ratio > 1.0
         )
         doubt = "is the response of another integration time, or are two bands exchanged?"
@@ -389,17 +389,17 @@ def _known_emissivity(
     return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
 
 
-def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *other: str) -> Array:
+def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: str) -> Array:
     """Values (band, ..., y, x) of an array over the bands, of one pixel or of all."""
     schema.check_numbers(array, name, "1")
-    allowed = ("band", *other), ("band", *other, "y", "x")
+    allowed = ("band", *second), ("band", *second, "y", "x")
     if array.dims not in allowed:
         raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
     array = laid_on(array, corrected, name, "the capture")
-    for one in other:  # the same bands
+    for one in second:  # the same bands
         exchanged = array.rename({"band": one, one: "band"})
         array = laid_on(exchanged, corrected, name, "the capture")
-    leading = array.shape[: 1 + len(other)]
+    leading = array.shape[: 1 + len(second)]
     values = array.values.astype(np.float64).reshape(
         *leading, *array.shape[len(leading) :] or (1, 1)
     )

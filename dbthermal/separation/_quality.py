@@ -47,7 +47,7 @@ def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grai
 
 
 def read(
-    part: xr.Dataset,
+    window: xr.Dataset,
     fewest: int = 1,
     known: list[samples.Grain] | None = None,
     most_missing: float = MOST_MISSING,
@@ -60,16 +60,16 @@ def read(
     that has less than the `fewest` valid frames, or lacks more than `most_missing`, cannot be
     solved. The `grains` of a larger part, if known, tell what repeats by chance.
     """
-    raw = part["counts"].values
+    raw = window["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
     valid = np.ones(counts.shape[1:], dtype=bool)
     ends = np.stack([counts.min(axis=1), counts.max(axis=1)], axis=1)
     if not schema.measured(ends).all():  # NaN is both
         valid = np.all(schema.measured(counts), axis=0)
-    if "mask" in part:
-        valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
+    if "mask" in window:
+        valid &= window["mask"].broadcast_like(window["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
-    known = grains(part) if known is None else known
+    known = grains(window) if known is None else known
     bands = zip(counts, known, ends, strict=True)
     saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
@@ -92,8 +92,8 @@ def read(
             Status.FROZEN_FRAMES: frozen & ~invalid & ~constant,
         }
     )
-    if "status" in part:
-        status |= part["status"].values.reshape(-1).astype(np.uint32)
+    if "status" in window:
+        status |= window["status"].values.reshape(-1).astype(np.uint32)
     if (without := unusable(status)).any():
         counts[:, :, without] = 0.0
     return counts, valid, status
@@ -127,14 +127,14 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     if not np.any(gap):
         return counts, valid
     frame, pixel = np.nonzero(gap)
-    some, place = np.unique(pixel, return_inverse=True)
+    selected, place = np.unique(pixel, return_inverse=True)
     places = np.arange(len(valid))[:, np.newaxis]
-    before = np.maximum.accumulate(np.where(valid[:, some], places, -len(valid)))[frame, place]
-    after = np.where(valid[::-1, some], places, -len(valid))
+    before = np.maximum.accumulate(np.where(valid[:, selected], places, -len(valid)))[frame, place]
+    after = np.where(valid[::-1, selected], places, -len(valid))
     after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
-    frame, pixel, first, last = (one[short] for one in (frame, pixel, before, after))
+    frame, pixel, first, last = (band[short] for band in (frame, pixel, before, after))
     share = (time[frame] - time[first]) / (time[last] - time[first])
     filled = counts.copy()
     line = (1.0 - share) * counts[:, first, pixel] + share * counts[:, last, pixel]

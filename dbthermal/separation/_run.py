@@ -141,10 +141,10 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         job = _Job(response, method, options, executor, memory, dict(provenance), bar)
         runs = [captures.submit(job.separate, *pair) for pair in pairs]
         try:
-            errors = [one.exception() for one in runs]
+            errors = [name.exception() for name in runs]
         finally:
-            for one in (*runs, *job.blocks):
-                one.cancel()
+            for name in (*runs, *job.blocks):
+                name.cancel()
     failed = [(error, pair) for error, pair in zip(errors, pairs, strict=True) if error]
     if failed and isinstance(target, str | Path):
         raise failed[0][0]
@@ -197,7 +197,7 @@ class _Job:
             for top in range(0, end, read):
                 rows = slice(top, min(top + read, end))
                 blocks = range(top, rows.stop, height)
-                left = {one - top: paths[one] for one in blocks if not paths[one].exists()}
+                left = {row - top: paths[row] for row in blocks if not paths[row].exists()}
                 if left:
                     here = {name: _of_rows(value, rows) for name, value in self.options.items()}
                     part = source if isinstance(source, Path) else capture.isel(y=rows)
@@ -296,9 +296,11 @@ def _share(
             f"one row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames"
             + (f", of a source in chunks of {chunk} rows." if lazy else ".")
         )
-    fit = [one for one in range(1, min(BLOCK_ROWS, capture.sizes["y"]) + 1) if need(one) <= free]
+    fit = [
+        array for array in range(1, min(BLOCK_ROWS, capture.sizes["y"]) + 1) if need(array) <= free
+    ]
     # A somewhat lower block, of which no chunk is read for two.
-    height = max([one for one in fit if 2 * one > fit[-1] and read(one)[1]] or fit)
+    height = max([array for array in fit if 2 * array > fit[-1] and read(array)[1]] or fit)
     return threads, height, read(height)[0]
 
 
@@ -341,10 +343,10 @@ def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor
     return [_digest(rest), "".join(digests)]
 
 
-def _row_digests(part: xr.Dataset) -> str:
+def _row_digests(block: xr.Dataset) -> str:
     """Digests of rows, each by itself, whatever the number that are read together."""
-    part = part.compute(scheduler="synchronous")
-    return "".join(_digest(part.isel(y=row)) for row in range(part.sizes["y"]))
+    block = block.compute(scheduler="synchronous")
+    return "".join(_digest(block.isel(y=row)) for row in range(block.sizes["y"]))
 
 
 def _digest(value: Any) -> str:

@@ -70,11 +70,11 @@ class Pixels:
 
     def each(self, function: Callable[[Any], Any]) -> Self:
         """Return the record with a function of each of its arrays."""
-        parts: dict[str, Any] = {}
+        arrays: dict[str, Any] = {}
         for name, value in vars(self).items():
             within = value.each(function) if isinstance(value, Pixels) else value
-            parts[name] = function(value) if isinstance(value, np.ndarray) else within
-        return replace(self, **parts)
+            arrays[name] = function(value) if isinstance(value, np.ndarray) else within
+        return replace(self, **arrays)
 
     def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
         """Replace the selected pixels by those of a part, in order, in place."""
@@ -89,7 +89,7 @@ class Pixels:
         """Return the record with the pixels of others after its own."""
         joined: dict[str, Any] = {}
         for field in fields(self):
-            values = [getattr(part, field.name) for part in (self, *others)]
+            values = [getattr(record, field.name) for record in (self, *others)]
             joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
         return replace(self, **joined)
 
@@ -181,14 +181,14 @@ class Tile:
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
-        known: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             name: None if getattr(self, name) is None else select(getattr(self, name), selected)
             for name in ("emissivity", "emissivity_covariance")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = select(self.signals, selected)
         shape = (1, signals.shape[2])
-        return replace(self, signals=signals, shape=shape, material=material, **known)
+        return replace(self, signals=signals, shape=shape, material=material, **arrays)
 
 
 @dataclass(frozen=True)
@@ -278,7 +278,7 @@ class Estimate(Pixels):
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
             values[name], values[f"{name}_std"] = (
-                np.where(lost, np.nan, part) for part in (value, std)
+                np.where(lost, np.nan, array) for array in (value, std)
             )
             if name.endswith("temperature"):
                 beyond |= np.any(out_of_range(value, std, curve), axis=0)
@@ -395,14 +395,18 @@ def cut(
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0], some)
-        parts = []
+        sections = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
-            part = tile if whole else tile.select_pixels(pixels)
-            parts.append((frames, pixels, part if np.all(frames) else part.select_frames(frames)))
+            piece = tile if whole else tile.select_pixels(pixels)
+            sections.append(
+                (frames, pixels, piece if np.all(frames) else piece.select_frames(frames))
+            )
         if displacement is not None:
-            parts = [part for one in parts for part in of_one_noise(*one, gain, most)]
-        yield Cut(window, places, status, valid, parts)
+            sections = [
+                piece for section in sections for piece in of_one_noise(*section, gain, most)
+            ]
+        yield Cut(window, places, status, valid, sections)
 
 
 def _tile(
@@ -455,11 +459,13 @@ def of_one_noise(
         alike = np.flatnonzero(order == level)
         for start in range(0, alike.size, most):
             chosen = alike[start : start + most]
-            part = np.zeros_like(pixels)
-            part[np.flatnonzero(pixels)[chosen]] = True
-            factor = np.exp(np.log(gain[:, part]).mean(axis=1))
+            group = np.zeros_like(pixels)
+            group[np.flatnonzero(pixels)[chosen]] = True
+            factor = np.exp(np.log(gain[:, group]).mean(axis=1))
             factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
-            one = replace(tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist()))
+            single = replace(
+                tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist())
+            )
             if tile.pattern is not None:
-                one = replace(one, pattern=tuple((factors * tile.pattern).tolist()))
-            yield frames, part, one
+                single = replace(single, pattern=tuple((factors * tile.pattern).tolist()))
+            yield frames, group, single

@@ -148,23 +148,26 @@ class Beside:
 
 
 def filled(
-    result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, beside: Beside, workers: int
+    result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, context: Beside, workers: int
 ) -> xr.Dataset:
     """Complete a result in place, see `complete`."""
-    shared: dict[str, Any] = {"pool": beside.materials, "reflection_shift": beside.reflection_shift}
+    shared: dict[str, Any] = {
+        "pool": context.materials,
+        "reflection_shift": context.reflection_shift,
+    }
     kind = str(result.attrs.get("response_kind", "exact"))
     inputs = check(corrected, response, _METHOD, "complete", response_kind=kind, **shared)
-    told = result
-    if beside.materials is not None and not result.attrs.get("pooled"):
-        told = solve(corrected, response, **shared)
-    scene = scenes.gather(inputs, result, told, beside.prior)
+    measured = result
+    if context.materials is not None and not result.attrs.get("pooled"):
+        measured = solve(corrected, response, **shared)
+    scene = scenes.gather(inputs, result, measured, context.prior)
     sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
         scenes.require_same_capture(scene, result, sample)
-    if beside.surroundings is None:
+    if context.surroundings is None:
         level = scenes.find_level(scene, sample)
     else:
-        level = scenes.stated(scene, beside.surroundings, beside.surroundings_std)
+        level = scenes.stated(scene, context.surroundings, context.surroundings_std)
         fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
@@ -183,7 +186,7 @@ def filled(
         frames_bridged=float(number.sum() / max(1, np.count_nonzero(number))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
-        surroundings_source="capture" if beside.surroundings is None else "stated",
+        surroundings_source="capture" if context.surroundings is None else "stated",
     )
 
 
@@ -225,8 +228,10 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: sli
     tile, valid = scene.tile(part, pixels[lines].ravel())
     places = np.flatnonzero(pixels) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
-        some = np.arange(start, min(start + tiles.PIXELS, places.size))
-        _complete_pixels(scene, completed, tile.select_pixels(some), valid[:, some], places[some])
+        wanted = np.arange(start, min(start + tiles.PIXELS, places.size))
+        _complete_pixels(
+            scene, completed, tile.select_pixels(wanted), valid[:, wanted], places[wanted]
+        )
     release()
 
 

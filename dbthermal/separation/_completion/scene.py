@@ -100,19 +100,19 @@ class Scene:
 def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -> Scene:
     """Gather what is known of the emissivities; the background is a room of any temperature."""
     bands = inputs.bands
-    value, shared = (_flat(one["emissivity"])[bands] for one in (result, pooled))
-    covariance, shared_covariance = (_covariance(one, bands) for one in (result, pooled))
+    value, shared = (_flat(variable["emissivity"])[bands] for variable in (result, pooled))
+    covariance, shared_covariance = (_covariance(variable, bands) for variable in (result, pooled))
     known = np.all((value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0), axis=0)
     source = np.where(known, OWN, PRIOR)
     labels = np.full(source.size, -1) if inputs.labels is None else inputs.labels
-    told = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
-    for label in np.unique(labels[told & (labels >= 0)]):
-        here, wanted = told & (labels == label), ~known & (labels == label)
-        if here.sum() < _FEWEST:
+    measured = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
+    for label in np.unique(labels[measured & (labels >= 0)]):
+        places, wanted = measured & (labels == label), ~known & (labels == label)
+        if places.sum() < _FEWEST:
             continue
-        value[:, wanted] = np.median(shared[:, here], axis=-1)[..., np.newaxis]
+        value[:, wanted] = np.median(shared[:, places], axis=-1)[..., np.newaxis]
         # Those of the label that were not pooled tell how much its pixels differ.
-        around = np.median(shared_covariance[..., here], axis=-1) + np.cov(shared[:, here])
+        around = np.median(shared_covariance[..., places], axis=-1) + np.cov(shared[:, places])
         covariance[..., wanted] = around[..., np.newaxis]
         source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
@@ -161,12 +161,12 @@ def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> No
 
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
     """Level of stated surroundings, of all pixels or of each."""
-    given = schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
-    if given.dims not in ((), ("y", "x")):
-        raise ValueError(f"Invalid dims {given.dims} of surroundings. Must be () or ('y', 'x').")
-    given = laid_on(given, scene.inputs.capture, "surroundings", "the capture")
-    values = given.values.astype(np.float64)
-    values = values.ravel() if given.dims else values
+    prior = schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
+    if prior.dims not in ((), ("y", "x")):
+        raise ValueError(f"Invalid dims {prior.dims} of surroundings. Must be () or ('y', 'x').")
+    prior = laid_on(prior, scene.inputs.capture, "surroundings", "the capture")
+    values = prior.values.astype(np.float64)
+    values = values.ravel() if prior.dims else values
     _numbers.real_numbers("surroundings [K]", values, _numbers.KELVIN)
     curve = scene.inputs.curves[scene.inputs.bands[0]]
     signal = curve.signal(values) - curve.reference
@@ -206,18 +206,21 @@ def solve(
     """
     with np.errstate(all="ignore"):
         parts = static.point, static.level, variance, static.covariance
-        found = frames.solve(tile, *parts, apart=scene.apart)
-        signal, left = windows.smooth(found.signal, found.white, valid, tile.time)
-        background, spread = found.background, found.background_variance
-        if (some := np.isfinite(measured[0]).any(axis=0)).any():
-            part, samples = static.select_pixels(some), (measured[..., some], valid[:, some])
-            known = part.emissivity, part.level, variance[some], part.covariance
-            behind = frames.background(tile.select_pixels(some), *samples, *known)
+        statics = frames.solve(tile, *parts, apart=scene.apart)
+        signal, left = windows.smooth(statics.signal, statics.white, valid, tile.time)
+        background, spread = statics.background, statics.background_variance
+        if (selected := np.isfinite(measured[0]).any(axis=0)).any():
+            part, samples = (
+                static.select_pixels(selected),
+                (measured[..., selected], valid[:, selected]),
+            )
+            known = part.emissivity, part.level, variance[selected], part.covariance
+            behind = frames.background(tile.select_pixels(selected), *samples, *known)
             seen = np.isfinite(behind).all(axis=0)
             for film, own in zip((background, spread), behind, strict=True):
-                film[:, some] = np.where(seen, own, film[:, some])
+                film[:, selected] = np.where(seen, own, film[:, selected])
         values: Values = {}
-        films = (signal, left + found.shared), (background, spread)
+        films = (signal, left + statics.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
             pair = frames.temperatures(tile, np.where(valid, mean, np.nan), deviation)
             values[name], values[f"{name}_std"] = pair
@@ -275,6 +278,6 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     middle = float(value[order][np.searchsorted(share, 0.5)])
     scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
-    own = between + _MEDIAN / float(np.sum(pixels / variance)) + _LEAST[0] ** 2
-    signal = (middle * wide + room * own) / (wide + own)
-    return replace(level, signal=signal, std=float(np.sqrt(own * wide / (own + wide))))
+    levels = between + _MEDIAN / float(np.sum(pixels / variance)) + _LEAST[0] ** 2
+    signal = (middle * wide + room * levels) / (wide + levels)
+    return replace(level, signal=signal, std=float(np.sqrt(levels * wide / (levels + wide))))

@@ -50,11 +50,11 @@ def mean_signals(
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
             part = counts.isel(band=band, y=rows).values
-            known = schema.measured(part)
-            part = part if known.all() else np.where(known, part, 0.0)
+            valid = schema.measured(part)
+            part = part if valid.all() else np.where(valid, part, 0.0)
             sums, numbers = (
-                np.stack([film[some].sum(axis=0, dtype=np.float64) for some in thirds])
-                for film in (part, known)
+                np.stack([film[selected].sum(axis=0, dtype=np.float64) for selected in thirds])
+                for film in (part, valid)
             )
             frames[index, rows] = numbers.sum(axis=0)
             with np.errstate(invalid="ignore"):  # without a sample
@@ -67,8 +67,8 @@ def mean_signals(
     for index in range(1, len(bands)):
         image = means[index] - means[0]
         bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)  # of variance s^2
-        known = np.abs(bend[np.isfinite(bend)])
-        scatter = MAD * float(np.median(known)) if known.size else 0.0
+        valid = np.abs(bend[np.isfinite(bend)])
+        scatter = MAD * float(np.median(valid)) if valid.size else 0.0
         of_noise = float(np.median(variances[0] + variances[index]))
         variances[index] += max(scatter**2 - of_noise, 0.0)
     return means, variances, change
@@ -98,8 +98,8 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
         release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames
-    known = np.isfinite(share * excess * variance)
-    return np.where(known, share * excess, 0.0), np.where(known, variance, 0.0)
+    valid = np.isfinite(share * excess * variance)
+    return np.where(valid, share * excess, 0.0), np.where(valid, variance, 0.0)
 
 
 def edges(maps: Array, variances: Array) -> Array:

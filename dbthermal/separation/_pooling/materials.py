@@ -185,12 +185,16 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
         square = np.sum((ratios.values - means[:, others]) ** 2 / total, axis=0)
         return np.where(np.all(known[:, others], axis=0), square, np.nan)
 
-    own, stays, around = distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1)
+    nearest, stays, around = (
+        distance(cells),
+        np.ones(cells.shape, dtype=bool),
+        np.pad(cells, 1),
+    )
     height, width = cells.shape
     for y, x in product(range(3), repeat=2):
-        other = around[y : y + height, x : x + width]
-        apart = (distance(other) > own + _TELLING) | ~known[0, other]
-        stays &= (other == cells) | (other == 0) | ((own < _TELLING) & apart)
+        second = around[y : y + height, x : x + width]
+        apart = (distance(second) > nearest + _TELLING) | ~known[0, second]
+        stays &= (second == cells) | (second == 0) | ((nearest < _TELLING) & apart)
     return labels.where(stays, NONE)
 
 
@@ -206,7 +210,7 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 
 def joined(
     labels: xr.DataArray,
-    alone: xr.Dataset,
+    per_pixel: xr.Dataset,
     pooled: Material | None,
     response: xr.Dataset,
 ) -> xr.DataArray:
@@ -219,21 +223,21 @@ def joined(
     if pooled is None:
         return labels
     cells = np.asarray(labels.values + 1, dtype=np.intp)
-    bands, noise = _bands(alone, response)
+    bands, noise = _bands(per_pixel, response)
     variance = ratio_variance(pooled.ratio, pooled.inverse_energy + pooled.spread, noise)
     emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
     parts = pooled.ratio[1:], variance[1:], *emissivity
     features = _both(*(part.reshape(-1, *cells.shape) for part in parts))
-    found = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
+    wider = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
-    found.join_alike(pairs, _RESOLUTION)
+    wider.join_alike(pairs, _RESOLUTION)
     # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
-    own, boxes, grown = _features(alone, bands), find_objects(cells), True
+    first_pixels, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
     while grown:
         grown = False
         for pair in pairs:
-            one, other = (found.root(cell) for cell in pair)
-            if one == other:
+            first, second = (wider.root(cell) for cell in pair)
+            if first == second:
                 continue
             # Around where the two cells touch.
             window = tuple(
@@ -242,15 +246,15 @@ def joined(
                 )
                 for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
             )
-            here = found.roots()[cells[window]]
-            sides = here == one, here == other
-            ratios, both = (part.window(window) for part in own)
+            here = wider.roots()[cells[window]]
+            sides = here == first, here == second
+            ratios, both = (part.window(window) for part in first_pixels)
             if region_merging.alike(*sides, ratios, both) and region_merging.continuous(
                 *sides, both, _RESOLUTION, _SPACINGS[0]
             ):
-                found.join(one, other)
+                wider.join(first, second)
                 grown = True
-    return _labelled(cells, found, alone)
+    return _labelled(cells, wider, per_pixel)
 
 
 def _checked(

@@ -69,19 +69,21 @@ def materials(
     if not np.any(alone.frames[0] > 0):
         return None
     image = Image(labels, places, inputs.capture.sizes["x"])
-    found = estimate(image, labels[places], alone, noise, known)
+    material = estimate(image, labels[places], alone, noise, known)
     count = int(labels.max()) + 1
-    sound, told = (
-        total(labels[places], 1.0 * part, count)
-        for part in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
+    sound, valid = (
+        total(labels[places], 1.0 * values, count)
+        for values in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
     )
-    again = (told <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(found.ratio[-1, places])
-    if known is not None or not np.any(again):
-        return found
-    selected[places] = again
+    asked = (valid <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
+    if known is not None or not np.any(asked):
+        return material
+    selected[places] = asked
     # The emissivity is a guess, of constant objects alone.
-    more = survey(inputs, replace(found, noise_variance=unknown), selected).select_pixels(selected)
-    alone.replace_pixels(again, more)
+    more = survey(inputs, replace(material, noise_variance=unknown), selected).select_pixels(
+        selected
+    )
+    alone.replace_pixels(asked, more)
     return estimate(image, labels[places], alone, noise, known)
 
 
@@ -112,13 +114,13 @@ def estimate(
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1
-        found, used, most = _sound(labels, count, survey, noise)
+        ratio_set, used, most = _sound(labels, count, survey, noise)
         if known is None:
-            common, used = _common(image, labels, (found, used, most), survey, noise)
+            common, used = _common(image, labels, (ratio_set, used, most), survey, noise)
         else:
             stated = np.isfinite(known.ratio[-1])
-            ratio = np.where(stated, known.ratio, image.expand(found.ratio))
-            variance = np.where(stated, known.inverse_energy, image.expand(found.variance))
+            ratio = np.where(stated, known.ratio, image.expand(ratio_set.ratio))
+            variance = np.where(stated, known.inverse_energy, image.expand(ratio_set.variance))
             common = Common(ratio, variance, known.spread)
         return _material(image, common, used, survey)
 
@@ -126,18 +128,18 @@ def estimate(
 def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ratios, Labels, Mask]:
     """Ratios of each material, labels of the pixels that agree, and those that may be left out."""
     # A pixel that takes a rapid object for the background has an energy beyond all others'.
-    told = np.isfinite(survey.emissivity) * 1.0
-    sound = np.where(told > 0, labels, -1)
-    found = ratios.estimate(sound, count, survey, noise, even=True)
-    outliers = ratios.outliers(labels, found, found.common(labels), survey, noise)
+    measured = np.isfinite(survey.emissivity) * 1.0
+    sound = np.where(measured > 0, labels, -1)
+    ratio_set = ratios.estimate(sound, count, survey, noise, even=True)
+    outliers = ratios.outliers(labels, ratio_set, ratio_set.common(labels), survey, noise)
     # Near black the few that have an emissivity alone are selected by their own ratio.
     surveyed = np.where(survey.frames[0] > 0, 1.0, 0.0)
-    most = total(labels, told, count) > _MAJORITY * total(labels, surveyed, count)
+    most = total(labels, measured, count) > _MAJORITY * total(labels, surveyed, count)
     of_most = np.append(most, False)[labels]
     used = np.where(outliers & of_most, -1, labels)
     for _ in range(_ROUNDS):
-        found = ratios.estimate(used, count, survey, noise, even=True)
-        outliers = ratios.outliers(used, found, found.common(labels), survey, noise)
+        ratio_set = ratios.estimate(used, count, survey, noise, even=True)
+        outliers = ratios.outliers(used, ratio_set, ratio_set.common(labels), survey, noise)
         if not np.any(outliers):
             break
         used = np.where(outliers, -1, used)
@@ -154,24 +156,24 @@ def _common(
     their ratios, no gradient is told. A degree more in each round, for what goes through the
     middle alone leads astray beyond it.
     """
-    found, used, most = sound
+    ratio_set, used, most = sound
     seen = np.where(most, used, -1)
-    common, uneven = ratios.graded(image, seen, found, survey, noise)
+    common, uneven = ratios.graded(image, seen, ratio_set, survey, noise)
     if not np.any(uneven):
         return common, used
-    common, _ = ratios.graded(image, seen, found, survey, noise, limit=1)
+    common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit=1)
     for degree in range(2, _ROUNDS + 2):
-        here = common.at(image.surveyed)
+        local = common.at(image.surveyed)
         used = np.where(uneven[labels], labels, used)
         for _ in range(_ROUNDS):
-            outliers = most & ratios.outliers(used, found, here, survey, noise)
+            outliers = most & ratios.outliers(used, ratio_set, local, survey, noise)
             if not np.any(outliers):
                 break
             used = np.where(outliers, -1, used)
-        even = ratios.scaled(survey, found.ratio[:, labels] / here.ratio)
-        found = ratios.estimate(used, uneven.size - 1, even, noise)
+        even = ratios.scaled(survey, ratio_set.ratio[:, labels] / local.ratio)
+        ratio_set = ratios.estimate(used, uneven.size - 1, even, noise)
         seen, limit = np.where(most, used, -1), min(degree, gradients.DEGREE)
-        common, _ = ratios.graded(image, seen, found, survey, noise, limit)
+        common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit)
     return common, used
 
 
@@ -182,18 +184,18 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     # a slope of 1 - (1 - e_1) p with the object's signal, and the regression one of e_1 over that.
     product = (survey.null_weights * common.ratio[:, image.surveyed]).sum(axis=0)
     value = survey.emissivity * (1.0 - product) / (1.0 - survey.emissivity * product)
-    known = (labels >= 0) & np.isfinite(value)
-    where = np.where(known, labels, -1)
+    valid = (labels >= 0) & np.isfinite(value)
+    where = np.where(valid, labels, -1)
     value, noise, drift = (
-        np.where(known, part, 0.0) for part in (value, survey.noise_variance, survey.drift_variance)
+        np.where(valid, term, 0.0) for term in (value, survey.noise_variance, survey.drift_variance)
     )
     # Weights 1 / (var + median var): no pixel outweighs all others by a small variance.
-    typical = np.median(noise[known]) if np.any(known) else np.nan
-    weight = np.where(known, 1.0 / (noise + typical), 0.0)
+    typical = np.median(noise[valid]) if np.any(valid) else np.nan
+    weight = np.where(valid, 1.0 / (noise + typical), 0.0)
     whole = total(where, weight, count)
     mean = total(where, weight * value, count) / whole
     # var(mean) = sum w^2 (e - mean)^2 / (sum w)^2 n / (n - 1), at least sum w^2 var / (sum w)^2
-    residual = np.where(known, (value - mean[where]) ** 2, 0.0)
+    residual = np.where(valid, (value - mean[where]) ** 2, 0.0)
     pixels = total(where, np.ones_like(value), count)
     scatter = total(where, weight**2 * residual, count) / whole**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
@@ -217,8 +219,8 @@ def _graded(
     every, fits = np.unique(labels[labels >= 0]), []
     for label in every:
         pixels = np.flatnonzero(labels == label)
-        apart, noise, weight = (part[pixels] for part in sample)
-        cost = gradients.Cost(weight, weight * apart, weight**2 * noise)
+        difference, noise, weight = (values[pixels] for values in sample)
+        cost = gradients.Cost(weight, weight * difference, weight**2 * noise)
         fits.append(image.gradient(label, pixels, cost))
     for label, fit, spread in zip(every, fits, gradients.spreads(fits), strict=True):
         pixels = image.labels == label
@@ -258,44 +260,48 @@ def hold(
     that tells nothing alone, by as much as around. At one place this does not hold for a material
     most of whose moving pixels are gray alone: its others are selected by their noise.
     """
-    sound, told = (one["status"].values == 0 for one in (alone, pooled))
-    stay = sound & (~told | (labels.values < 0))
+    sound, valid = (result["status"].values == 0 for result in (alone, pooled))
+    stay = sound & (~valid | (labels.values < 0))
     if apart:
-        ratios = [one["reflection_ratio_std"].values for one in (pooled, alone)]
+        ratios = [result["reflection_ratio_std"].values for result in (pooled, alone)]
         stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
     gray, gray_alone, still = (
-        (one["status"].values & np.uint32(flag)) != 0
-        for one, flag in (
+        (result["status"].values & np.uint32(flag)) != 0
+        for result, flag in (
             (pooled, Status.GRAY),
             (alone, Status.GRAY),
             (alone, Status.NO_BACKGROUND_MOTION),
         )
     )
     stay |= _share(labels.values, gray) > _MOSTLY
-    both, single = sound & told & ~stay, alone["object_temperature_std"].values
+    common, single = sound & valid & ~stay, alone["object_temperature_std"].values
     if not apart:
-        both &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
-    films = [one["object_temperature"].values for one in (pooled, alone)]
-    square, variance = np.zeros((2, *both.shape))
+        common &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
+    films = [result["object_temperature"].values for result in (pooled, alone)]
+    square, variance = np.zeros((2, *common.shape))
     every = slice(None, None, max(1, len(single) // _FRAMES))
-    for row, here in enumerate(sound & told):
-        value, other, std = (film[every, row, here].astype(np.float64) for film in (*films, single))
-        square[row, here] = np.nanmean(((value - other) / std) ** 2, axis=0)
-        variance[row, here] = np.nanmean(std**2, axis=0)
+    for row, x in enumerate(sound & valid):
+        value, lone, std = (film[every, row, x].astype(np.float64) for film in (*films, single))
+        square[row, x] = np.nanmean(((value - lone) / std) ** 2, axis=0)
+        variance[row, x] = np.nanmean(std**2, axis=0)
         release()
-    local = np.where(both, _around(square, both), 0.0)
-    more = both & ((square > _MORE) | (local > _MORE_AROUND))
+    local = np.where(common, _around(square, common), 0.0)
+    more = common & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
-    constant = np.where(told & ~sound, _around(square * variance, both | (stay & sound)), 0.0)
-    factor, film = square * both, pooled["object_temperature_std"].values
-    maps = [(pooled[name].values, part.values) for name, part in alone.items() if "x" in part.dims]
+    constant = np.where(valid & ~sound, _around(square * variance, common | (stay & sound)), 0.0)
+    factor, film = square * common, pooled["object_temperature_std"].values
+    maps = [
+        (pooled[name].values, variable.values)
+        for name, variable in alone.items()
+        if "x" in variable.dims
+    ]
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
-        here, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
-        added = factor[row, here] * np.nan_to_num(single[:, row, here]) ** 2 + constant[row, here]
-        film[:, row, here] = np.sqrt(film[:, row, here] ** 2 + added)
-        for target, part in maps:
-            target[..., row, alike] = part[..., row, alike]
+        x, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
+        added = factor[row, x] * np.nan_to_num(single[:, row, x]) ** 2 + constant[row, x]
+        film[:, row, x] = np.sqrt(film[:, row, x] ** 2 + added)
+        for target, variable in maps:
+            target[..., row, alike] = variable[..., row, alike]
         release()
 
 
@@ -312,7 +318,9 @@ def _border(labels: Array) -> Mask:
     return np.asarray(minimum_filter(whole, size) < maximum_filter(whole, size))
 
 
-def _around(values: Array, known: Mask) -> Array:
+def _around(values: Array, counted: Mask) -> Array:
     """Mean (y, x) of the known pixels around."""
-    sums = [gaussian_filter(part, _AROUND) for part in (np.where(known, values, 0.0), known * 1.0)]
+    sums = [
+        gaussian_filter(part, _AROUND) for part in (np.where(counted, values, 0.0), counted * 1.0)
+    ]
     return np.asarray(sums[0] / np.maximum(sums[1], _SOME))

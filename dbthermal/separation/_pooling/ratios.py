@@ -37,8 +37,8 @@ class Image:
     ) -> gradients.Gradient:
         """Gradient at all pixels of a label, from some that are surveyed, see `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
-        here, there = (np.divmod(one, self.width) for one in (self.surveyed[known], asked))
-        return gradients.fit(here, there, cost, limit)
+        start, places = (np.divmod(pixels, self.width) for pixels in (self.surveyed[known], asked))
+        return gradients.fit(start, places, cost, limit)
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Common:
 
 def total(labels: Labels, values: Array, count: int) -> Array:
     """Sum of values (pixel) over each material."""
-    known = labels >= 0
-    return np.asarray(np.bincount(labels[known], values[known], count), dtype=np.float64)
+    labelled = labels >= 0
+    return np.asarray(np.bincount(labels[labelled], values[labelled], count), dtype=np.float64)
 
 
 def _inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) -> Array:
@@ -90,12 +90,12 @@ def estimate(
     Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
     weights few pixels of much energy do not turn the axis: they are to be found as outliers.
     """
-    parts = [*zip(survey.scatter, survey.frames, strict=True)]
+    scatters = [*zip(survey.scatter, survey.frames, strict=True)]
     if even:
-        parts = [_even(labels, count, *part) for part in parts]
-    own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
-    rapid = _apart(own, most, noise)[0] > _ORDER_SIGMAS
-    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, own, strict=True))
+        scatters = [_even(labels, count, *scatter) for scatter in scatters]
+    at_order, fewer, most = (_at_order(labels, count, *scatter, noise) for scatter in scatters)
+    rapid = _apart(at_order, most, noise)[0] > _ORDER_SIGMAS
+    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
     return Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
 
 
@@ -135,16 +135,16 @@ def _at_order(
 
 
 def _apart(
-    one: tuple[Array, Array], other: tuple[Array, Array], noise: Array
+    smaller: tuple[Array, Array], larger: tuple[Array, Array], noise: Array
 ) -> tuple[Array, Array]:
     """Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
 
     The estimate at the smaller order is the more certain one, and their difference has the
     difference of their variances (Hausman 1978, doi:10.2307/1913827).
     """
-    scale = noise[1:, np.newaxis] ** 2 + (other[0][1:] * noise[0]) ** 2
-    square = np.max((one[0] - other[0])[1:] ** 2 / scale, axis=0)
-    expected = np.abs(other[1] - one[1])
+    scale = noise[1:, np.newaxis] ** 2 + (larger[0][1:] * noise[0]) ** 2
+    square = np.max((smaller[0] - larger[0])[1:] ** 2 / scale, axis=0)
+    expected = np.abs(larger[1] - smaller[1])
     return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
 
 
@@ -165,17 +165,19 @@ def outliers(
         scatter = np.where(rapid, survey.scatter[order], survey.scatter[0])
         frames = np.where(rapid, survey.frames[order], survey.frames[0])
         whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
-        own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
-        inverse = _inverse_energy(scatter, own, noise, frames)
-        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse + common.spread, noise))[1:]
-        score = np.max(np.abs(own - common.ratio)[1:] / std, axis=0)
+        pixel_ratio = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
+        inverse = _inverse_energy(scatter, pixel_ratio, noise, frames)
+        std = np.sqrt(reflection_ratio.ratio_variance(pixel_ratio, inverse + common.spread, noise))[
+            1:
+        ]
+        score = np.max(np.abs(pixel_ratio - common.ratio)[1:] / std, axis=0)
         score = np.where(labels >= 0, np.nan_to_num(score), 0.0)
         farthest = np.zeros(len(material.rapid))
         np.maximum.at(farthest, labels, score)
-        apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
-        result |= apart & ~reflection_ratio.agrees(whole, axis)
-    known = np.isfinite(material.variance[labels])
-    return np.asarray(result & known & (survey.frames[0] > 0) & (labels >= 0))
+        distant = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+        result |= distant & ~reflection_ratio.agrees(whole, axis)
+    informed = np.isfinite(material.variance[labels])
+    return np.asarray(result & informed & (survey.frames[0] > 0) & (labels >= 0))
 
 
 def scaled(survey: Survey, change: Array) -> Survey:
@@ -187,7 +189,7 @@ def scaled(survey: Survey, change: Array) -> Survey:
 def graded(
     image: Image,
     labels: Labels,
-    found: Ratios,
+    level: Ratios,
     survey: Survey,
     noise: Array,
     limit: int = gradients.DEGREE,
@@ -198,33 +200,35 @@ def graded(
     axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
     tells it by :math:`a = u^T C u - n^T C n`, :math:`b = n^T C u`, of variance u^T C u + n.
     """
-    ratio, variance = image.expand(found.ratio), image.expand(found.variance)
-    spread, uneven = np.zeros(image.labels.size), np.zeros(len(found.variance) + 1, dtype=bool)
+    ratio, variance = image.expand(level.ratio), image.expand(level.variance)
+    spread, uneven = np.zeros(image.labels.size), np.zeros(len(level.variance) + 1, dtype=bool)
     scatter, frames = survey.scatter[-1], survey.frames[-1]
     fits, at = [], []
-    for label in map(int, np.flatnonzero(np.isfinite(found.variance))):
+    for label in map(int, np.flatnonzero(np.isfinite(level.variance))):
         pixels = np.flatnonzero((labels == label) & (frames > 0))
         if pixels.size == 0:
             continue
-        whitened = found.ratio[:, label] / noise
-        length, parts = whitened @ whitened, scatter[..., pixels]
+        whitened = level.ratio[:, label] / noise
+        length, scatters = whitened @ whitened, scatter[..., pixels]
         axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
         axes *= np.sign(axes[0, 0])
-        seen = np.einsum("bi,bcp,cj->ijp", axes, parts, axes)
+        seen = np.einsum("bi,bcp,cj->ijp", axes, scatters, axes)
         asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
         for number, across in enumerate(axes.T[1:], 1):
             cost = gradients.Cost(
                 seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
             )
-            one = image.gradient(label, pixels, cost, limit)
-            if one.degree > 0:
-                vector = vector + one.value * across[:, np.newaxis]
-                variance[asked] = np.maximum(variance[asked], length * one.variance)
-            fits.append(one)
+            gradient = image.gradient(label, pixels, cost, limit)
+            if gradient.degree > 0:
+                vector = vector + gradient.value * across[:, np.newaxis]
+                variance[asked] = np.maximum(variance[asked], length * gradient.variance)
+            fits.append(gradient)
             at.append((label, asked, length))
-        if any(one.degree > 0 for one in fits[1 - len(noise) :]):
+        if any(gradient.degree > 0 for gradient in fits[1 - len(noise) :]):
             ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
-    for (label, asked, length), one, square in zip(at, fits, gradients.spreads(fits), strict=True):
+    for (label, asked, length), gradient, square in zip(
+        at, fits, gradients.spreads(fits), strict=True
+    ):
         spread[asked] = np.maximum(spread[asked], length * square)
-        uneven[label] |= one.degree > 0 or square > 0
+        uneven[label] |= gradient.degree > 0 or square > 0
     return Common(ratio, variance, spread), uneven

@@ -44,12 +44,12 @@ class Features:
 
         The weight is the inverse variance, 0 without an estimate; pixels of no cell come first.
         """
-        known = np.isfinite(self.values) & np.isfinite(self.variances) & (self.variances > 0)
-        weight = np.divide(1.0, self.variances, out=np.zeros_like(self.values), where=known)
+        valid = np.isfinite(self.values) & np.isfinite(self.variances) & (self.variances > 0)
+        weight = np.divide(1.0, self.variances, out=np.zeros_like(self.values), where=valid)
         values = np.where(weight > 0, self.values, 0.0)
-        parts = (weight, weight * values, weight * values**2, weight > 0)
+        sums = (weight, weight * values, weight * values**2, weight > 0)
         size, flat = int(cells.max()) + 1, cells.ravel()
-        return np.array([[np.bincount(flat, m.ravel(), size) for m in part] for part in parts])
+        return np.array([[np.bincount(flat, m.ravel(), size) for m in part] for part in sums])
 
 
 def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
@@ -68,9 +68,9 @@ def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
 def neighbours(cells: Labels) -> Labels:
     """Pairs (pair, 2) of cells that touch along a side of a pixel, each once, smaller first."""
     sides = [(cells[1:], cells[:-1]), (cells[:, 1:], cells[:, :-1])]
-    both = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in sides])
-    both = both[(both[:, 0] != both[:, 1]) & np.all(both > 0, axis=1)]
-    return np.asarray(np.unique(np.sort(both, axis=1), axis=0))
+    pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in sides])
+    pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & np.all(pairs > 0, axis=1)]
+    return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
 
 
 class Regions:
@@ -119,16 +119,16 @@ class Regions:
         The statistic is 0 where no feature can be compared. The resolution is the relative
         difference of the first feature that would reach the limit, infinite where it is unknown.
         """
-        mean, variance, known = self.pooled(np.stack([first, second]))  # (feature, 2, pair)
-        both = np.all(known, axis=1)
+        mean, variance, comparable = self.pooled(np.stack([first, second]))  # (feature, 2, pair)
+        joint = np.all(comparable, axis=1)
         # var(f_a - f_b) = var(f_a) + var(f_b) + (epsilon f)^2
         total = variance.sum(axis=1) + (self._tolerance * mean.mean(axis=1)) ** 2
-        difference = np.where(both, mean[:, 1] - mean[:, 0], 0.0)
-        statistic = np.sum(difference**2 / np.where(both, total, 1.0), axis=0)
+        difference = np.where(joint, mean[:, 1] - mean[:, 0], 0.0)
+        statistic = np.sum(difference**2 / np.where(joint, total, 1.0), axis=0)
         visible = np.sqrt(self._limits[1] * total[0])
-        size = np.where(both[0], np.abs(mean[0].mean(axis=0)), 0.0)
+        size = np.where(joint[0], np.abs(mean[0].mean(axis=0)), 0.0)
         resolution = np.divide(visible, size, out=np.full_like(visible, np.inf), where=size > 0)
-        return statistic / self._limits[both.sum(axis=0)], resolution
+        return statistic / self._limits[joint.sum(axis=0)], resolution
 
     def join_alike(self, pairs: Labels, resolution: float) -> None:
         """Join neighbours (pair, 2) that agree within a resolution [1], the most alike first."""
@@ -171,55 +171,58 @@ class Regions:
         """Means of regions, by their roots, variances, and valid ones: (feature, *shape)."""
         # mean = sum w f / sum w,  var = 1 / sum w, times the pixels for an error that all share
         total = self._total[:, regions]
-        known = total > 0
-        safe = np.where(known, total, 1.0)
+        valid = total > 0
+        safe = np.where(valid, total, 1.0)
         pixels = np.where(self._common, self._count[:, regions], 1.0)
-        return self._first[:, regions] / safe, pixels / safe, known
+        return self._first[:, regions] / safe, pixels / safe, valid
 
     def _compare_one(self, first: int, second: int) -> tuple[float, float]:
         """As `compare` of one pair: without arrays, for there are many."""
         statistic, features, resolution = 0.0, 0, np.inf
         for k, (total, sums) in enumerate(zip(self._total, self._first, strict=True)):
             if total[first] > 0 and total[second] > 0:
-                one, other = sums[first] / total[first], sums[second] / total[second]
+                angle, turn = sums[first] / total[first], sums[second] / total[second]
                 pixels = self._count[k, [first, second]] if self._common[k, 0, 0] else (1.0, 1.0)
-                mean = 0.5 * abs(one + other)
+                mean = 0.5 * abs(angle + turn)
                 variance = pixels[0] / total[first] + pixels[1] / total[second]
                 variance += (self._tolerance[k, 0] * mean) ** 2
-                statistic, features = statistic + (other - one) ** 2 / variance, features + 1
+                statistic, features = (
+                    statistic + (turn - angle) ** 2 / variance,
+                    features + 1,
+                )
                 if k == 0 and mean > 0:
                     resolution = np.sqrt(self._limits[1] * variance) / mean
         return statistic / self._limits[features], resolution
 
     def _merge(self, first: int, second: int) -> None:
         self._parent[second] = first
-        for part in (self._total, self._first, self._count):
-            part[:, first] += part[:, second]
-            part[:, second] = 0.0
+        for values in (self._total, self._first, self._count):
+            values[:, first] += values[:, second]
+            values[:, second] = 0.0
 
 
-def alike(one: Mask, other: Mask, ratios: Features, both: Features) -> bool:
+def alike(one: Mask, second: Mask, ratios: Features, both: Features) -> bool:
     """Say that the ratios on both sides of a border (y, x) may be those of one material.
 
     Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
     """
     told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
-    sides = [told & part for part in (one, other)]
-    if not all(part.any() for part in sides):
+    sides = [told & region for region in (one, second)]
+    if not all(region.any() for region in sides):
         return True
-    middle = np.array([np.median(ratios.values[:, part], axis=1) for part in sides])
-    variance = [np.median(ratios.variances[:, part], axis=1) / part.sum() for part in sides]
+    middle = np.array([np.median(ratios.values[:, region], axis=1) for region in sides])
+    variance = [np.median(ratios.variances[:, region], axis=1) / region.sum() for region in sides]
     error = np.sqrt(_MEDIAN * np.sum(variance, axis=0))
 
-    def near(expected: Array, found: Array, share: float) -> bool:
+    def near(expected: Array, ratio: Array, share: float) -> bool:
         return bool(
-            np.all(np.abs(found - expected) <= np.maximum(_CERTAIN * error, share * expected))
+            np.all(np.abs(ratio - expected) <= np.maximum(_CERTAIN * error, share * expected))
         )
 
     if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
         return True
-    for part, own, beside in zip(sides, middle, middle[::-1], strict=True):
-        first = both.values[-1, part]
+    for region, own, beside in zip(sides, middle, middle[::-1], strict=True):
+        first = both.values[-1, region]
         if np.isfinite(first).any():
             emissivity = np.nanmedian(first)
             if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
@@ -227,14 +230,16 @@ def alike(one: Mask, other: Mask, ratios: Features, both: Features) -> bool:
     return False
 
 
-def continuous(one: Mask, other: Mask, own: Features, resolution: float, reach: int) -> bool:
+def continuous(
+    first: Mask, second: Mask, features: Features, resolution: float, reach: int
+) -> bool:
     """Say that the pixels' own features go on across the border of two regions (y, x)."""
-    border = (binary_dilation(one) & other) | (binary_dilation(other) & one)
-    values, variances = own.values, own.variances
-    both = (one | other) & (distance_transform_cdt(~border, "chessboard") <= reach)
-    both &= np.all(np.isfinite(values) & (variances > 0), axis=0)
-    if not np.any(both):
+    border = (binary_dilation(first) & second) | (binary_dilation(second) & first)
+    values, variances = features.values, features.variances
+    union = (first | second) & (distance_transform_cdt(~border, "chessboard") <= reach)
+    union &= np.all(np.isfinite(values) & (variances > 0), axis=0)
+    if not np.any(union):
         return False
-    least = np.where(own.common, 0.0, resolution * np.abs(np.mean(values[:, both], axis=1)))
-    y, x = np.nonzero(both)
-    return gradients.continuous((y, x), values[:, both], variances[:, both], other[both], least)
+    least = np.where(features.common, 0.0, resolution * np.abs(np.mean(values[:, union], axis=1)))
+    y, x = np.nonzero(union)
+    return gradients.continuous((y, x), values[:, union], variances[:, union], second[union], least)

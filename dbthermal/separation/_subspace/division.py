@@ -203,27 +203,27 @@ def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
     for i in range(len(tree.edges) - 1, -1, -1):
         start, stop = tree.edges[i]
         columns, free = tree.columns[i], tree.columns[i] < stop - start
-        one, two = white[0, start:stop], white[1, start:stop]
+        one, second = white[0, start:stop], white[1, start:stop]
         if 2 * i + 1 < inner:
             first, last = tree.held[2 * i + 1], tree.held[2 * i + 3]
-            one, two = products[0, first:last], products[1, first:last]
+            one, second = products[0, first:last], products[1, first:last]
             for k in range(3):
                 energy[k, i] = energy[k, 2 * i + 1] + energy[k, 2 * i + 2]
         else:
-            energy[0, i], energy[2, i] = kernels.dot(one, one), kernels.dot(two, two)
-            energy[1, i] = kernels.dot(one, two)
+            energy[0, i], energy[2, i] = kernels.dot(one, one), kernels.dot(second, second)
+            energy[1, i] = kernels.dot(one, second)
         a, b, d = energy[0, i], energy[1, i], energy[2, i]
         for j in range(columns if free or i < inner else 0):
             if j == tree.chosen[i]:
                 scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i] = a, b, d
             column = tree.values[tree.places[i] + j * one.size :]
-            held, other = 0.0, 0.0
+            held, cross = 0.0, 0.0
             for t in range(one.size):
                 held += column[t] * one[t]
-                other += column[t] * two[t]
-            a, b, d = a - held * held, b - held * other, d - other * other
+                cross += column[t] * second[t]
+            a, b, d = a - held * held, b - held * cross, d - cross * cross
             if i < inner:
-                products[0, tree.held[i] + j], products[1, tree.held[i] + j] = held, other
+                products[0, tree.held[i] + j], products[1, tree.held[i] + j] = held, cross
         if not free:  # any curve
             a, b, d = 0.0, 0.0, 0.0
         if tree.chosen[i] >= columns or not free:
@@ -265,11 +265,15 @@ def _best_within(tree: Tree, scratch: Scratch, root: int, end: int, least: Array
 
 
 @compiled
-def _halve(tree: Tree, scratch: Scratch, one: float, two: float) -> None:
+def _halve(tree: Tree, scratch: Scratch, left_half: float, right_half: float) -> None:
     """Find the pieces that are halved in the best division, by one axis."""
     least, (a, b, d) = scratch.cheapest, scratch.scatter
     for i in range(len(tree.edges)):
-        least[i] = two * two * a[i] - 2.0 * one * two * b[i] + one * one * d[i]
+        least[i] = (
+            right_half * right_half * a[i]
+            - 2.0 * left_half * right_half * b[i]
+            + left_half * left_half * d[i]
+        )
         least[i] += pieces.COST * tree.chosen[i]
     end = len(tree.edges) // 2
     while end > 0:  # level by level

@@ -243,10 +243,10 @@ def copy(values: Array, result: Array) -> None:
 
 
 @compiled
-def dot(one: Array, other: Array) -> float:
+def dot(first: Array, second: Array) -> float:
     total = 0.0
-    for t in range(one.size):
-        total += one[t] * other[t]
+    for t in range(first.size):
+        total += first[t] * second[t]
     return total
 
 

@@ -213,13 +213,13 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
 
 def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     """Conditions (pixel) of the bits of the status."""
-    frames, others, emissivity = tile.time.size, len(tile.noise) - 1, solution.emissivity
+    frames, second_bands, emissivity = tile.time.size, len(tile.noise) - 1, solution.emissivity
     still = solution.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
     # The quietest band holds no more than its noise either.
     still |= solution.scatter[0, 0, 0] <= 0
     still = (still & ~solution.pooled) | ~np.isfinite(solution.inverse_energy)
     # Ratios of 1, where eq. 5 is singular, are not excluded.
-    singular = solution.epsilon_variance > 1.0 / chdtri(others, reflection_ratio.CHANCE)
+    singular = solution.epsilon_variance > 1.0 / chdtri(second_bands, reflection_ratio.CHANCE)
     gray = ~still & (singular | solution.gray)
     defined = ~still & ~gray & ~solution.constant
     nonphysical = defined & np.any((emissivity <= 0) | (emissivity >= 1), axis=0)
@@ -232,7 +232,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     emitted = np.all((solution.ratio > _EMITTED[0]) & (solution.ratio < _EMITTED[1]), axis=0)
     swapped |= constant & emitted
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
-    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom[0])
+    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * second_bands * solution.freedom[0])
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
     return {
         Status.NO_BACKGROUND_MOTION: still,
@@ -260,52 +260,57 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
     if suspect.size == 0:
         return result
     first = np.zeros((tile.time.size, suspect.size), dtype=bool)
-    part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    white, axes = pieces.plane(part.signals, noise)
+    suspects, best = tile.select_pixels(suspect), result.select_pixels(suspect)
+    white, axes = pieces.plane(suspects.signals, noise)
     axis = np.full((2, suspect.size), np.nan)
-    if part.material is not None:
-        axis = np.einsum("abp,bp->ap", axes, part.material.ratio / noise[:, np.newaxis])
+    if suspects.material is not None:
+        axis = np.einsum("abp,bp->ap", axes, suspects.material.ratio / noise[:, np.newaxis])
         axis /= np.sqrt((axis**2).sum(axis=0))
     pooled = np.where(solution.pooled[suspect], axis, np.nan)
     energy, count = pieces.null_energy(white, functions, pooled)
     divisions = division.divide(white, tile.time, tile.segment, axis)
     # Outside the plane a function fits noise in each further band.
     further = (pieces.COST - 1.0) * (len(noise) - 2)
-    divisions = [replace(one, cost=one.cost + further * one.functions) for one in divisions]
+    divisions = [
+        replace(candidate, cost=candidate.cost + further * candidate.functions)
+        for candidate in divisions
+    ]
     cost = energy + (pieces.COST + further) * count  # of one smooth curve
-    lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
-    for one in divisions:
+    lowest = np.min([cost, *(candidate.cost for candidate in divisions)], axis=0)
+    for candidate in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
-        tried = (one.cost < cost) | (flagged & (one.cost < lowest + _LIKELY))
+        tried = (candidate.cost < cost) | (flagged & (candidate.cost < lowest + _LIKELY))
         # One piece is a smooth curve.
-        places = np.flatnonzero(tried & (one.first.sum(axis=0) > 1))
+        places = np.flatnonzero(tried & (candidate.first.sum(axis=0) > 1))
         if places.size == 0:
             continue
-        some = part.select_pixels(places)
-        again = _report(some, _divided(some, one.first[:, places], functions, settings))
-        cheaper = one.cost[places] < cost[places] - _LIKELY
-        better = (again.status == 0) | (flagged[places] & cheaper)
-        places, again = places[better], again.select_pixels(better)
-        best.replace_pixels(places, again)
-        cost[places] = one.cost[places]
-        first[:, places] = one.first[:, places]
+        chosen = suspects.select_pixels(places)
+        resolved = _report(
+            chosen, _divided(chosen, candidate.first[:, places], functions, settings)
+        )
+        cheaper = candidate.cost[places] < cost[places] - _LIKELY
+        better = (resolved.status == 0) | (flagged[places] & cheaper)
+        places, resolved = places[better], resolved.select_pixels(better)
+        best.replace_pixels(places, resolved)
+        cost[places] = candidate.cost[places]
+        first[:, places] = candidate.first[:, places]
     divided = np.asarray(first.any(axis=0))
     surveyed = divided.copy()
-    if part.material is not None:  # one with its emissivity is not asked for a scatter
-        surveyed &= np.isnan(part.material.noise_variance)
+    if suspects.material is not None:  # one with its emissivity is not asked for a scatter
+        surveyed &= np.isnan(suspects.material.noise_variance)
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
-        some = part.select_pixels(surveyed)
-        more = _report(some, _divided(some, first[:, surveyed], functions, settings, number))
+        chosen = suspects.select_pixels(surveyed)
+        more = _report(chosen, _divided(chosen, first[:, surveyed], functions, settings, number))
         best.replace_scatter(place, surveyed, more)
     jumping = divided & pieces.sudden(
         best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
     # A delay of the bands asks for a piece at each change of the background, which hide it.
-    apart = result.status[suspect] & np.uint32(Status.BANDS_APART)
+    asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first.sum(axis=0) > _MOST_PIECES
-    status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
+    status |= np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
 
@@ -327,8 +332,8 @@ def _divided(
     parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
     if settings.device is None:
         return fused.solve_parts(tile, functions, parts, settings.background_drift)
-    alone = [_solve(tile.select_pixels(places), own, settings) for places, own in parts]
-    return alone[0].join(alone[1:]).select_pixels(np.argsort(np.concatenate(groups)))
+    per_pixel = [_solve(tile.select_pixels(places), own, settings) for places, own in parts]
+    return per_pixel[0].join(per_pixel[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 METHOD: Final = Method(

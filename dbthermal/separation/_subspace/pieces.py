@@ -133,11 +133,11 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     mean = left + curve / (length * deviation)
     least = halves = cost = np.full((2, 1), np.inf)
     for level in range(levels - 2, -1, -1):
-        parts = mean.reshape(1 << level, -1, mean.shape[1])
-        found = [functions(one.tobytes(), None) for one in places.reshape(len(parts), -1)]
-        chosen = found[0][1]
-        held = np.stack([basis[:, :chosen] for basis, _ in found]).mT @ parts
-        energy = np.einsum("itp,itp->ip", parts, parts) - np.einsum("ijp,ijp->ip", held, held)
+        sums = mean.reshape(1 << level, -1, mean.shape[1])
+        suspect = [functions(total.tobytes(), None) for total in places.reshape(len(sums), -1)]
+        chosen = suspect[0][1]
+        held = np.stack([basis[:, :chosen] for basis, _ in suspect]).mT @ sums
+        energy = np.einsum("itp,itp->ip", sums, sums) - np.einsum("ijp,ijp->ip", held, held)
         cost = energy + COST * chosen
         halves = least[::2] + least[1::2] if level < levels - 2 else np.full_like(cost, np.inf)
         least = np.minimum(halves, cost)
@@ -200,8 +200,8 @@ def returning(signal: Array) -> Mask:
     Of means over parts of the capture: their total variation over their range is 1 for a change
     that stays, 2 for one that comes and goes.
     """
-    parts = np.array_split(signal, min(_PARTS, len(signal)))
-    means = np.stack([part.mean(axis=0) for part in parts])
+    stretches = np.array_split(signal, min(_PARTS, len(signal)))
+    means = np.stack([stretch.mean(axis=0) for stretch in stretches])
     variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
     return np.asarray(variation > _RETURNED * np.ptp(means, axis=0))
 
@@ -221,7 +221,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
     jumps = (step > residuals.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
     result = np.any(jumps, axis=0)
-    some, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
-    around = maximum_filter(some, size)[1:] - minimum_filter(some, size)[1:]
-    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * around), axis=0)
+    jumping, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
+    change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]
+    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * change_around), axis=0)
     return np.asarray(result)

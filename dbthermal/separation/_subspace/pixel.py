@@ -163,10 +163,12 @@ def ratios(model: Model, work: Work) -> Ratio:
     if pooled:
         # The mean of the posterior, of the material's ratio for a prior with its spread.
         spread = material[4]
-        own = spread / (spread + inverse) if spread > 0 else 0.0
+        blend = spread / (spread + inverse) if spread > 0 else 0.0
         for m in range(1, bands):
-            ratio[m] = material[5 + m] + (own * (ratio[m] - material[5 + m]) if own > 0 else 0.0)
-        inverse = (1.0 - own) * (spread + (1.0 - own) * material[0])
+            ratio[m] = material[5 + m] + (
+                blend * (ratio[m] - material[5 + m]) if blend > 0 else 0.0
+            )
+        inverse = (1.0 - blend) * (spread + (1.0 - blend) * material[0])
     variance = null_weights(ratio, noise, work.null_weights)
     last = work.scatter[orders - 1]
     least, whole = _across(last, work, pooled), 0.0
@@ -188,8 +190,8 @@ def scatter(model: Model, work: Work) -> None:
     straight, coefficients = work.straight, work.coefficients
     bands, frames = model.noise.size, work.first.size
     for m in range(0, bands - 1, 2):
-        one, two = straight[m, :frames], straight[m + 1, :frames]
-        kernels.projected_both(model.functions, model.spans, one, two, coefficients[m : m + 2])
+        first, second = straight[m, :frames], straight[m + 1, :frames]
+        kernels.projected_both(model.functions, model.spans, first, second, coefficients[m : m + 2])
     if bands % 2:
         last, count = bands - 1, len(model.functions)
         kernels.projected(
@@ -198,14 +200,14 @@ def scatter(model: Model, work: Work) -> None:
     # The basis is orthonormal: |P z|^2 = |z|^2 - sum of squared coefficients.
     for m in range(bands):
         for n in range(m + 1):
-            rest = kernels.dot(straight[m, :frames], straight[n, :frames])
-            one, two = coefficients[m], coefficients[n]
+            product = kernels.dot(straight[m, :frames], straight[n, :frames])
+            first, second = coefficients[m], coefficients[n]
             scale = 1.0 / (model.noise[m] * model.noise[n])
             for j in range(model.steps):
-                rest -= one[j] * two[j]
+                product -= first[j] * second[j]
             for order in range(len(work.scatter)):
-                rest -= one[model.steps + order] * two[model.steps + order]
-                work.scatter[order, m, n] = work.scatter[order, n, m] = rest * scale
+                product -= first[model.steps + order] * second[model.steps + order]
+                work.scatter[order, m, n] = work.scatter[order, n, m] = product * scale
 
 
 @inlined
@@ -363,7 +365,7 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     kernels.fill(work.lack, 1.0)
     guess = regression.moments(work.emitted, z, work.lack)[0]
     emissivity = guess if 0 < guess < 1 else middle
-    known = ratios.pooled and not np.isnan(material[1] + material[2])
+    fixed = ratios.pooled and not np.isnan(material[1] + material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     before, slope_before = np.nan, np.nan
@@ -372,16 +374,16 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
         slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
-        constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not known
+        constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope
-        emissivity = material[1] if known else middle if constant else slope
-        if abs(rate) < FASTEST and not known and not constant:
+        emissivity = material[1] if fixed else middle if constant else slope
+        if abs(rate) < FASTEST and not fixed and not constant:
             emissivity += (slope - before) * rate / (1.0 - rate)
     _approach(model, emissivity, work, work.at_object[0, : z.size])
     for m in range(work.ratio.size):
         work.emissivity[m] = 1.0 - work.ratio[m] * (1.0 - emissivity)
-    return Line(variance, scale, energy, constant, known)
+    return Line(variance, scale, energy, constant, fixed)
 
 
 @inlined
@@ -396,7 +398,7 @@ def background(model: Model, work: Work) -> None:
     kernels.fill(mean, 0.0)
     for m in range(share.size):
         share[m] /= total
-        e, part, inverse = emissivity[m], share[m], 1.0 / (1.0 - emissivity[m])
+        e, weight, inverse = emissivity[m], share[m], 1.0 / (1.0 - emissivity[m])
         z, emitted = work.signals[m, :frames], work.at_object[m, :frames]
         reflected = work.reflected[m, :frames]
         if m > 0:
@@ -404,19 +406,19 @@ def background(model: Model, work: Work) -> None:
             kernels.blackbody(table, work.temperature, emitted, work.spare)
         for t in range(frames):
             reflected[t] = (z[t] - e * emitted[t]) * inverse
-            mean[t] += part * reflected[t]
+            mean[t] += weight * reflected[t]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
     kernels.temperature(first, mean, result)
     kernels.fill(step, 0.0)
     kernels.fill(curvature, 0.0)
     middle, half, scale = first.middle, first.half, 1.0 / first.half
     for m in range(share.size):
-        signal, part = kernels.response(tables, m).signal, share[m]
+        signal, weight = kernels.response(tables, m).signal, share[m]
         reflected = work.reflected[m, :frames]
         for t in range(frames):
             u, a = kernels.with_slope(signal, (result[t] - middle) * scale)
-            step[t] += part * a * (reflected[t] - u)
-            curvature[t] += part * a * a
+            step[t] += weight * a * (reflected[t] - u)
+            curvature[t] += weight * a * a
     for t in range(frames):
         x = (result[t] - middle) * scale
         y = x + step[t] / curvature[t]
