@@ -8,15 +8,14 @@ until they are released (`release`).
 import importlib
 import mmap
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryFile
-from threading import Lock
 from typing import Any, Final
-from weakref import WeakSet, finalize
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -108,39 +107,6 @@ def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     for part in parts(values):
         result[part] = values[part]
     return result
-
-
-class Shelf:
-    """Arrays in one file that vanishes with the process, kept and read by any thread."""
-
-    def __init__(self, folder: Path) -> None:
-        self._file = TemporaryFile(dir=folder)  # noqa: SIM115 - open as long as the shelf is there
-        self._lock = Lock()
-        finalize(self, self._file.close)
-
-    def put(self, values: npt.NDArray[Any]) -> Callable[[], npt.NDArray[Any]]:
-        """Keep an array; return what reads it. OSError if the disk has no room for it."""
-        values = np.ascontiguousarray(values)
-        shape, dtype = values.shape, values.dtype  # of `get`, which does not hold the values
-        with self._lock:
-            place = self._file.seek(0, os.SEEK_END)
-            self._file.write(values.data)
-            self._file.flush()
-
-        def get() -> npt.NDArray[Any]:
-            result = np.empty(shape, dtype)
-            with self._lock:
-                self._file.seek(place)
-                self._file.readinto(result.data)
-            return result
-
-        return get
-
-
-def shelf() -> Shelf | None:
-    """Shelf in the folder of this thread's films; None where they are in memory."""
-    folder = _FOLDER.get()
-    return None if folder is None else Shelf(folder)
 
 
 def parts(film: npt.NDArray[Any]) -> Iterator[slice]:

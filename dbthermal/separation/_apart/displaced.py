@@ -8,7 +8,6 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 """
 
 from collections.abc import Callable, Hashable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
@@ -21,7 +20,7 @@ from scipy.sparse import csr_array
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, Shelf, select, shelf
+from dbthermal._arrays import Array, Mask, select
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -62,8 +61,6 @@ class Displacement:
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
     read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
-    shelf: Shelf | None = field(default_factory=shelf)  # of captures whose films are on disk
-    shelved: dict[Hashable, list[Callable[[], Any]]] = field(default_factory=dict)
 
     def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
@@ -205,17 +202,13 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    The source is read if they are not kept; all pixels are kept of a small capture alone, and some
-    pixels of any capture whose films are on disk.
+    The source is read if they are not kept; only those of a small capture are.
     """
     films, key = displacement.read, (rows.start, rows.stop)
     every, chosen = (
         (*key, None),
         (*key, None if isinstance(selected, slice) else selected.tobytes()),
     )
-    if chosen in displacement.shelved:
-        counts, usable, valid, status, gain = (get() for get in displacement.shelved[chosen])
-        return counts, usable, valid, status, gain
     if chosen not in films:
         reading = films.get(every)
         if reading is None:
@@ -226,10 +219,6 @@ def paired(
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, reading = 1.0, tuple(select(film, selected) for film in reading)
-            if displacement.shelf is not None:
-                with suppress(OSError):  # a full disk: read anew
-                    displacement.shelved[chosen] = [displacement.shelf.put(it) for it in reading]
-                return reading
         size, held = (
             sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
         )
