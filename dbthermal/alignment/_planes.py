@@ -43,8 +43,7 @@ _PIXELS: Final = 1024  # that tell the frames, about
 # tell each of them.
 _PLANES: Final = 96
 _FOR_EACH: Final = 8
-# Of displaced windows:
-# frames, windows along either side, and their sides [pixel].
+# Of displaced windows: frames, number along either side of the image, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
 # Chance below and pixels or frames from which it is a displacement, of so many windows at least.

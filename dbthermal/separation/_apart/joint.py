@@ -254,8 +254,7 @@ def solve(
             solutions = list(zip(groups, results, strict=True))
         signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
-        weight = system.weights(inputs, emissivity)[0]
-        off = weight**2 * of_slope + emissivity[0] ** 2 * of_ratio
+        off = system.weights(inputs, emissivity)[0] ** 2 * of_slope + emissivity[0] ** 2 * of_ratio
         off *= equations.spread(np.mean((at_p - at_r) ** 2, axis=1))
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
     errors = partial(_factor, inputs, equations, np.array(sizes), change.variance, blur)

@@ -96,8 +96,8 @@ def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradie
     for degree in range(limit + 2):
         functions = _powers(known, known, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
-        low = degree > 0 and pixels < _ENOUGH * functions.shape[1]
-        if low or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
+        scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
+        if scarce or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
             break
         inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         coefficients = inverse @ (functions.T @ cost.linear)
@@ -113,10 +113,10 @@ def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradie
     for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : limit + 1], 1):
         # Chi-square of all coefficients but the constant, less the criterion's price.
         covariance = _covariance(functions, inverse, variance)[1:, 1:]
-        higher = coefficients[1:].size
+        terms = coefficients[1:].size
         gain = float(coefficients[1:] @ np.linalg.solve(covariance, coefficients[1:]))
-        if gain - higher * (np.log(pixels) if chosen == 0 else 2.0) > highest:
-            chosen, highest = degree, gain - 2.0 * higher
+        if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > highest:
+            chosen, highest = degree, gain - 2.0 * terms
     _, _, coefficients, residual = fits[chosen]
     value = _powers(asked, known, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
@@ -144,11 +144,11 @@ def spreads(fits: list[Gradient]) -> list[float]:
 
 
 def _spreads(fits: list[Left]) -> list[float]:
-    single, sizes = [fit.excess() for fit in fits], [fit.residual.size for fit in fits]
-    weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in single])
-    usual = float(weights @ [value for value, _ in single]) / max(weights.sum(), _TINY)
+    excesses, sizes = [fit.excess() for fit in fits], [fit.residual.size for fit in fits]
+    weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in excesses])
+    usual = float(weights @ [value for value, _ in excesses]) / max(weights.sum(), _TINY)
     if not usual * np.sqrt(weights.sum()) > _seen(sum(sizes)):
-        pairs = zip(single, sizes, strict=True)
+        pairs = zip(excesses, sizes, strict=True)
         return [value if value > _seen(size) * std else 0.0 for (value, std), size in pairs]
     result = []
     for fit in fits:

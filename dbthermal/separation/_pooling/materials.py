@@ -185,16 +185,12 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
         square = np.sum((ratios.values - means[:, others]) ** 2 / total, axis=0)
         return np.where(np.all(known[:, others], axis=0), square, np.nan)
 
-    nearest, stays, around = (
-        distance(cells),
-        np.ones(cells.shape, dtype=bool),
-        np.pad(cells, 1),
-    )
+    to_region, stays, around = (distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1))
     height, width = cells.shape
     for y, x in product(range(3), repeat=2):
-        second = around[y : y + height, x : x + width]
-        apart = (distance(second) > nearest + _TELLING) | ~known[0, second]
-        stays &= (second == cells) | (second == 0) | ((nearest < _TELLING) & apart)
+        neighbour = around[y : y + height, x : x + width]
+        apart = (distance(neighbour) > to_region + _TELLING) | ~known[0, neighbour]
+        stays &= (neighbour == cells) | (neighbour == 0) | ((to_region < _TELLING) & apart)
     return labels.where(stays, NONE)
 
 
@@ -209,10 +205,7 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 
 
 def joined(
-    labels: xr.DataArray,
-    per_pixel: xr.Dataset,
-    pooled: Material | None,
-    response: xr.Dataset,
+    labels: xr.DataArray, per_pixel: xr.Dataset, pooled: Material | None, response: xr.Dataset
 ) -> xr.DataArray:
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
@@ -228,15 +221,15 @@ def joined(
     emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
     parts = pooled.ratio[1:], variance[1:], *emissivity
     features = _both(*(part.reshape(-1, *cells.shape) for part in parts))
-    wider = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
+    merged = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
-    wider.join_alike(pairs, _RESOLUTION)
+    merged.join_alike(pairs, _RESOLUTION)
     # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
-    first_pixels, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
+    maps, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
     while grown:
         grown = False
         for pair in pairs:
-            first, second = (wider.root(cell) for cell in pair)
+            first, second = (merged.root(cell) for cell in pair)
             if first == second:
                 continue
             # Around where the two cells touch.
@@ -246,15 +239,15 @@ def joined(
                 )
                 for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
             )
-            here = wider.roots()[cells[window]]
+            here = merged.roots()[cells[window]]
             sides = here == first, here == second
-            ratios, both = (part.window(window) for part in first_pixels)
+            ratios, both = (part.window(window) for part in maps)
             if region_merging.alike(*sides, ratios, both) and region_merging.continuous(
                 *sides, both, _RESOLUTION, _SPACINGS[0]
             ):
-                wider.join(first, second)
+                merged.join(first, second)
                 grown = True
-    return _labelled(cells, wider, per_pixel)
+    return _labelled(cells, merged, per_pixel)
 
 
 def _checked(

@@ -280,10 +280,12 @@ def hold(
     films = [result["object_temperature"].values for result in (pooled, alone)]
     square, variance = np.zeros((2, *common.shape))
     every = slice(None, None, max(1, len(single) // _FRAMES))
-    for row, x in enumerate(sound & valid):
-        value, lone, std = (film[every, row, x].astype(np.float64) for film in (*films, single))
-        square[row, x] = np.nanmean(((value - lone) / std) ** 2, axis=0)
-        variance[row, x] = np.nanmean(std**2, axis=0)
+    for row, columns in enumerate(sound & valid):
+        value, lone, std = (
+            film[every, row, columns].astype(np.float64) for film in (*films, single)
+        )
+        square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
+        variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
     local = np.where(common, _around(square, common), 0.0)
     more = common & ((square > _MORE) | (local > _MORE_AROUND))
@@ -297,9 +299,12 @@ def hold(
     ]
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
-        x, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
-        added = factor[row, x] * np.nan_to_num(single[:, row, x]) ** 2 + constant[row, x]
-        film[:, row, x] = np.sqrt(film[:, row, x] ** 2 + added)
+        columns, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
+        added = (
+            factor[row, columns] * np.nan_to_num(single[:, row, columns]) ** 2
+            + constant[row, columns]
+        )
+        film[:, row, columns] = np.sqrt(film[:, row, columns] ** 2 + added)
         for target, variable in maps:
             target[..., row, alike] = variable[..., row, alike]
         release()

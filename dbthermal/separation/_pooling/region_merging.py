@@ -181,15 +181,12 @@ class Regions:
         statistic, features, resolution = 0.0, 0, np.inf
         for k, (total, sums) in enumerate(zip(self._total, self._first, strict=True)):
             if total[first] > 0 and total[second] > 0:
-                angle, turn = sums[first] / total[first], sums[second] / total[second]
+                mean_a, mean_b = sums[first] / total[first], sums[second] / total[second]
                 pixels = self._count[k, [first, second]] if self._common[k, 0, 0] else (1.0, 1.0)
-                mean = 0.5 * abs(angle + turn)
+                mean = 0.5 * abs(mean_a + mean_b)
                 variance = pixels[0] / total[first] + pixels[1] / total[second]
                 variance += (self._tolerance[k, 0] * mean) ** 2
-                statistic, features = (
-                    statistic + (turn - angle) ** 2 / variance,
-                    features + 1,
-                )
+                statistic, features = (statistic + (mean_b - mean_a) ** 2 / variance, features + 1)
                 if k == 0 and mean > 0:
                     resolution = np.sqrt(self._limits[1] * variance) / mean
         return statistic / self._limits[features], resolution
@@ -201,13 +198,13 @@ class Regions:
             values[:, second] = 0.0
 
 
-def alike(one: Mask, second: Mask, ratios: Features, both: Features) -> bool:
+def alike(first: Mask, second: Mask, ratios: Features, both: Features) -> bool:
     """Say that the ratios on both sides of a border (y, x) may be those of one material.
 
     Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
     """
     told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
-    sides = [told & region for region in (one, second)]
+    sides = [told & region for region in (first, second)]
     if not all(region.any() for region in sides):
         return True
     middle = np.array([np.median(ratios.values[:, region], axis=1) for region in sides])
@@ -222,9 +219,9 @@ def alike(one: Mask, second: Mask, ratios: Features, both: Features) -> bool:
     if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
         return True
     for region, own, beside in zip(sides, middle, middle[::-1], strict=True):
-        first = both.values[-1, region]
-        if np.isfinite(first).any():
-            emissivity = np.nanmedian(first)
+        values = both.values[-1, region]
+        if np.isfinite(values).any():
+            emissivity = np.nanmedian(values)
             if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
                 return True
     return False
