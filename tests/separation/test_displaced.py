@@ -54,7 +54,7 @@ def test_stuck_pixels_do_not_reach_their_surroundings(seed: int) -> None:
     error = abs(result["object_temperature"] - scene.truth["object_temperature"]).mean("time")
     error = error.where(result["status"] == 0)
     assert float(error.notnull().mean()) > 0.75
-    assert float(error.max()) < 0.5
+    assert float(error.max()) < 0.4
 
 
 def test_known_emissivities_and_rapid_heating() -> None:
