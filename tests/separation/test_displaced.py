@@ -8,9 +8,11 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 from scenes import GLASS, RIG, field, judged, painted
+from scipy.sparse import csr_array
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
+from dbthermal.separation._apart.equations import Equations
 from reproduction.experiments.pictures import Picture, smooth_shift
 
 TIME = np.arange(300) / 10.0
@@ -124,3 +126,30 @@ def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
     alone = separation.solve(capture, RIG.response(), reflection_shift=known)
     stds = [float(one["reflection_ratio_std"][1].median()) for one in (pooled, alone)]
     assert stds[0] < 0.5 * stds[1]
+
+
+def test_the_object_of_both_places_solves_the_equations() -> None:
+    """A row of pixels that each see the next one: by its own equation, by that before, or alone."""
+    pixels, loose, frames = 60, 30, 7
+    bends = np.array([[0.0, 0.05, 2e-3, 0.0, 0.0]])
+    object_ = 5.0 * np.random.default_rng(1).standard_normal((pixels + 1, frames))  # [K]
+    beyond = object_[1:] * (1.0 + bends[0, 1]) + bends[0, 2] * object_[1:] ** 2  # u_2(x(p))
+    strong = np.arange(pixels) < loose
+    shares = np.where(strong, [[1.8], [-0.8]], [[-0.8], [1.8]])
+    places, following = np.arange(pixels), np.arange(loose + 1, pixels)
+    linked = np.delete(places, [loose, pixels - 1])
+    there = csr_array((np.ones(linked.size), (linked, linked + 1)), (pixels, pixels))
+    onward = csr_array(
+        (np.ones(following.size), (following - following[0], following - 1)),
+        (following.size, pixels),
+    )
+    first = np.full(pixels, 0.9)
+    equations = Equations(
+        first, shares, there, onward, places[:loose], following, places[[loose]], bends
+    )
+    target = shares[0][:, np.newaxis] * object_[:-1] + shares[1][:, np.newaxis] * beyond
+    change = first[loose] * (object_[loose + 1] - object_[loose])[np.newaxis]
+    solution = equations.solve(target, np.zeros((pixels, frames)), change)
+    for signal, expected in zip(solution[:2], (object_[:-1], object_[1:]), strict=True):
+        np.testing.assert_allclose(signal[:-1], expected[:-1], rtol=0, atol=0.01)  # [K]
+    assert solution[2].max() < 1e-3  # the last step [K]

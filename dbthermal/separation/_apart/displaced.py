@@ -41,7 +41,7 @@ _FEW: Final = 0.5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some nine times [byte].
-_KEPT: Final = 2**30
+_KEPT: Final = 2**29
 
 
 T = TypeVar("T")

@@ -427,21 +427,29 @@ def _factor(
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
     size, off = std[..., np.newaxis]
+    # Errors of single pixels, of the drawn noise scaled to their deviations.
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
-    # Ratios of blurred bands have errors that neighbours share.
-    image = drawn.reshape(*displacement.shape, _DRAWS)
-    drawn = gaussian_filter(image, blur, axes=(0, 1)).reshape(drawn.shape)
-    gain = np.sqrt((drawn**2).mean(axis=1, keepdims=True))
-    errors = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
+    if blur > 0.0:  # ratios of blurred bands have errors that neighbours share
+        image = drawn.reshape(*displacement.shape, _DRAWS)
+        gaussian_filter(image, blur, axes=(0, 1), output=image)
+    gain = np.sqrt(np.einsum("pd,pd->p", drawn, drawn) / _DRAWS)[:, np.newaxis]
+    drawn *= np.divide(size, gain, out=np.zeros_like(gain), where=gain > 0)
+    errors = drawn.astype(np.float32)
+    del drawn
     # Those of a material are common to its pixels.
     labels = np.arange(len(size)) if inputs.labels is None else inputs.labels
-    common = rng.standard_normal((len(size), _DRAWS), dtype=np.float32)[labels]
-    target = errors + off * common
+    target = rng.standard_normal((len(size), _DRAWS), dtype=np.float32)[labels]
+    target *= off
+    target += errors
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
-    linear = replace(equations, bends=np.zeros_like(equations.bends))
-    places = linear.solved
-    signal, _, _ = linear.packed.solve(target[places], errors[places], change)
-    sized, power = size[:, 0] > 0, linear.spread((signal.astype(np.float64) ** 2).mean(axis=1))
+    # Propagated by the equations without their bend, a few draws at a time.
+    linear = replace(equations, bends=np.zeros_like(equations.bends)).packed
+    places, power = equations.solved, np.zeros(equations.solved.size)
+    for start in range(0, _DRAWS, _FRAMES):
+        few = slice(start, start + _FRAMES)
+        signal, _, _ = linear.solve(target[places, few], errors[places, few], change[:, few])
+        power += np.square(signal, dtype=np.float64).sum(axis=1) / _DRAWS
+    sized, power = size[:, 0] > 0, equations.spread(power)
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
