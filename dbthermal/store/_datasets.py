@@ -21,13 +21,13 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
 from dbthermal.store._integrity import (
+    GROUP,
     MARK,
     SUMS,
     CheckedStore,
     SummedStore,
     last_sums,
     sums_file,
-    valid_part,
 )
 from dbthermal.store._results import as_json, whole
 
@@ -133,13 +133,9 @@ def save_rows(
 
 
 def _save(
-    parts: Iterable[xr.Dataset],
-    path: str | Path,
-    provenance: Any,
-    height: int | None,
+    parts: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None
 ) -> None:
     """Save parts that follow one another along y, each of a height that chunks then divide."""
-    options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
     if not isinstance(provenance, Mapping):
         kind = type(provenance).__name__
         raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
@@ -149,33 +145,34 @@ def _save(
         for number, rows in enumerate(parts):
             _check(rows)
             if number == 0:
-                first = rows.isel(y=slice(0)) if "y" in rows.dims else rows
+                first = rows.isel(y=slice(0), missing_dims="ignore")
                 attrs = {**MARK, **rows.attrs, **attrs}
             _check_same(rows, first, number)
-            # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
+            # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {name: _chunks(variable, height) for name, variable in plain.variables.items()}
+            encoding = {
+                name: {"chunks": _chunks(variable, height), "compressors": _COMPRESSORS}
+                for name, variable in plain.variables.items()
+            }
+            options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
+                options = {"mode": "a", "append_dim": "y"}
                 constant = [
-                    name for name, variable in plain.variables.items() if "y" not in variable.dims
+                    name for name, array in plain.variables.items() if "y" not in array.dims
                 ]
                 plain = plain.drop_vars(constant)
-            for name, variable in plain.variables.items():
-                if variable.chunks is not None:  # those of dask are written as those of the store
-                    plain[name] = variable.chunk(
-                        dict(zip(variable.dims, chunks[name], strict=True))
-                    )
-            encoding = {
-                name: {"chunks": shape, "compressors": _COMPRESSORS}
-                for name, shape in chunks.items()
-            }
+            # Arrays of dask are written in the chunks of the store.
+            lazy = {name: array for name, array in plain.variables.items() if array.chunks}
+            for name, array in lazy.items():
+                chunks = zip(array.dims, encoding[name]["chunks"], strict=True)
+                plain[name] = array.chunk(dict(chunks))
             plain.to_zarr(
                 SummedStore(folder),
                 zarr_format=3,
                 consolidated=False,
                 write_empty_chunks=True,
-                **(options if number else {"mode": "w-", "encoding": encoding}),
+                **options,
             )
         (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
 
@@ -222,17 +219,12 @@ def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
     """Refuse a part whose variables, units or coordinates are not those of the first."""
     for name in rows.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
-    for name, variable in rows.variables.items():
+    for name, variable in rows.isel(y=slice(0), missing_dims="ignore").variables.items():
         reference = first.variables[name]
-        equal = variable.dims == reference.dims and variable.dtype == reference.dtype
-        sizes = [
-            [candidate.sizes[dim] for dim in candidate.dims if dim != "y"]
-            for candidate in (variable, reference)
-        ]
-        equal &= sizes[0] == sizes[1] and variable.attrs.get("units") == reference.attrs.get(
-            "units"
-        )
-        if equal and name in rows.coords and "y" not in variable.dims:
+        equal = (variable.dims, variable.shape) == (reference.dims, reference.shape)
+        equal &= variable.dtype == reference.dtype
+        equal &= variable.attrs.get("units") == reference.attrs.get("units")
+        if equal and name in rows.coords:
             equal = bool(variable.equals(reference))  # type: ignore[no-untyped-call]
         if not equal:
             raise ValueError(
@@ -301,11 +293,14 @@ def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
 
 def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends, arrays = valid_part(checked.attrs), []
+    ends = {"time": min(checked.attrs["frames_written"].values())}  # of all bands
+    ends["log"] = checked.attrs["log_written"]
     names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
-    for name in sorted(names):
-        array = _open(checked, leave=names - {name})
-        arrays.append(array.isel({d: slice(end) for d, end in ends.items() if d in array.dims}))
+    opened = (_open(checked, leave=names - {name}) for name in sorted(names))
+    arrays = [
+        array.isel({dim: slice(end) for dim, end in ends.items()}, missing_dims="ignore")
+        for array in opened
+    ]
     # The attributes as checked, for they may have gone on since.
     return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
 
@@ -337,19 +332,19 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     """
     if not (folders := [texts.as_path(source) for source in parts]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
-    first, *following = folders
     with whole(path, ".zarr") as folder:
-        shutil.copytree(first, folder, copy_function=_link)
+        shutil.copytree(folders[0], folder, copy_function=_link)
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
-        along = {file: array for file, array in metadata.items() if "y" in array["dimension_names"]}
         sums = last_sums(folder)
-        for source in following:
-            for file, array in along.items():
-                sums |= _added(source / file.parent.name, file.parent, array)
-        for file, array in along.items():
+        for file, array in metadata.items():
+            if "y" not in array["dimension_names"]:
+                continue
+            for source in folders[1:]:
+                sums |= _linked_chunks(source, folder, file.parent.name, array)
+            content = json.dumps(array, indent=2).encode()
             file.unlink()
-            file.write_text(json.dumps(array, indent=2))
-            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(file.read_bytes()):08x}"
+            file.write_bytes(content)
+            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(content):08x}"
         (folder / SUMS).unlink()
         (folder / SUMS).write_bytes(sums_file(sums))
 
@@ -362,26 +357,27 @@ def _link(source: str | Path, target: str | Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _added(source: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
-    """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
-    place = array["dimension_names"].index("y")
-    end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
-    part_sums, sums = last_sums(source.parent), {}
+def _linked_chunks(
+    source: Path, folder: Path, name: str, metadata: dict[str, Any]
+) -> dict[str, str]:
+    """Link the chunks of an array of a part behind those of the whole; checksums by file."""
+    axis, sums = metadata["dimension_names"].index("y"), {}
+    end, rows = (
+        metadata["shape"][axis],
+        metadata["chunk_grid"]["configuration"]["chunk_shape"][axis],
+    )
     if end % rows:
-        raise ValueError(
-            f"Invalid part '{source.parent}' after {end} rows in chunks of {rows}. Must follow "
-            "whole chunks."
-        )
-    for chunk in [chunk for chunk in (source / "c").rglob("*") if chunk.is_file()]:
-        numbers = list(chunk.relative_to(source / "c").parts)
-        numbers[place] = str(int(numbers[place]) + end // rows)
-        added = whole.joinpath("c", *numbers)
-        sums[added.relative_to(whole.parent).as_posix()] = part_sums[
-            chunk.relative_to(source.parent).as_posix()
-        ]
-        added.parent.mkdir(parents=True, exist_ok=True)
-        _link(chunk, added)
-    array["shape"][place] += json.loads((source / "zarr.json").read_text())["shape"][place]
+        label = f"Invalid part '{source}' after {end} rows in chunks of {rows}"
+        raise ValueError(f"{label}. Must follow whole chunks.")
+    for key, crc in last_sums(source).items():
+        if key.startswith(f"{name}/c/"):
+            numbers = key.split("/")
+            numbers[axis + 2] = str(int(numbers[axis + 2]) + end // rows)
+            target = folder.joinpath(*numbers)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _link(source / key, target)
+            sums["/".join(numbers)] = crc
+    metadata["shape"][axis] += json.loads((source / name / GROUP).read_text())["shape"][axis]
     return sums
 
 

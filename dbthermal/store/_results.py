@@ -254,7 +254,10 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """
     path = check_place(path, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
+    with TemporaryDirectory(
+        prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
         part = Path(folder) / path.name
         yield part
         if path.is_dir():  # a folder cannot be renamed onto another
