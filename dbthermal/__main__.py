@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves, unused
+from dbthermal._cli import is_source, leaves
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -259,8 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = print_once
     options = _parser().parse_args(arguments)
     try:
-        unused.refuse(options, sys.argv[1:] if arguments is None else arguments)
-        return _carry_out(options)
+        return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
     except BrokenPipeError:  # nobody reads the summary any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
@@ -290,25 +289,31 @@ def _reason(error: Exception, command: str) -> str:
     return f"{type(error).__name__}: {message} (--traceback shows where)"
 
 
-def _carry_out(options: argparse.Namespace) -> int:
-    """Check what is read and written, run the command, and print its summary."""
+def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Check the options, and what is read and written; run the command; print its summary."""
     if options.command == "completion":
         print(_completion())
         return 0
+    module, function = options.place.split(".")
     if options.command == "record":
-        return int(_function(options)(options))
+        return int(_command(module, function)(options))
+    _command("unused", "refuse")(options, arguments)
     sources, targets = _sources_and_targets(options)
     if options.dry_run:
-        foreseen = import_module("dbthermal._cli.steps").foreseen
-        summary = foreseen(options, sources, targets)
+        summary = _command("steps", "foreseen")(options, sources, targets)
     else:
         start = time.monotonic()
-        summary = _function(options)(options)
+        summary = _command(module, function)(options)
         if not sys.stderr.isatty():  # where no bar was shown
             print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
+
+
+def _command(module: str, function: str) -> Any:
+    """Function of a command, imported when it is needed."""
+    return getattr(import_module(f"dbthermal._cli.{module}"), function)
 
 
 def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[Path]]:
@@ -347,12 +352,6 @@ def _completion() -> str:
 }}
 [ -z "${{ZSH_VERSION-}}" ] || {{ autoload -U compinit bashcompinit; compinit; bashcompinit; }}
 complete -o default -F _dbthermal dbthermal"""
-
-
-def _function(options: argparse.Namespace) -> Any:
-    """Function of a command, imported when its paths have been checked."""
-    module, function = options.place.split(".")
-    return getattr(import_module(f"dbthermal._cli.{module}"), function)
 
 
 def _plain(value: Any) -> Any:

@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from dbthermal import (
     scene,
     separation,
 )
-from dbthermal._cli import PLUS, leaves
+from dbthermal._cli import PLUS, accepted, leaves
 from dbthermal._cli.files import (
     capture,
     described,
@@ -104,31 +105,21 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
             "offset themselves, --corrected-by-camera."
         )
     gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
-    corrected = correction.correct_capture(
-        raw,
-        gain,
-        lazy=True,
-        shutter=not options.no_shutter,
-        time_constant=options.time_constant,
+    named = accepted(correction.correct_capture, options)
+    shutter = not options.no_shutter
+    return saved(
+        correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named), options
     )
-    return saved(corrected, options)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
-    (corrected,), transform = staged(options, capture="corrected"), None
+    (corrected,) = staged(options, capture="corrected")
     options.register = options.register or "homography"
+    named = {**accepted(alignment.align, options), "clock": options.reference}
     if options.register != "none":
-        transform = alignment.register(corrected, model=options.register)
-    aligned = alignment.align(
-        corrected,
-        transform=transform,
-        lazy=True,
-        offset=options.offset,
-        search=options.search,
-        clock=options.reference,
-    )
-    return saved(aligned, options)
+        named["transform"] = alignment.register(corrected, model=options.register)
+    return saved(alignment.align(corrected, lazy=True, **named), options)
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
@@ -140,40 +131,33 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     source, response, *fitted = staged(options, **stages)
     announce_compiling()
     response.load()
-    completing, progress = _completing(options), sys.stderr.isatty()
+    progress = {"progress": sys.stderr.isatty()}
     if options.correction:  # all steps of a raw capture, by rows
-        offset = {} if options.offset is None else {"offset": options.offset}
         scene.separate_capture(
             source,
             fitted[0].load(),
             response,
             registration=None if options.register == "none" else options.register,
-            aligning=offset,
-            separating={**completing, "progress": progress},
+            aligning=accepted(alignment.align, options),
+            separating=accepted(separation.separate, options) | progress,
             target=options.output,
             provenance=provenance(options),
         )
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
-        result = separation.separate(source.load(), response, **completing, progress=progress)
+        named = accepted(separation.separate, options) | progress
+        result = separation.separate(source.load(), response, **named)
         return saved(warned(result, *notes, *hardly_measured(result)), options)
     else:  # a single method, by rows
-        emissivities = None
+        named = accepted(separation.run, options) | progress
         if options.emissivity:
             axis = {"band": source["band"].values}
             if len(options.emissivity) != len(axis["band"]):
                 rule = f"Must be one for each of the bands {axis['band'].tolist()}"
                 raise ValueError(f"Invalid --emissivity {options.emissivity}. {rule}.")
-            emissivities = xr.DataArray(options.emissivity, dims="band", coords=axis)
-        separation.run(
-            options.capture,
-            options.output,
-            response,
-            options.method,
-            emissivity=emissivities,
-            provenance=provenance(options),
-            progress=progress,
-        )
+            named["emissivity"] = xr.DataArray(options.emissivity, dims="band", coords=axis)
+        made_by = provenance(options)
+        separation.run(options.capture, options.output, response, provenance=made_by, **named)
     return described(options.output)
 
 
@@ -184,13 +168,8 @@ def announce_compiling() -> None:
     class CompilerListener(event.Listener):
         """Listener to the compiler."""
 
-        announced = False
-
         def on_start(self, _: event.Event) -> None:
-            if not self.announced:
-                text = "Compiling the separation, once after an installation: about a minute.\n"
-                sys.stderr.write(text)
-            self.announced = True
+            _announce()
 
         def on_end(self, _: event.Event) -> None:
             """Stay silent: a listener must have this function."""
@@ -198,20 +177,19 @@ def announce_compiling() -> None:
     event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
 
 
-def _completing(options: argparse.Namespace) -> dict[str, Any]:
-    """Options of the completion, and the number of threads."""
-    return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
+@cache
+def _announce() -> None:
+    sys.stderr.write("Compiling the separation, once after an installation: about a minute.\n")
 
 
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
-    result, source, response = (one.load() for one in staged(options, **stages))
+    datasets = [dataset.load() for dataset in staged(options, **stages)]
     announce_compiling()
-    completed = separation.complete(
-        result, source, response, result.get("material"), **_completing(options)
-    )
-    return saved(completed, options)
+    named = accepted(separation.complete, options)
+    materials = datasets[0].get("material")
+    return saved(separation.complete(*datasets, materials, **named), options)
 
 
 def foreseen(
@@ -244,9 +222,9 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
             if name not in names:
                 raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
-    numbers = {name: getattr(options, name) for name in ("seconds", "rate", "span", "amplitude")}
+    design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options))
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
-    plans = limits.plan(table, noise, limits.CaptureDesign(**numbers))
+    plans = limits.plan(table, noise, design)
     filters = plans["filter"].values.tolist()
     by_material = {str(name): plans.sel(material=name) for name in plans["material"].values}
     return {
