@@ -327,7 +327,7 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()
-        if any(place in (other, *other.parents) or other in place.parents for other in taken):
+        if any(place in (used, *used.parents) or used in place.parents for used in taken):
             label = f"Invalid output '{path}': it is another one, or it is read"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)

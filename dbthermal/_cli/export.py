@@ -39,8 +39,8 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     for path, options.variable in outputs.items():
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
-        with store.whole(path, suffix) as part:
-            summary[str(path)] = _WRITERS[suffix](result, part, options)
+        with store.whole(path, suffix) as draft:
+            summary[str(path)] = _WRITERS[suffix](result, draft, options)
     return summary
 
 
@@ -149,8 +149,8 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     cell |= {"execution_count": None, "source": f"import dbthermal\n\ndbthermal.explore({paths})"}
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
-    with store.whole(options.output, ".ipynb") as part:
-        part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
+    with store.whole(options.output, ".ipynb") as draft:
+        draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
     install = ""
     if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
         install = "python -m pip install 'dbthermal[explorer]' jupyterlab; "

@@ -94,24 +94,24 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
 
 def save_rows(
-    parts: Iterable[xr.Dataset],
+    blocks: Iterable[xr.Dataset],
     path: str | Path,
     provenance: Mapping[str, Any],
     height: int | None = None,
 ) -> None:
-    """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+    """Save a dataset as `save` does, by blocks of rows from the first to the last.
 
     Parameters
     ----------
-    parts : iterable of Dataset
-        Rows from the first to the last, made when they are asked for: no more than one is held.
-        What has no y, and the attributes, are those of the first. ValueError for none, and for one
-        whose variables, coordinates or units are others.
+    blocks : iterable of Dataset
+        Rows that follow one another, made when they are asked for: one block is held at a time.
+        What has no y, and the attributes, are those of the first block. ValueError without a block,
+        and for a block of other variables, coordinates or units.
     path, provenance : str or Path, mapping
         See `save`.
     height : int, optional
-        Rows of each part but the last, which has no more; of the first by default. For
-        `join_parts` it is that of the other folders too.
+        Rows of each block; the last may have fewer. That of the first block by default. For
+        `join_parts` all folders have the same.
 
     Examples
     --------
@@ -124,7 +124,7 @@ def save_rows(
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    following = iter(parts)
+    following = iter(blocks)
     if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
     if height is not None and (type(height) is not int or height < 1):
@@ -133,16 +133,16 @@ def save_rows(
 
 
 def _save(
-    parts: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None
+    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None
 ) -> None:
-    """Save parts that follow one another along y, each of a height that chunks then divide."""
+    """Save blocks of rows, of a height that chunks then divide."""
     if not isinstance(provenance, Mapping):
         kind = type(provenance).__name__
         raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
-        for number, rows in enumerate(parts):
+        for number, rows in enumerate(blocks):
             _check(rows)
             if number == 0:
                 first = rows.isel(y=slice(0), missing_dims="ignore")
@@ -305,14 +305,14 @@ def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
     return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
 
 
-def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
+def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
     """Join datasets of rows that follow one another; their chunks are linked, and not read.
 
     Parameters
     ----------
-    parts : iterable of str or Path
-        Folders from `save_rows`, each a part of its own, of one `height` but the last. They stay as
-        they are; on a disk without hard links their chunks are copied.
+    folders : iterable of str or Path
+        From `save_rows`, all of one `height` except the last. They stay as they are; on a disk
+        without hard links their chunks are copied.
     path : str or Path
         Folder ``*.zarr`` of the whole, with the attributes of the first.
 
@@ -323,23 +323,23 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     >>> from dbthermal import store
     >>> rows = [xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3)]
     >>> with TemporaryDirectory() as folder:
-    ...     parts = [f"{folder}/{number}.zarr" for number in range(3)]
-    ...     for row, part in zip(rows, parts):
-    ...         store.save_rows([row], part, store.provenance({}))
-    ...     store.join_parts(parts, f"{folder}/wall.zarr")
+    ...     paths = [f"{folder}/{number}.zarr" for number in range(3)]
+    ...     for row, path in zip(rows, paths):
+    ...         store.save_rows([row], path, store.provenance({}))
+    ...     store.join_parts(paths, f"{folder}/wall.zarr")
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    if not (folders := [texts.as_path(source) for source in parts]):
+    if not (sources := [texts.as_path(folder) for folder in folders]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
     with whole(path, ".zarr") as folder:
-        shutil.copytree(folders[0], folder, copy_function=_link)
+        shutil.copytree(sources[0], folder, copy_function=_link)
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
         sums = last_sums(folder)
         for file, array in metadata.items():
             if "y" not in array["dimension_names"]:
                 continue
-            for source in folders[1:]:
+            for source in sources[1:]:
                 sums |= _linked_chunks(source, folder, file.parent.name, array)
             content = json.dumps(array, indent=2).encode()
             file.unlink()

@@ -93,10 +93,10 @@ class Recording:
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         sizes = {**sizes, "band": len(bands), "time": chunk}
-        with whole(self.path, ".zarr") as part:
-            part.mkdir()
+        with whole(self.path, ".zarr") as draft:
+            draft.mkdir()
             group = zarr.open_group(
-                SummedStore(part), mode="w-", zarr_format=3, attributes=self._attrs
+                SummedStore(draft), mode="w-", zarr_format=3, attributes=self._attrs
             )
             for name, variable in variables.items():
                 _create(group, name, variable, sizes, (fills or {}).get(name))
@@ -104,8 +104,8 @@ class Recording:
             group.create_array(
                 "band", data=names, compressors=_COMPRESSORS, dimension_names=("band",)
             )
-            tree_to_disk([part], part)
-            self._folder = HeldFolder(part, self.path)
+            tree_to_disk([draft], draft)
+            self._folder = HeldFolder(draft, self.path)
         to_disk([self.path.parent])
         self.root = self._folder.root
         self._store = DurableStore(self.root)
@@ -317,13 +317,13 @@ def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
     The new content is written beside it first. If that fails, the old file stays, and nothing
     beside it. The files `before` are brought to the disk with it.
     """
-    part = path.with_name(f".{path.name}.part")
+    draft = path.with_name(f".{path.name}.part")
     try:
-        part.write_bytes(content)
-        to_disk([part, *before])
-        part.replace(path)
+        draft.write_bytes(content)
+        to_disk([draft, *before])
+        draft.replace(path)
     except OSError:
-        part.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
         raise
     to_disk([path.parent])
 

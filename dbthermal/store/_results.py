@@ -131,8 +131,8 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     suffix = ".html" if texts.as_path(path).suffix == ".html" else ".md"
     # A string in it can neither end the comment nor begin a tag.
     content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
-    with whole(path, suffix) as part:
-        part.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
+    with whole(path, suffix) as draft:
+        draft.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
 
 
 def save_figure(
@@ -173,8 +173,8 @@ def save_figure(
     }
     kind = suffix if suffix in metadata else ".png"
     fonts: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}
-    with rc_context(fonts), whole(path, kind) as part:
-        figure.savefig(part, dpi=dpi, metadata=metadata[kind])
+    with rc_context(fonts), whole(path, kind) as draft:
+        figure.savefig(draft, dpi=dpi, metadata=metadata[kind])
 
 
 def save_video(
@@ -206,7 +206,7 @@ def save_video(
         raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
     encoder, options = _ENCODERS[codec]
     frequency = _numbers.real_number("rate [Hz]", rate, (0.01, 1e6))
-    with whole(path, ".mp4") as part, av.open(part, "w") as film:
+    with whole(path, ".mp4") as draft, av.open(draft, "w") as film:
         film.metadata["comment"] = as_json(provenance)
         fraction = Fraction(frequency).limit_denominator(1000)
         stream = film.add_stream(encoder, rate=fraction, options=options)
@@ -258,11 +258,11 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     with TemporaryDirectory(
         prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
     ) as folder:
-        part = Path(folder) / path.name
-        yield part
+        draft = Path(folder) / path.name
+        yield draft
         if path.is_dir():  # a folder cannot be renamed onto another
             path.rename(Path(folder) / "replaced")
-        part.replace(path)
+        draft.replace(path)
 
 
 def as_json(content: Mapping[str, Any], indent: int | None = None) -> str:
