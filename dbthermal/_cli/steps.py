@@ -185,11 +185,10 @@ def _announce() -> None:
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
-    datasets = [dataset.load() for dataset in staged(options, **stages)]
+    result, source, response = (dataset.load() for dataset in staged(options, **stages))
     announce_compiling()
-    named = accepted(separation.complete, options)
-    materials = datasets[0].get("material")
-    return saved(separation.complete(*datasets, materials, **named), options)
+    named = {**accepted(separation.complete, options), "materials": result.get("material")}
+    return saved(separation.complete(result, source, response, **named), options)
 
 
 def foreseen(

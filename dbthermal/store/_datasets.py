@@ -151,10 +151,8 @@ def _save(
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            encoding = {
-                name: {"chunks": _chunks(variable, height), "compressors": _COMPRESSORS}
-                for name, variable in plain.variables.items()
-            }
+            chunks = {name: _chunks(array, height) for name, array in plain.variables.items()}
+            encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
                 options = {"mode": "a", "append_dim": "y"}
@@ -165,8 +163,7 @@ def _save(
             # Arrays of dask are written in the chunks of the store.
             lazy = {name: array for name, array in plain.variables.items() if array.chunks}
             for name, array in lazy.items():
-                chunks = zip(array.dims, encoding[name]["chunks"], strict=True)
-                plain[name] = array.chunk(dict(chunks))
+                plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
             plain.to_zarr(
                 SummedStore(folder),
                 zarr_format=3,

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -112,7 +112,8 @@ class Recording:
         group = zarr.open_group(self._store, mode="r+", use_consolidated=False)
         # A chunk of zeros is written too: a missing one was never recorded.
         config: Any = {"write_empty_chunks": True}
-        self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
+        arrays: Iterable[tuple[str, Any]] = group.arrays()
+        self._arrays = {name: array.with_config(config) for name, array in arrays}
         self._inside = {name: (self.root / name).stat() for name in self._arrays}
 
     def place(self) -> Path:
@@ -201,9 +202,9 @@ class Recording:
                     copies = np.broadcast_to(last, (frames - recorded, *last.shape))
                     self._write({"counts": copies}, (place,), recorded, self.chunk)
             for array in self._arrays.values():
-                shape, metadata = {"time": frames, "log": self.rows}, cast("Any", array.metadata)
-                sizes = zip(metadata.dimension_names, array.shape, strict=True)
-                array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
+                valid, dims = {"time": frames, "log": self.rows}, array.metadata.dimension_names
+                sizes = zip(dims, array.shape, strict=True)
+                array.resize(tuple(valid.get(dim, size) for dim, size in sizes))
             if time is not None:
                 zarr.create_array(
                     self._store,
