@@ -48,7 +48,11 @@ Values = npt.NDArray[Any]
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _THREADS: Final = 8
 _LOOKS: Final = 10  # for a folder, which may be moved while its path is read and compared
-_COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
+# A chunk of zeros is written too: a missing one was never recorded.
+_FORM: Final[Any] = {
+    "compressors": (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec()),
+    "config": {"write_empty_chunks": True},
+}
 
 
 class Recording:
@@ -93,27 +97,24 @@ class Recording:
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         sizes = {**sizes, "band": len(bands), "time": chunk}
+        # The store with empty arrays, on the disk before it has its name.
         with whole(self.path, ".zarr") as draft:
             draft.mkdir()
-            group = zarr.open_group(
-                SummedStore(draft), mode="w-", zarr_format=3, attributes=self._attrs
-            )
-            for name, variable in variables.items():
-                _create(group, name, variable, sizes, (fills or {}).get(name))
+            self._store = DurableStore(draft)
+            group = zarr.open_group(self._store, mode="w-", zarr_format=3, attributes=self._attrs)
+            self._arrays = {
+                name: _create(group, name, variable, sizes, (fills or {}).get(name))
+                for name, variable in variables.items()
+            }
             names = np.array(bands, dtype=np.dtypes.StringDType())
-            group.create_array(
-                "band", data=names, compressors=_COMPRESSORS, dimension_names=("band",)
+            self._arrays["band"] = group.create_array(
+                "band", data=names, dimension_names=("band",), **_FORM
             )
             tree_to_disk([draft], draft)
             self._folder = HeldFolder(draft, self.path)
         to_disk([self.path.parent])
-        self.root = self._folder.root
-        self._store = DurableStore(self.root)
-        group = zarr.open_group(self._store, mode="r+", use_consolidated=False)
-        # A chunk of zeros is written too: a missing one was never recorded.
-        config: Any = {"write_empty_chunks": True}
-        arrays: Iterable[tuple[str, Any]] = group.arrays()
-        self._arrays = {name: array.with_config(config) for name, array in arrays}
+        # From here on it is written to wherever it is moved.
+        self.root = self._store.root = self._folder.root
         self._inside = {name: (self.root / name).stat() for name in self._arrays}
 
     def place(self) -> Path:
@@ -210,10 +211,9 @@ class Recording:
                     self._store,
                     name=TIME,
                     data=time.astype(np.float64),
-                    compressors=_COMPRESSORS,
                     dimension_names=("time",),
                     attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
-                    config={"write_empty_chunks": True},
+                    **_FORM,
                 )
                 tree_to_disk([self.root / TIME, self.root / SUMS], self.root)
             if lost := missing_files(self.root):
@@ -229,19 +229,19 @@ class Recording:
 
 def _create(
     group: zarr.Group, name: str, variable: Variable, sizes: dict[str, int], fill: float | None
-) -> None:
+) -> Any:
     """Make an empty array with room for one chunk of frames, or for no row of the log."""
     chunks = {**sizes, "band": 1, "log": _LOG_CHUNK}
     missing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
-    group.create_array(
+    return group.create_array(
         name,
         shape=tuple({**sizes, "log": 0}[dim] for dim in variable.dims),
         chunks=tuple(chunks[dim] for dim in variable.dims),
         dtype=variable.dtype,
-        compressors=_COMPRESSORS,
         fill_value=missing if fill is None else fill,
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),
+        **_FORM,
     )
 
 
