@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -248,15 +249,8 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    printed = set[str]()
-
-    def print_once(message: Warning | str, *_: Any, **__: Any) -> None:
-        """Print a warning, once."""
-        if str(message) not in printed:
-            print(f"Warning: {message}", file=sys.stderr)
-        printed.add(str(message))
-
-    warnings.showwarning = print_once
+    say = cache(lambda text: print(f"Warning: {text}", file=sys.stderr))  # once
+    warnings.showwarning = lambda message, *_, **__: say(str(message))
     options = _parser().parse_args(arguments)
     try:
         return _carry_out(options, sys.argv[1:] if arguments is None else arguments)

@@ -183,11 +183,11 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
-            good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
-            values = [pixels[np.isfinite(pixels)] for pixels in np.atleast_1d(good.values)]
-            if all(pixels.size for pixels in values):
-                medians = [round(float(np.median(pixels)), 4) for pixels in values]
-                lines[f"median_{name}{unit}"] = dict(zip(lines["bands"], medians, strict=True))
+            good = dataset[name].astype(float).where(np.isfinite)
+            good = good.where(dataset["status"] == 0 if "status" in dataset else True)
+            medians = good.median([dim for dim in good.dims if dim != "band"])
+            if medians.notnull().all():
+                lines[f"median_{name}{unit}"] = medians.round(4).to_series().to_dict()
     if not everything:
         return lines
     lines["variables"] = {

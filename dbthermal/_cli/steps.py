@@ -224,16 +224,13 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options))
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
     plans = limits.plan(table, noise, design)
-    filters = plans["filter"].values.tolist()
-    by_material = {str(name): plans.sel(material=name) for name in plans["material"].values}
+    deviations = plans["object_temperature_std"].transpose("filter", "material").to_pandas()
     return {
         name: {
-            "best_filter": str(plan["best"].values),
-            "object_temperature_std_K": dict(
-                zip(filters, plan["object_temperature_std"].values.round(4).tolist(), strict=True)
-            ),
+            "best_filter": str(best),
+            "object_temperature_std_K": deviations[name].round(4).to_dict(),
         }
-        for name, plan in by_material.items()
+        for name, best in plans["best"].to_series().items()
     }
 
 
@@ -245,11 +242,6 @@ def data(_: argparse.Namespace) -> dict[str, Any]:
             name: [round(1e6 * band.lower, 3), round(1e6 * band.upper, 3)]
             for name, band in bands.FILTERS.items()
         },
-        "emissivity": {
-            str(row["material"].values): dict(
-                zip(table["band"].values.tolist(), row.values.round(3).tolist(), strict=True)
-            )
-            for row in table
-        },
+        "emissivity": table.transpose("band", "material").to_pandas().round(3).to_dict(),
         "outside_files": "listed by data_manifest.yaml of a clone, and fetched there by: make data",
     }
