@@ -202,6 +202,7 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 
 def _parser() -> argparse.ArgumentParser:
     """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
+    # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
@@ -251,6 +252,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
     say = cache(lambda text: print(f"Warning: {text}", file=sys.stderr))  # once
     warnings.showwarning = lambda message, *_, **__: say(str(message))
+    # Errors end in one line and a status.
     options = _parser().parse_args(arguments)
     try:
         return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
@@ -300,6 +302,7 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         summary = _command(module, function)(options)
         if not sys.stderr.isatty():  # where no bar was shown
             print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    # The summary, for programs or for people.
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0

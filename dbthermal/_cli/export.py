@@ -17,6 +17,7 @@ from dbthermal._cli.files import opened, provenance, staged
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
     """Command `export`."""
+    # The variable, which must be of the kind that the file shows.
     result, suffix = opened(options.result), options.output.suffix
     options.variable = options.variable or "object_temperature"
     if suffix not in _WRITERS:
@@ -98,6 +99,7 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
+    # The last image, in degrees Celsius.
     array = result[options.variable]
     image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
     unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")

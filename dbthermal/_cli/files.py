@@ -67,6 +67,7 @@ def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
     """Recording of one camera, by the kind of its files, with its origin."""
     kind = kind_of(paths[0], options)
     reader, _ = READERS[kind]
+    # Arguments of the reader, by the options of the same names.
     parameters, stated = signature(reader).parameters, accepted(reader, options)
     stated.pop("frames", None)  # of a calibration
     if "shape" in stated:
@@ -78,6 +79,7 @@ def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
         if required and name not in stated:
             label = f"Missing --{name.replace('_', '-')}: '{paths[0].name}' does not tell"
             raise ValueError(f"{label}. Must be stated.")
+    # Files of the kinds that make one recording together.
     several = kind in {"FLIR", "TIFF"}
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")

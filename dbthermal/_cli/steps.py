@@ -42,9 +42,11 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(
             f"Invalid sources {stated}. Must be --at, --blackbody, --sweep or --maker."
         )
+    # The constants of the cameras' maker.
     if options.maker:
         response = calibration.maker_response(opened(options.maker).attrs.get("files", {}))
         return saved(response, options)
+    # Movies of a blackbody: statistics of each pixel, then one curve for all.
     blackbody = _blackbody(options)
     if "frame" in blackbody.dims:
         blackbody = correction.blackbody_statistics(blackbody)
@@ -63,6 +65,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
 
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
+    # A store, or the recordings of a sweep.
     if options.blackbody:
         return opened(options.blackbody).load()
     if options.sweep:
@@ -71,6 +74,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         return recording.open_sweep(*options.sweep, frames=options.frames)
     if options.frames < 1:
         raise ValueError(f"Invalid --frames {options.frames}. Must be at least 1.")
+    # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
@@ -124,6 +128,7 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `separate`."""
+    # Inputs of the stages that the way needs.
     stages = {"capture": "corrected", "response": "response"}
     if options.correction:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
@@ -214,6 +219,7 @@ def foreseen(
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:
     """Command `plan`."""
+    # Materials, all or those that are named.
     table = emissivity.embedded_table()
     if options.materials:
         names = table["material"].values.tolist()
@@ -221,6 +227,7 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
             if name not in names:
                 raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
+    # Plan of the capture, and its best filter by material.
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options))
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
     plans = limits.plan(table, noise, design)

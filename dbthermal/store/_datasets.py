@@ -185,6 +185,7 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
 
 def _check(dataset: xr.Dataset) -> None:
     """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
+    # Attributes of the dataset and its variables.
     attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
     for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
         for key, value in attrs.items():
@@ -197,6 +198,7 @@ def _check(dataset: xr.Dataset) -> None:
             except (AttributeError, TypeError) as error:
                 label = f"Invalid attribute '{key}' of {owner}, of type {type(value).__name__}"
                 raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
+    # Names and types of the variables.
     for name, variable in dataset.variables.items():
         if "/" in str(name):
             raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
@@ -330,6 +332,7 @@ def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
     if not (sources := [texts.as_path(folder) for folder in folders]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
     with whole(path, ".zarr") as folder:
+        # The first folder, then the chunks of all others in their places.
         shutil.copytree(sources[0], folder, copy_function=_link)
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
         sums = last_sums(folder)
@@ -338,6 +341,7 @@ def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
                 continue
             for source in sources[1:]:
                 sums |= _linked_chunks(source, folder, file.parent.name, array)
+            # The metadata, of all rows, in a file of its own: that of the first is linked.
             content = json.dumps(array, indent=2).encode()
             file.unlink()
             file.write_bytes(content)

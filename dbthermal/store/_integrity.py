@@ -75,6 +75,7 @@ class CheckedStore(SummedStore):
         if not _is_listed(self._sums, GROUP, content):
             content = self._content(GROUP)
         self._compare(GROUP, content)
+        # Attributes, of which a mark says that the store has checksums.
         try:
             group = json.loads(content or b"")
             self.attrs: dict[str, Any] = group["attributes"]
@@ -86,6 +87,7 @@ class CheckedStore(SummedStore):
         mark = {name: self.attrs[name] for name in MARK if name in self.attrs}
         self.closed = mark != GROWING if mark else bool(self.attrs.get("closed", True))
         self.hidden = () if self.closed else (TIME,)
+        # The list of files, unless the store is of a version without one.
         if mark and not self._sums:
             raise ValueError(f"Missing {self._named(SUMS)}. {AS_WRITTEN}")
         if self._sums:

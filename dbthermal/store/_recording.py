@@ -88,6 +88,7 @@ class Recording:
         attrs: Mapping[str, Any],
         fills: Mapping[str, float] | None = None,
     ) -> None:
+        # A new path, and the attributes of an empty recording.
         self.path, self.chunk, self._closed = Path(path), chunk, False
         if self.path.exists():
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
@@ -195,6 +196,7 @@ class Recording:
         if self._closed:
             return
         with self._held():
+            # All bands in as many frames as the longest, all arrays without empty room.
             self.commit()
             frames = max(self.frames.values())
             for place, recorded in enumerate(self.frames.values()):
@@ -206,6 +208,7 @@ class Recording:
                 valid, dims = {"time": frames, "log": self.rows}, array.metadata.dimension_names
                 sizes = zip(dims, array.shape, strict=True)
                 array.resize(tuple(valid.get(dim, size) for dim, size in sizes))
+            # The common clock.
             if time is not None:
                 zarr.create_array(
                     self._store,
@@ -216,6 +219,7 @@ class Recording:
                     **_FORM,
                 )
                 tree_to_disk([self.root / TIME, self.root / SUMS], self.root)
+            # Nothing was lost, and one state of every file counts from here on.
             if lost := missing_files(self.root):
                 raise FileNotFoundError(
                     f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "

@@ -202,6 +202,7 @@ def save_video(
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
+    # Codec and rate, before a file is made.
     if codec not in _ENCODERS:
         raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
     encoder, options = _ENCODERS[codec]
@@ -211,6 +212,7 @@ def save_video(
         fraction = Fraction(frequency).limit_denominator(1000)
         stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
+        # Frames, of the size of the first.
         for frame in frames:
             height, width = frame.shape[:2]
             if stream.width == 0:
@@ -223,6 +225,7 @@ def save_video(
             film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if stream.width == 0:
             raise ValueError("Invalid film without frames. Must have at least one.")
+        # Frames that the encoder still holds.
         film.mux(stream.encode())
 
 
