@@ -252,8 +252,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
     say = cache(lambda text: print(f"Warning: {text}", file=sys.stderr))  # once
     warnings.showwarning = lambda message, *_, **__: say(str(message))
-    # Errors end in one line and a status.
     options = _parser().parse_args(arguments)
+    # An error ends in a line and a status.
     try:
         return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
     except BrokenPipeError:  # nobody reads the summary any more
@@ -359,18 +359,13 @@ def _plain(value: Any) -> Any:
 def _lines(summary: Any, indent: str = "") -> Iterator[str]:
     """Summary as text: a line for each entry that is not empty, numbers in one line."""
     for key, value in summary.items():
-        if isinstance(value, dict) and any(
-            isinstance(entry, dict | list | str) for entry in value.values()
-        ):
+        entries = value if isinstance(value, dict) else dict[str, Any]()
+        if any(isinstance(entry, dict | list | str) for entry in entries.values()):
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")
             continue
-        entries = (
-            [f"{name} {number:g}" for name, number in value.items()]
-            if isinstance(value, dict)
-            else leaves(value)
-        )
-        if line := ", ".join(map(str, entries)):
+        words = [f"{name} {number:g}" for name, number in entries.items()]
+        if line := ", ".join(words if isinstance(value, dict) else map(str, leaves(value))):
             yield f"{indent}{key}: {line}"
 
 
