@@ -20,16 +20,7 @@ from dbthermal import (
     scene,
     separation,
 )
-from dbthermal._cli import PLUS, accepted, leaves
-from dbthermal._cli.files import (
-    capture,
-    described,
-    opened,
-    outline,
-    provenance,
-    saved,
-    staged,
-)
+from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._warnings import warned
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
@@ -44,8 +35,8 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
         )
     # The constants of the cameras' maker.
     if options.maker:
-        response = calibration.maker_response(opened(options.maker).attrs.get("files", {}))
-        return saved(response, options)
+        response = calibration.maker_response(files.opened(options.maker).attrs.get("files", {}))
+        return files.saved(response, options)
     # Movies of a blackbody: statistics of each pixel, then one curve for all.
     blackbody = _blackbody(options)
     if "frame" in blackbody.dims:
@@ -55,11 +46,11 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     response = calibration.fit_response(counts, blackbody.get("noise"))
     # The response names the files that it was fitted to.
     named = leaves([options.at, options.blackbody, options.sweep])
-    files = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
-    response.attrs["blackbody"] += f"; of {', '.join(files)}"
-    summary = saved(response, options)
+    paths = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
+    response.attrs["blackbody"] += f"; of {', '.join(paths)}"
+    summary = files.saved(response, options)
     if fitted is not None and options.correction_output:
-        summary |= saved(fitted, options, options.correction_output)
+        summary |= files.saved(fitted, options, options.correction_output)
     return summary
 
 
@@ -67,7 +58,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     # A store, or the recordings of a sweep.
     if options.blackbody:
-        return opened(options.blackbody).load()
+        return files.opened(options.blackbody).load()
     if options.sweep:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
@@ -79,7 +70,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        still = capture(paths, options, offset=0.0)  # nothing moves: any offset will do
+        still = files.capture(paths, options, offset=0.0)  # nothing moves: any offset will do
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
@@ -96,11 +87,11 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
     stages = {"correction": "correction"} if options.correction else {}
-    raw, *fitted = staged(options, capture="capture|corrected", **stages)
+    raw, *fitted = files.staged(options, capture="capture|corrected", **stages)
     by_camera = options.corrected_by_camera
-    files = raw.attrs.get("files", {}).values()
+    records = raw.attrs.get("files", {}).values()
     # Planck constants of the maker hold for all pixels: such a camera has corrected its offsets.
-    by_maker = bool(files) and all("file_planck_R1" in attrs for attrs in files)
+    by_maker = bool(records) and all("file_planck_R1" in attrs for attrs in records)
     if by_camera == bool(options.correction) and (by_camera or not by_maker):
         sources = "both a file and --corrected-by-camera" if by_camera else "neither"
         raise ValueError(
@@ -111,19 +102,19 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
     gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
     named = accepted(correction.correct_capture, options)
     shutter = not options.no_shutter
-    return saved(
+    return files.saved(
         correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named), options
     )
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
-    (corrected,) = staged(options, capture="corrected")
+    (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
     named = {**accepted(alignment.align, options), "clock": options.reference}
     if options.register != "none":
         named["transform"] = alignment.register(corrected, model=options.register)
-    return saved(alignment.align(corrected, lazy=True, **named), options)
+    return files.saved(alignment.align(corrected, lazy=True, **named), options)
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
@@ -133,7 +124,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     if options.correction:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
-    source, response, *fitted = staged(options, **stages)
+    source, response, *fitted = files.staged(options, **stages)
     announce_compiling()
     response.load()
     progress = {"progress": sys.stderr.isatty()}
@@ -146,13 +137,13 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             aligning=accepted(alignment.align, options),
             separating=accepted(separation.separate, options) | progress,
             target=options.output,
-            provenance=provenance(options),
+            provenance=files.provenance(options),
         )
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
         named = accepted(separation.separate, options) | progress
         result = separation.separate(source.load(), response, **named)
-        return saved(warned(result, *notes, *hardly_measured(result)), options)
+        return files.saved(warned(result, *notes, *hardly_measured(result)), options)
     else:  # a single method, by rows
         named = accepted(separation.run, options) | progress
         if options.emissivity:
@@ -161,9 +152,9 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
                 rule = f"Must be one for each of the bands {axis['band'].tolist()}"
                 raise ValueError(f"Invalid --emissivity {options.emissivity}. {rule}.")
             named["emissivity"] = xr.DataArray(options.emissivity, dims="band", coords=axis)
-        made_by = provenance(options)
+        made_by = files.provenance(options)
         separation.run(options.capture, options.output, response, provenance=made_by, **named)
-    return described(options.output)
+    return files.described(options.output)
 
 
 def announce_compiling() -> None:
@@ -190,10 +181,10 @@ def _announce() -> None:
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
-    result, source, response = (dataset.load() for dataset in staged(options, **stages))
+    result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
     announce_compiling()
     named = {**accepted(separation.complete, options), "materials": result.get("material")}
-    return saved(separation.complete(result, source, response, **named), options)
+    return files.saved(separation.complete(result, source, response, **named), options)
 
 
 def foreseen(
@@ -202,13 +193,13 @@ def foreseen(
     """Inputs and outputs of a command, and the memory that a separation takes at most."""
     inputs = dict[str, Any]()
     for path in sources:
-        files = [file for file in (path, *path.rglob("*")) if file.is_file()]
-        inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in files)}
+        contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
+        inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
-            inputs[str(path)] |= outline(opened(path))
+            inputs[str(path)] |= files.outline(files.opened(path))
     summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        summary["would_be"] = outline(capture(options.files, options, options.offset))
+        summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))

@@ -20,15 +20,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
-from dbthermal.store._integrity import (
-    GROUP,
-    MARK,
-    SUMS,
-    CheckedStore,
-    SummedStore,
-    last_sums,
-    sums_file,
-)
+from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import as_json, whole
 
 # Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
@@ -146,7 +138,7 @@ def _save(
             _check(rows)
             if number == 0:
                 first = rows.isel(y=slice(0), missing_dims="ignore")
-                attrs = {**MARK, **rows.attrs, **attrs}
+                attrs = {**integrity.MARK, **rows.attrs, **attrs}
             _check_same(rows, first, number)
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
@@ -165,13 +157,13 @@ def _save(
             for name, array in lazy.items():
                 plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
             plain.to_zarr(
-                SummedStore(folder),
+                integrity.SummedStore(folder),
                 zarr_format=3,
                 consolidated=False,
                 write_empty_chunks=True,
                 **options,
             )
-        (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
+        (folder / integrity.SUMS).write_bytes(integrity.sums_file(integrity.last_sums(folder)))
 
 
 def chunks_in_turn() -> AbstractContextManager[Any]:
@@ -277,20 +269,21 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
         raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
-    checked = CheckedStore(path)
+    checked = integrity.CheckedStore(path)
     dataset = _open(checked) if checked.closed else _open_valid_part(checked)
-    dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in MARK}
+    for name in integrity.MARK:
+        dataset.attrs.pop(name, None)
     return _with_text_as(dataset, "T", np.dtype(str))
 
 
-def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
+def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
         checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
     )
     return dataset
 
 
-def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
+def _open_valid_part(checked: integrity.CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
     ends = {"time": min(checked.attrs["frames_written"].values())}  # of all bands
     ends["log"] = checked.attrs["log_written"]
@@ -335,7 +328,7 @@ def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
         # The first folder, then the chunks of all others in their places.
         shutil.copytree(sources[0], folder, copy_function=_link)
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
-        sums = last_sums(folder)
+        sums = integrity.last_sums(folder)
         for file, array in metadata.items():
             if "y" not in array["dimension_names"]:
                 continue
@@ -346,8 +339,8 @@ def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
             file.unlink()
             file.write_bytes(content)
             sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(content):08x}"
-        (folder / SUMS).unlink()
-        (folder / SUMS).write_bytes(sums_file(sums))
+        (folder / integrity.SUMS).unlink()
+        (folder / integrity.SUMS).write_bytes(integrity.sums_file(sums))
 
 
 def _link(source: str | Path, target: str | Path) -> None:
@@ -370,7 +363,7 @@ def _linked_chunks(
     if end % rows:
         label = f"Invalid part '{source}' after {end} rows in chunks of {rows}"
         raise ValueError(f"{label}. Must follow whole chunks.")
-    for key, crc in last_sums(source).items():
+    for key, crc in integrity.last_sums(source).items():
         if key.startswith(f"{name}/c/"):
             numbers = key.split("/")
             numbers[axis + 2] = str(int(numbers[axis + 2]) + end // rows)
@@ -378,7 +371,8 @@ def _linked_chunks(
             target.parent.mkdir(parents=True, exist_ok=True)
             _link(source / key, target)
             sums["/".join(numbers)] = crc
-    metadata["shape"][axis] += json.loads((source / name / GROUP).read_text())["shape"][axis]
+    added = json.loads((source / name / integrity.GROUP).read_text())
+    metadata["shape"][axis] += added["shape"][axis]
     return sums
 
 

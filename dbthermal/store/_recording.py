@@ -29,18 +29,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.core.buffer import Buffer
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store._integrity import (
-    GROUP,
-    GROWING,
-    MARK,
-    SUMS,
-    TIME,
-    SummedStore,
-    add_sum,
-    last_sums,
-    missing_files,
-    sums_file,
-)
+from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import whole
 
 Values = npt.NDArray[Any]
@@ -93,9 +82,8 @@ class Recording:
         if self.path.exists():
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
-        self._attrs = json.loads(
-            json.dumps({**GROWING, **attrs, "complete": False, "closed": False}, allow_nan=False)
-        )
+        attrs = {**integrity.GROWING, **attrs, "complete": False, "closed": False}
+        self._attrs = json.loads(json.dumps(attrs, allow_nan=False))
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         sizes = {**sizes, "band": len(bands), "time": chunk}
         # The store with empty arrays, on the disk before it has its name.
@@ -172,7 +160,7 @@ class Recording:
             for name in block
             for number in range(start // chunk, (stop - 1) // chunk + 1)
         ]
-        tree_to_disk([*chunks, self.root / SUMS], self.root)
+        tree_to_disk([*chunks, self.root / integrity.SUMS], self.root)
         return stop
 
     def read(self, name: str, band: str) -> Values:
@@ -186,7 +174,7 @@ class Recording:
         with self._held():
             self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
             content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
-            self._store.replace(GROUP, json.dumps(content, allow_nan=False).encode())
+            self._store.replace(integrity.GROUP, json.dumps(content, allow_nan=False).encode())
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
         """Bring all bands to one number of frames, once, with `time` [s] as coordinate.
@@ -212,21 +200,21 @@ class Recording:
             if time is not None:
                 zarr.create_array(
                     self._store,
-                    name=TIME,
+                    name=integrity.TIME,
                     data=time.astype(np.float64),
                     dimension_names=("time",),
                     attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
                     **_FORM,
                 )
-                tree_to_disk([self.root / TIME, self.root / SUMS], self.root)
+                tree_to_disk([self.root / integrity.TIME, self.root / integrity.SUMS], self.root)
             # Nothing was lost, and one state of every file counts from here on.
-            if lost := missing_files(self.root):
+            if lost := integrity.missing_files(self.root):
                 raise FileNotFoundError(
                     f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "
                     f"{len(lost)} that were deleted. Must stay while it is written to."
                 )
-            self.commit(complete=complete, closed=True, **MARK, **attrs)
-            replace(self.root / SUMS, sums_file(last_sums(self.root)))
+            self.commit(complete=complete, closed=True, **integrity.MARK, **attrs)
+            replace(self.root / integrity.SUMS, integrity.sums_file(integrity.last_sums(self.root)))
             self.path, self._closed = self.place(), True
             self._folder.close()
 
@@ -290,7 +278,7 @@ class HeldFolder:
         )
 
 
-class DurableStore(SummedStore):
+class DurableStore(integrity.SummedStore):
     """Zarr store in a folder in which an existing file is replaced in one step.
 
     New files are brought to the disk by `tree_to_disk`, for many at once take the time of one.
@@ -313,7 +301,7 @@ class DurableStore(SummedStore):
 
     def replace(self, key: str, content: bytes) -> None:
         """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""
-        replace(self.root / key, content, before=[add_sum(self.root, key, content)])
+        replace(self.root / key, content, before=[integrity.add_sum(self.root, key, content)])
 
 
 def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
