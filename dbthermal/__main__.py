@@ -13,12 +13,13 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves, unused
+from dbthermal._cli import is_source, leaves
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -201,6 +202,7 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 
 def _parser() -> argparse.ArgumentParser:
     """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
+    # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
@@ -248,19 +250,12 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    printed = set[str]()
-
-    def print_once(message: Warning | str, *_: Any, **__: Any) -> None:
-        """Print a warning, once."""
-        if str(message) not in printed:
-            print(f"Warning: {message}", file=sys.stderr)
-        printed.add(str(message))
-
-    warnings.showwarning = print_once
+    say = cache(lambda text: print(f"Warning: {text}", file=sys.stderr))  # once
+    warnings.showwarning = lambda message, *_, **__: say(str(message))
     options = _parser().parse_args(arguments)
+    # An error ends in a line and a status.
     try:
-        unused.refuse(options, sys.argv[1:] if arguments is None else arguments)
-        return _carry_out(options)
+        return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
     except BrokenPipeError:  # nobody reads the summary any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
@@ -290,25 +285,32 @@ def _reason(error: Exception, command: str) -> str:
     return f"{type(error).__name__}: {message} (--traceback shows where)"
 
 
-def _carry_out(options: argparse.Namespace) -> int:
-    """Check what is read and written, run the command, and print its summary."""
+def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Check the options, and what is read and written; run the command; print its summary."""
     if options.command == "completion":
         print(_completion())
         return 0
+    module, function = options.place.split(".")
     if options.command == "record":
-        return int(_function(options)(options))
+        return int(_command(module, function)(options))
+    _command("unused", "refuse")(options, arguments)
     sources, targets = _sources_and_targets(options)
     if options.dry_run:
-        foreseen = import_module("dbthermal._cli.steps").foreseen
-        summary = foreseen(options, sources, targets)
+        summary = _command("steps", "foreseen")(options, sources, targets)
     else:
         start = time.monotonic()
-        summary = _function(options)(options)
+        summary = _command(module, function)(options)
         if not sys.stderr.isatty():  # where no bar was shown
             print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    # The summary, for programs or for people.
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
+
+
+def _command(module: str, function: str) -> Any:
+    """Function of a command, imported when it is needed."""
+    return getattr(import_module(f"dbthermal._cli.{module}"), function)
 
 
 def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[Path]]:
@@ -322,7 +324,7 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()
-        if any(place in (other, *other.parents) or other in place.parents for other in taken):
+        if any(place in (used, *used.parents) or used in place.parents for used in taken):
             label = f"Invalid output '{path}': it is another one, or it is read"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
@@ -349,12 +351,6 @@ def _completion() -> str:
 complete -o default -F _dbthermal dbthermal"""
 
 
-def _function(options: argparse.Namespace) -> Any:
-    """Function of a command, imported when its paths have been checked."""
-    module, function = options.place.split(".")
-    return getattr(import_module(f"dbthermal._cli.{module}"), function)
-
-
 def _plain(value: Any) -> Any:
     """Value as JSON takes it: an array or number of NumPy as a list or number, else as text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
@@ -363,18 +359,13 @@ def _plain(value: Any) -> Any:
 def _lines(summary: Any, indent: str = "") -> Iterator[str]:
     """Summary as text: a line for each entry that is not empty, numbers in one line."""
     for key, value in summary.items():
-        if isinstance(value, dict) and any(
-            isinstance(entry, dict | list | str) for entry in value.values()
-        ):
+        entries = value if isinstance(value, dict) else dict[str, Any]()
+        if any(isinstance(entry, dict | list | str) for entry in entries.values()):
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")
             continue
-        entries = (
-            [f"{name} {number:g}" for name, number in value.items()]
-            if isinstance(value, dict)
-            else leaves(value)
-        )
-        if line := ", ".join(map(str, entries)):
+        words = [f"{name} {number:g}" for name, number in entries.items()]
+        if line := ", ".join(words if isinstance(value, dict) else map(str, leaves(value))):
             yield f"{indent}{key}: {line}"
 
 

@@ -195,7 +195,7 @@ def test_raw_files_need_their_form(results: Path) -> None:
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
         np.testing.assert_array_equal(counts.values, [stack, stack + 1])
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
-    assert "Invalid byte_order" in line
+    assert "Missing --byte-order: 'a.raw' does not tell" in line
 
 
 def test_blackbody_in_a_store(

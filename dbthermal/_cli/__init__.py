@@ -1,6 +1,8 @@
 """Subcommands of the command line, thin calls of the library; see `dbthermal.__main__`."""
 
-from collections.abc import Iterator
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,3 +18,13 @@ def leaves(value: Any) -> Iterator[Any]:
 def is_source(name: str, value: Any) -> bool:
     """Tell whether a value of an argument is a path that is read."""
     return isinstance(value, Path) and value != PLUS and not name.endswith("output")
+
+
+def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]:
+    """Options that a function takes by name; paths, which are opened first, are not among them."""
+    names = signature(function).parameters
+    return {
+        name: value
+        for name, value in vars(options).items()
+        if name in names and value is not None and not isinstance(value, Path)
+    }

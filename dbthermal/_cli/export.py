@@ -17,6 +17,7 @@ from dbthermal._cli.files import opened, provenance, staged
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
     """Command `export`."""
+    # The variable, which must be of the kind that the file shows.
     result, suffix = opened(options.result), options.output.suffix
     options.variable = options.variable or "object_temperature"
     if suffix not in _WRITERS:
@@ -39,8 +40,8 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     for path, options.variable in outputs.items():
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
-        with store.whole(path, suffix) as part:
-            summary[str(path)] = _WRITERS[suffix](result, part, options)
+        with store.whole(path, suffix) as draft:
+            summary[str(path)] = _WRITERS[suffix](result, draft, options)
     return summary
 
 
@@ -98,6 +99,7 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
+    # The last image, in degrees Celsius.
     array = result[options.variable]
     image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
     unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")
@@ -149,8 +151,8 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     cell |= {"execution_count": None, "source": f"import dbthermal\n\ndbthermal.explore({paths})"}
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
-    with store.whole(options.output, ".ipynb") as part:
-        part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
+    with store.whole(options.output, ".ipynb") as draft:
+        draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
     install = ""
     if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
         install = "python -m pip install 'dbthermal[explorer]' jupyterlab; "

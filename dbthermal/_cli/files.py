@@ -2,16 +2,17 @@
 
 import argparse
 import sys
+from collections.abc import Callable
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
-from dbthermal._cli import PLUS, is_source, leaves
-from dbthermal._cli.unused import kind_of
+from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal._warnings import warned
 
 _MADE_BY = {
@@ -21,7 +22,14 @@ _MADE_BY = {
     "response": "calibrate",
     "separated": "separate",
 }
-_NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
+READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
+    "TIFF": (readers.tiff, (".tif", ".tiff", ".btf")),
+    "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr")),
+    "FLIR": (readers.flir, ()),
+    "raw files": (readers.raw, ()),
+}
+"""Kind of files -> its reader, whose arguments are the options, and its suffixes."""
+_NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
 
 def opened(path: Path) -> xr.Dataset:
@@ -49,35 +57,34 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
     return [*datasets.values()]
 
 
+def kind_of(path: Path, options: argparse.Namespace) -> str:
+    """Kind of a recording's file: by its suffix, else raw if a shape is stated, else FLIR."""
+    kinds = [kind for kind, (_, suffixes) in READERS.items() if path.suffix.lower() in suffixes]
+    return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
+
+
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
-    """Recording of one camera, with its origin."""
-    movie = _read(paths, options)
-    return movie.assign_attrs(origin="simulated") if options.simulated else movie
-
-
-def _read(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
-    """Recording of one camera, by the kind of its files."""
-    kind, clock = kind_of(paths[0], options), options.clock
-    if kind == "FLIR":
-        return readers.flir(paths, clock=clock)
-    for name in ("unit", "clock"):
-        if getattr(options, name) is None:
-            raise ValueError(f"Missing --{name}: '{paths[0].name}' does not tell. Must be stated.")
-    if kind == "TIFF":
-        return readers.tiff(paths, unit=options.unit, clock=clock)
-    if len(paths) > 1:
+    """Recording of one camera, by the kind of its files, with its origin."""
+    kind = kind_of(paths[0], options)
+    reader, _ = READERS[kind]
+    # Arguments of the reader, by the options of the same names.
+    parameters, stated = signature(reader).parameters, accepted(reader, options)
+    stated.pop("frames", None)  # of a calibration
+    if "shape" in stated:
+        stated["shape"] = tuple(options.shape)
+    if "name" in parameters:
+        stated["name"] = options.variable
+    for name, parameter in parameters.items():
+        required = parameter.kind is Parameter.KEYWORD_ONLY and parameter.default is Parameter.empty
+        if required and name not in stated:
+            label = f"Missing --{name.replace('_', '-')}: '{paths[0].name}' does not tell"
+            raise ValueError(f"{label}. Must be stated.")
+    # Files of the kinds that make one recording together.
+    several = kind in {"FLIR", "TIFF"}
+    if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
-    if kind == "arrays":
-        return readers.array(paths[0], options.variable, unit=options.unit, clock=clock)
-    return readers.raw(
-        paths[0],
-        tuple(options.shape),
-        byte_order=options.byte_order or "unknown",
-        unit=options.unit,
-        clock=clock,
-        header=options.header,
-        frame_header=options.frame_header,
-    )
+    movie = reader(paths if several else paths[0], **stated)
+    return movie.assign_attrs(origin="simulated") if options.simulated else movie
 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: float | None) -> xr.Dataset:
@@ -161,28 +168,28 @@ def outline(dataset: xr.Dataset) -> dict[str, Any]:
 def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     """Outline, flags, clocks, views and medians of a dataset; with everything its attributes."""
     lines, attrs = outline(dataset), dataset.attrs
-    # Shares of the flags, and frames that were lost or bridged.
+    # Shares of the flags, frames that were lost or bridged, and the offset of the clocks.
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             lines[f"{name}_shares"] = _shares(dataset[name])
-    frames = ("frames_missing", "frames_bridged")
-    lines |= {name: round(attrs[name], 1) for name in frames if name in attrs}
-    # The offset of the clocks, and that of the views: a matrix for each band.
-    for name in ("time_offset", "time_offset_std"):
+    places = {"frames_missing": 1, "frames_bridged": 1, "frames_lost": 1}
+    places |= {"time_offset": 6, "time_offset_std": 6}  # decimals
+    for name, decimals in places.items():
         if attrs.get(name) is not None:
-            lines[f"{name}_s"] = np.round(attrs[name], 6).tolist()
-    lines |= {name: attrs[name] for name in ("frames_lost",) if name in attrs}
+            unit = "_s" if name.startswith("time") else ""
+            lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
+    # The offset of the views: a matrix for each band.
     views = len(attrs.get("transform", ())) / 9
     if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
         lines["view_shift_pixel"] = _view_shifts(dataset)
     # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
-            good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
-            values = [pixels[np.isfinite(pixels)] for pixels in np.atleast_1d(good.values)]
-            if all(pixels.size for pixels in values):
-                medians = [round(float(np.median(pixels)), 4) for pixels in values]
-                lines[f"median_{name}{unit}"] = dict(zip(lines["bands"], medians, strict=True))
+            good = dataset[name].astype(float).where(np.isfinite)
+            good = good.where(dataset["status"] == 0 if "status" in dataset else True)
+            medians = good.median([dim for dim in good.dims if dim != "band"])
+            if medians.notnull().all():
+                lines[f"median_{name}{unit}"] = medians.round(4).to_series().to_dict()
     if not everything:
         return lines
     lines["variables"] = {

@@ -52,6 +52,7 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
     path = folder / f"{session.name}.zarr"
     if session.blackbody is None and path.exists() and not dry:
         raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
+    # The devices, as emulated or as plugged in.
     if session.simulated:
         _say(f"Session '{session.name}': every device is emulated, nothing is measured.")
     else:
@@ -61,6 +62,7 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
             _say(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
         if dry:
             return 0
+        # The protocol of the session.
         _say("Preparing: cameras are set, offsets corrected, the wheel is homed and turned.")
         devices.prepare()
         summaries = _record(devices, folder)

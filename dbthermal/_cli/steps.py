@@ -3,6 +3,7 @@
 import argparse
 import math
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,7 @@ from dbthermal import (
     scene,
     separation,
 )
-from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import (
-    capture,
-    described,
-    opened,
-    outline,
-    provenance,
-    saved,
-    staged,
-)
+from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._warnings import warned
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
@@ -41,9 +33,11 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(
             f"Invalid sources {stated}. Must be --at, --blackbody, --sweep or --maker."
         )
+    # The constants of the cameras' maker.
     if options.maker:
-        response = calibration.maker_response(opened(options.maker).attrs.get("files", {}))
-        return saved(response, options)
+        response = calibration.maker_response(files.opened(options.maker).attrs.get("files", {}))
+        return files.saved(response, options)
+    # Movies of a blackbody: statistics of each pixel, then one curve for all.
     blackbody = _blackbody(options)
     if "frame" in blackbody.dims:
         blackbody = correction.blackbody_statistics(blackbody)
@@ -52,29 +46,31 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     response = calibration.fit_response(counts, blackbody.get("noise"))
     # The response names the files that it was fitted to.
     named = leaves([options.at, options.blackbody, options.sweep])
-    files = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
-    response.attrs["blackbody"] += f"; of {', '.join(files)}"
-    summary = saved(response, options)
+    paths = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
+    response.attrs["blackbody"] += f"; of {', '.join(paths)}"
+    summary = files.saved(response, options)
     if fitted is not None and options.correction_output:
-        summary |= saved(fitted, options, options.correction_output)
+        summary |= files.saved(fitted, options, options.correction_output)
     return summary
 
 
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
+    # A store, or the recordings of a sweep.
     if options.blackbody:
-        return opened(options.blackbody).load()
+        return files.opened(options.blackbody).load()
     if options.sweep:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
         return recording.open_sweep(*options.sweep, frames=options.frames)
     if options.frames < 1:
         raise ValueError(f"Invalid --frames {options.frames}. Must be at least 1.")
+    # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        still = capture(paths, options, offset=0.0)  # nothing moves: any offset will do
+        still = files.capture(paths, options, offset=0.0)  # nothing moves: any offset will do
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
@@ -91,11 +87,11 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
     stages = {"correction": "correction"} if options.correction else {}
-    raw, *fitted = staged(options, capture="capture|corrected", **stages)
+    raw, *fitted = files.staged(options, capture="capture|corrected", **stages)
     by_camera = options.corrected_by_camera
-    files = raw.attrs.get("files", {}).values()
+    records = raw.attrs.get("files", {}).values()
     # Planck constants of the maker hold for all pixels: such a camera has corrected its offsets.
-    by_maker = bool(files) and all("file_planck_R1" in attrs for attrs in files)
+    by_maker = bool(records) and all("file_planck_R1" in attrs for attrs in records)
     if by_camera == bool(options.correction) and (by_camera or not by_maker):
         sources = "both a file and --corrected-by-camera" if by_camera else "neither"
         raise ValueError(
@@ -104,77 +100,61 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
             "offset themselves, --corrected-by-camera."
         )
     gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
-    corrected = correction.correct_capture(
-        raw,
-        gain,
-        lazy=True,
-        shutter=not options.no_shutter,
-        time_constant=options.time_constant,
+    named = accepted(correction.correct_capture, options)
+    shutter = not options.no_shutter
+    return files.saved(
+        correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named), options
     )
-    return saved(corrected, options)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
-    (corrected,), transform = staged(options, capture="corrected"), None
+    (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
+    named = {**accepted(alignment.align, options), "clock": options.reference}
     if options.register != "none":
-        transform = alignment.register(corrected, model=options.register)
-    aligned = alignment.align(
-        corrected,
-        transform=transform,
-        lazy=True,
-        offset=options.offset,
-        search=options.search,
-        clock=options.reference,
-    )
-    return saved(aligned, options)
+        named["transform"] = alignment.register(corrected, model=options.register)
+    return files.saved(alignment.align(corrected, lazy=True, **named), options)
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `separate`."""
+    # Inputs of the stages that the way needs.
     stages = {"capture": "corrected", "response": "response"}
     if options.correction:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
-    source, response, *fitted = staged(options, **stages)
+    source, response, *fitted = files.staged(options, **stages)
     announce_compiling()
     response.load()
-    completing, progress = _completing(options), sys.stderr.isatty()
+    progress = {"progress": sys.stderr.isatty()}
     if options.correction:  # all steps of a raw capture, by rows
-        offset = {} if options.offset is None else {"offset": options.offset}
         scene.separate_capture(
             source,
             fitted[0].load(),
             response,
             registration=None if options.register == "none" else options.register,
-            aligning=offset,
-            separating={**completing, "progress": progress},
+            aligning=accepted(alignment.align, options),
+            separating=accepted(separation.separate, options) | progress,
             target=options.output,
-            provenance=provenance(options),
+            provenance=files.provenance(options),
         )
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
-        result = separation.separate(source.load(), response, **completing, progress=progress)
-        return saved(warned(result, *notes, *hardly_measured(result)), options)
+        named = accepted(separation.separate, options) | progress
+        result = separation.separate(source.load(), response, **named)
+        return files.saved(warned(result, *notes, *hardly_measured(result)), options)
     else:  # a single method, by rows
-        emissivities = None
+        named = accepted(separation.run, options) | progress
         if options.emissivity:
             axis = {"band": source["band"].values}
             if len(options.emissivity) != len(axis["band"]):
                 rule = f"Must be one for each of the bands {axis['band'].tolist()}"
                 raise ValueError(f"Invalid --emissivity {options.emissivity}. {rule}.")
-            emissivities = xr.DataArray(options.emissivity, dims="band", coords=axis)
-        separation.run(
-            options.capture,
-            options.output,
-            response,
-            options.method,
-            emissivity=emissivities,
-            provenance=provenance(options),
-            progress=progress,
-        )
-    return described(options.output)
+            named["emissivity"] = xr.DataArray(options.emissivity, dims="band", coords=axis)
+        made_by = files.provenance(options)
+        separation.run(options.capture, options.output, response, provenance=made_by, **named)
+    return files.described(options.output)
 
 
 def announce_compiling() -> None:
@@ -184,13 +164,8 @@ def announce_compiling() -> None:
     class CompilerListener(event.Listener):
         """Listener to the compiler."""
 
-        announced = False
-
         def on_start(self, _: event.Event) -> None:
-            if not self.announced:
-                text = "Compiling the separation, once after an installation: about a minute.\n"
-                sys.stderr.write(text)
-            self.announced = True
+            _announce()
 
         def on_end(self, _: event.Event) -> None:
             """Stay silent: a listener must have this function."""
@@ -198,20 +173,18 @@ def announce_compiling() -> None:
     event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
 
 
-def _completing(options: argparse.Namespace) -> dict[str, Any]:
-    """Options of the completion, and the number of threads."""
-    return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
+@cache
+def _announce() -> None:
+    sys.stderr.write("Compiling the separation, once after an installation: about a minute.\n")
 
 
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
-    result, source, response = (one.load() for one in staged(options, **stages))
+    result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
     announce_compiling()
-    completed = separation.complete(
-        result, source, response, result.get("material"), **_completing(options)
-    )
-    return saved(completed, options)
+    named = {**accepted(separation.complete, options), "materials": result.get("material")}
+    return files.saved(separation.complete(result, source, response, **named), options)
 
 
 def foreseen(
@@ -220,13 +193,13 @@ def foreseen(
     """Inputs and outputs of a command, and the memory that a separation takes at most."""
     inputs = dict[str, Any]()
     for path in sources:
-        files = [file for file in (path, *path.rglob("*")) if file.is_file()]
-        inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in files)}
+        contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
+        inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
-            inputs[str(path)] |= outline(opened(path))
+            inputs[str(path)] |= files.outline(files.opened(path))
     summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        summary["would_be"] = outline(capture(options.files, options, options.offset))
+        summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
@@ -237,6 +210,7 @@ def foreseen(
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:
     """Command `plan`."""
+    # Materials, all or those that are named.
     table = emissivity.embedded_table()
     if options.materials:
         names = table["material"].values.tolist()
@@ -244,19 +218,17 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
             if name not in names:
                 raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
-    numbers = {name: getattr(options, name) for name in ("seconds", "rate", "span", "amplitude")}
+    # Plan of the capture, and its best filter by material.
+    design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options))
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
-    plans = limits.plan(table, noise, limits.CaptureDesign(**numbers))
-    filters = plans["filter"].values.tolist()
-    by_material = {str(name): plans.sel(material=name) for name in plans["material"].values}
+    plans = limits.plan(table, noise, design)
+    deviations = plans["object_temperature_std"].transpose("filter", "material").to_pandas()
     return {
         name: {
-            "best_filter": str(plan["best"].values),
-            "object_temperature_std_K": dict(
-                zip(filters, plan["object_temperature_std"].values.round(4).tolist(), strict=True)
-            ),
+            "best_filter": str(best),
+            "object_temperature_std_K": deviations[name].round(4).to_dict(),
         }
-        for name, plan in by_material.items()
+        for name, best in plans["best"].to_series().items()
     }
 
 
@@ -268,11 +240,6 @@ def data(_: argparse.Namespace) -> dict[str, Any]:
             name: [round(1e6 * band.lower, 3), round(1e6 * band.upper, 3)]
             for name, band in bands.FILTERS.items()
         },
-        "emissivity": {
-            str(row["material"].values): dict(
-                zip(table["band"].values.tolist(), row.values.round(3).tolist(), strict=True)
-            )
-            for row in table
-        },
+        "emissivity": table.transpose("band", "material").to_pandas().round(3).to_dict(),
         "outside_files": "listed by data_manifest.yaml of a clone, and fetched there by: make data",
     }

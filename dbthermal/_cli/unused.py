@@ -2,28 +2,15 @@
 
 import argparse
 from collections.abc import Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Final
 
 from dbthermal._cli import PLUS, leaves
+from dbthermal._cli.files import READERS, kind_of
 
-_KINDS: Final = {
-    "TIFF": (".tif", ".tiff", ".btf"),
-    "arrays": (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"),
-}
-_FORM: Final = {
-    "FLIR": "clock bands offset",
-    "TIFF": "clock bands offset unit simulated",
-    "arrays": "clock bands offset unit variable simulated",
-    "raw files": "clock bands offset unit shape byte_order header frame_header simulated",
-}
-"""Kind of files -> the options that it takes."""
-
-
-def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file by its suffix; without a known one raw if a shape is stated."""
-    kinds = [kind for kind, suffixes in _KINDS.items() if path.suffix.lower() in suffixes]
-    return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
+_FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
+"""Options of files, of which each kind takes those that its reader has, and the last two."""
 
 
 def refuse(options: argparse.Namespace, arguments: Sequence[str]) -> None:
@@ -66,8 +53,12 @@ def _of_files(options: argparse.Namespace) -> dict[str, str]:
     stated = [source for source in sources if vars(options).get(source)]
     if options.command == "calibrate" and not (options.at or stated):
         return {}
-    taken = " ".join(_FORM[kind] for kind in kinds).split()
-    names = [name for name in " ".join(_FORM.values()).split() if name not in taken]
+    taken = {"bands", "offset"} if kinds else set[str]()
+    for kind in kinds:
+        parameters = {*signature(READERS[kind][0]).parameters}
+        taken |= parameters | ({"variable"} if "name" in parameters else set())
+        taken |= {"simulated"} if kind != "FLIR" else set()
+    names = [name for name in _FORM.split() if name not in taken]
     names += sources[stated[0]].split() if stated and not kinds else []
     reason = " and ".join([*(f"--{source}" for source in stated), *sorted(kinds)]) or "a store"
     return {f"with {reason}": " ".join(names)}

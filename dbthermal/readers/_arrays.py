@@ -75,6 +75,7 @@ def array(
     >>> array(frames, unit="count", clock=30.0).sizes["time"]
     2
     """
+    # Unit and memory, before a file is opened.
     label = Path(source).name if isinstance(source, str | Path) else "array"
     recordings.check_unit(unit, label)
     recordings.check_number(memory, "memory")
@@ -97,6 +98,7 @@ def array(
         if times is not None:
             _check_times(times, clock, label)
 
+    # The array, checked before it is read.
     with ExitStack() as stack:
         values = source
         if not isinstance(source, str | Path):
@@ -109,6 +111,7 @@ def array(
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
+    # The numbers: byte order, and values that stand for missing counts.
     judged = isinstance(source, str | Path) and np.any(counts & 0xFF)  # others tell nothing
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"

@@ -48,6 +48,7 @@ def read(
     path: Path, name: str | None, check: Callable[..., None], memory: float, stack: ExitStack
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
+    # Size, for NetCDF is read at once.
     kind = kind_of(path)
     limit = max(2 * memory, 2**20)
     if kind == "NetCDF" and path.stat().st_size > limit:
@@ -57,6 +58,7 @@ def read(
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
         arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
+        # The array, by its name, and its times.
         films = [key for key, array in arrays.items() if array.ndim == 3]
         name = recordings.array_name(films, name, path)
         values, dims = arrays[name], dims_of(arrays[name])
@@ -79,6 +81,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
         if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(array.attrs.get("NAME")):
             arrays.update({name: array} if array.ndim == 3 or are_times(name, array) else {})
 
+    # All arrays of the file itself: no other file, no overlap, every chunk.
     file.visititems(visit)  # follows no link to another file
     for name, array in arrays.items():
         if array.is_virtual or array.external:
@@ -151,6 +154,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     pieces = values.shards or values.chunks
     grid = [-(-size // piece) for size, piece in zip(values.shape, pieces, strict=True)]
     whole = tuple(number * piece for number, piece in zip(grid, pieces, strict=True))
+    # Files of chunks, which must be of their stated size.
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
     if values.shards is None and "Blosc" in str(values.compressors[-1:]):

@@ -130,6 +130,7 @@ def flir(
     name = recordings.label(paths)
     recordings.check_number(memory, "memory")
     wanted = slice(None) if frames is None else frames
+    # Records of the selected frames.
     with ExitStack() as stack:
         try:
             selected = islice(_walk(paths, memory, stack), wanted.start, wanted.stop, wanted.step)
@@ -138,6 +139,7 @@ def flir(
         listed = [*selected]
         if not listed:
             raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
+        # Images, all of the form of the first.
         form = _image(*listed[0])._replace(body=b"")
         recordings.check_memory((len(listed), *form.shape), memory, name)
         counts = np.empty((len(listed), *form.shape), dtype=np.uint16)
@@ -150,6 +152,7 @@ def flir(
                 image = image._replace(order=recordings.byte_order(name, byte_order))
             counts[number] = _decoded(image, listing[-1])
         seconds, same_number, attrs = _cameras(listed)
+    # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
     seconds = np.where(same_number, seconds, np.nan)
@@ -189,6 +192,7 @@ def _image(content: Content, records: Frame, place: str) -> _Image:
     order = {b"\2\0": "<", b"\0\2": ">"}.get(head[:2])
     if order is None or len(head) < _IMAGE_SIZE:
         raise ValueError(f"Damaged image in {place}: it begins with {head[:2]!r}. Must be 2.")
+    # Sizes by the header, and by the compressed image.
     width, height = struct.unpack_from(f"{order}HH", head, 2)
     image = _Image((height, width), order, "none", body)
     stated = (height, width, 16)
@@ -275,16 +279,19 @@ def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
     for number, (content, records, place) in enumerate(listed):
         if container.CAMERA not in records:
             continue
+        # The record, in its byte order.
         body = container.body(content, records[container.CAMERA], place)
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
             label = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
             raise ValueError(f"Damaged {label}. Must be {_CAMERA_SIZE} at least, and begin with 2.")
         order = "<" if body[0] else ">"
+        # Number and time of the frame.
         place_of = records[container.IMAGE].start + _NUMBER
         same_number[number] = content[place_of : place_of + 2] == body[_NUMBER : _NUMBER + 2]
         whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
+        # Settings and constants, which must stay those of the first frame.
         camera = {
             key: struct.unpack_from(order + code, body, start)[0]
             for key, (start, code, *_) in _FIELDS.items()

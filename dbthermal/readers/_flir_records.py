@@ -96,6 +96,7 @@ def of_jpeg(content: Content, name: str) -> bytes:
 def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     """Records of the frame that begins at a byte, and the byte after its last one."""
     size = len(content)
+    # Header, and the byte order by its version.
     if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:
         hint = "" if at else "; is it no recording of FLIR? Then export 16-bit counts as TIFF"
         rule = f"Must be FLIR's: 'FFF' or 'AFF'{hint}"
@@ -104,6 +105,7 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
     if not orders:
         version = content[at + 20 : at + 24].hex()
         raise ValueError(f"Invalid version {version} of {place}. Must be from 100 to 199.")
+    # Directory of the records.
     directory, count = struct.unpack_from(f"{orders[0]}II", content, at + 24)
     listed = directory + _ENTRY * count
     if directory < _HEADER or count > _MOST_RECORDS or at + listed > size:
@@ -121,6 +123,7 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
         if kind in {IMAGE, CAMERA} and kind in records:
             raise ValueError(f"Repeated record of type {kind} in {place}. Must be listed once.")
         records[kind] = Record(at + start, min(at + start + length, size), checksum)
+    # Records must lie one behind another, within the file.
     spans.sort()
     stops = [_HEADER, *(stop for _, stop in spans)]
     for before, (start, stop) in zip(stops, spans, strict=False):

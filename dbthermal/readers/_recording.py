@@ -186,12 +186,14 @@ def recording(
     flags: npt.NDArray[np.uint16] | None = None,
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
+    # Counts, of which both bytes are used.
     empty = (not any(np.any(frame & byte) for frame in counts) for byte in (0x00FF, 0xFF00))
     if any(empty):
         raise ValueError(
             f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
             "bits or with automatic gain. Must be 16-bit counts of the detector: record those."
         )
+    # Times, which must rise where they are known.
     (stamped,) = np.nonzero(np.isfinite(seconds))
     steps = np.diff(seconds[stamped])
     if np.any(steps < 0):
@@ -207,11 +209,13 @@ def recording(
             f"Unknown times in '{name}': {stamped.size} of {seconds.size} frames have one. Must be "
             "given: clock= is the frame rate [Hz], or the time of each frame [s]."
         )
+    # Flags of frames without a time, and behind a gap.
     flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
     flags[stands] |= FileFlag.TIME_STANDS.value
     period = np.median(np.diff(exposed[stamped]) / np.diff(stamped)) if stamped.size > 1 else 1.0
     late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
     flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
+    # The dataset, with a clock without holes.
     variables = {
         "counts": (("time", "y", "x"), counts, schema.STAGES["capture"]["counts"].attrs),
         "exposure_time": ("time", exposed - exposed[stamped[0]], schema.EXPOSURE_TIME.attrs),

@@ -256,6 +256,7 @@ def _spectrum(
     wavelength: Array, emissivity: Array, notes: Mapping[str, str], file: _File
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
+    # Values in range, over wavelengths in order, without a missing row.
     name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS
     for quantity, values, lowest, highest in (
         ("wavelength", wavelength, 1e-3, 1e3),
@@ -271,6 +272,7 @@ def _spectrum(
         raise ValueError(f"{file.at(i)}: Unordered wavelength in {name}: {message}. {rule}.")
     if file.reach is not None:
         _check_reach(wavelength, file.reach, file)
+    # Spectrum over rising wavelengths.
     if falling:
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))

@@ -96,6 +96,7 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     paths = recordings.files(path)
     name = recordings.label(paths)
     recordings.check_unit(unit, name)
+    # Pages of one size, and the memory that they take.
     pages = [page for file in paths for page in _pages(file)]
     for page in pages:
         if page.shape != pages[0].shape:
@@ -103,6 +104,7 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
             raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
     shape = (sum(page.images for page in pages), *pages[0].shape)
     recordings.check_memory(shape, memory, name)
+    # Their pixels, from the places that the pages state.
     counts, at = np.empty(shape, dtype=np.uint16), 0
     values = counts.reshape(-1)
     for page in pages:
@@ -160,6 +162,7 @@ def raw(
     (file,) = recordings.files([path])
     name = file.name
     recordings.check_unit(unit, name)
+    # Form, as stated.
     order = recordings.byte_order(name, byte_order)
     for label, value in {"header": header, "frame_header": frame_header}.items():
         recordings.check_number(value, f"{label} of '{name}'", whole=True)
@@ -169,6 +172,7 @@ def raw(
     if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
         rule = "Must be rows and columns, two whole numbers"
         raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
+    # Size of the file, which the form must fill.
     frame = frame_header + 2 * shape[0] * shape[1]
     frames, remainder = divmod(file.stat().st_size - header, frame)
     if frames < 1 or remainder:
@@ -176,6 +180,7 @@ def raw(
         rule = f"Must be {header} + a whole number of {frame}, as shape and headers state"
         raise ValueError(f"Invalid size {label}. {rule}.")
     recordings.check_memory((frames, *shape), memory, name)
+    # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
     counts = np.memmap(file, form, "r", offset=header)["counts"].astype(np.uint16)
     if recordings.smoother(counts) < 0:
@@ -203,6 +208,7 @@ def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
     tifffile = recordings.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
+    # Complaints that tifffile logs, without an error.
     complaints, log = SimpleQueue[logging.LogRecord](), logging.getLogger("tifffile")
     handler = QueueHandler(complaints)
     handler.setLevel(logging.ERROR)
@@ -227,6 +233,7 @@ def _pages(path: Path) -> list[_Page]:
         raise ValueError(f"{state} TIFF '{path.name}': {error}{rule}") from error
     finally:
         log.removeHandler(handler)
+    # Number of the pages, as the description states it.
     if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
         (start, length), *further = pages[0].spans
         if further or start + stated * length > size:
@@ -264,10 +271,12 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         span = f" from {values.min():g} to {values.max():g}" if values.size else ""
         rule = "Must be 16-bit counts, not temperatures: record or export those"
         raise ValueError(f"Invalid values of page {number}, {page.dtype}{span}. {rule}.")
+    # Form of the page.
     for key, label, value, rule in _FORM:
         actual = page.tags.valueof(key, 1) if isinstance(key, int) else getattr(page, key)
         if actual != value:
             raise ValueError(f"Invalid {label} {actual} of page {number}. Must be {rule}.")
+    # Places of its pixels, joined where they follow one another.
     shape = (int(page.imagelength), int(page.imagewidth))
     spans = list[tuple[int, int]]()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):

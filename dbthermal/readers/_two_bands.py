@@ -74,6 +74,7 @@ def two_bands(
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
+    # Two recordings of one size, with names.
     pair = (first, second)
     names = _names(bands)
     for name, recording in zip(names, pair, strict=True):
@@ -86,6 +87,7 @@ def two_bands(
             f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
             "equal: resample the second recording, or crop the first."
         )
+    # Offset of the clocks, by which they must overlap.
     late = offset
     if late is None:
         dates = [recording.attrs.get("start") for recording in pair]
@@ -100,6 +102,7 @@ def two_bands(
             f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
             "overlap. Must overlap; give offset= if a camera's clock is wrong."
         )
+    # Two cameras, not a file named twice.
     shared = min(recording.sizes["time"] for recording in pair)
     overlapping = [recording["counts"].values[:shared] for recording in pair]
     if np.array_equal(overlapping[0], overlapping[1]):
@@ -107,6 +110,7 @@ def two_bands(
             f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
             "is one file named twice?"
         )
+    # Frames of both; the shorter recording is filled up, and flagged.
     frames = max(recording.sizes["time"] for recording in pair)
     counts = np.empty((2, frames, *shapes[0]), dtype=np.uint16)
     times = np.full((2, frames), np.nan)
@@ -117,6 +121,7 @@ def two_bands(
         counts[place, length:] = recording["counts"].values[-1]
         times[place, :length] = recording["exposure_time"].values + shift
         flags[place, :length] = recording["frame_flags"].values
+    # The capture, on the clock of the longer recording.
     longer = int(second.sizes["time"] > first.sizes["time"])
     clock = pair[longer]["time"].values + (0.0, late)[longer]
     variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
@@ -171,6 +176,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 def _check(recording: xr.Dataset, name: str) -> None:
     """Refuse what is no recording of counts in one band."""
+    # Variables and dims.
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:
@@ -179,6 +185,7 @@ def _check(recording: xr.Dataset, name: str) -> None:
                 f"Invalid recording of band '{name}': '{variable}' is {actual}. Must be {dims}, as "
                 "from a reader of recordings."
             )
+    # Times that rise.
     for variable in ("time", "exposure_time"):
         values = schema.check_numbers(
             recording[variable], f"'{variable}' of band '{name}'", "s"
@@ -187,6 +194,7 @@ def _check(recording: xr.Dataset, name: str) -> None:
         if not valid.size or not np.isfinite(valid).all() or np.any(np.diff(valid) <= 0):
             rule = "Must be known, finite and rise; an exposure time may be NaN, not all"
             raise ValueError(f"Invalid '{variable}' of band '{name}' {shown(values)}. {rule}.")
+    # Types.
     for variable in ("counts", "frame_flags"):
         if ((dtype := recording[variable].dtype).kind, dtype.itemsize) != ("u", 2):
             actual = f"dtype {dtype} of the {variable} of band '{name}'"

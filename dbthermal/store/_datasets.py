@@ -20,15 +20,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
-from dbthermal.store._integrity import (
-    MARK,
-    SUMS,
-    CheckedStore,
-    SummedStore,
-    last_sums,
-    sums_file,
-    valid_part,
-)
+from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import as_json, whole
 
 # Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
@@ -94,24 +86,24 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
 
 def save_rows(
-    parts: Iterable[xr.Dataset],
+    blocks: Iterable[xr.Dataset],
     path: str | Path,
     provenance: Mapping[str, Any],
     height: int | None = None,
 ) -> None:
-    """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+    """Save a dataset as `save` does, by blocks of rows from the first to the last.
 
     Parameters
     ----------
-    parts : iterable of Dataset
-        Rows from the first to the last, made when they are asked for: no more than one is held.
-        What has no y, and the attributes, are those of the first. ValueError for none, and for one
-        whose variables, coordinates or units are others.
+    blocks : iterable of Dataset
+        Rows that follow one another, made when they are asked for: one block is held at a time.
+        What has no y, and the attributes, are those of the first block. ValueError without a block,
+        and for a block of other variables, coordinates or units.
     path, provenance : str or Path, mapping
         See `save`.
     height : int, optional
-        Rows of each part but the last, which has no more; of the first by default. For
-        `join_parts` it is that of the other folders too.
+        Rows of each block; the last may have fewer. That of the first block by default. For
+        `join_parts` all folders have the same.
 
     Examples
     --------
@@ -124,7 +116,7 @@ def save_rows(
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    following = iter(parts)
+    following = iter(blocks)
     if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
     if height is not None and (type(height) is not int or height < 1):
@@ -133,51 +125,45 @@ def save_rows(
 
 
 def _save(
-    parts: Iterable[xr.Dataset],
-    path: str | Path,
-    provenance: Any,
-    height: int | None,
+    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None
 ) -> None:
-    """Save parts that follow one another along y, each of a height that chunks then divide."""
-    options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+    """Save blocks of rows, of a height that chunks then divide."""
     if not isinstance(provenance, Mapping):
         kind = type(provenance).__name__
         raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
-        for number, rows in enumerate(parts):
+        for number, rows in enumerate(blocks):
             _check(rows)
             if number == 0:
-                first = rows.isel(y=slice(0)) if "y" in rows.dims else rows
-                attrs = {**MARK, **rows.attrs, **attrs}
+                first = rows.isel(y=slice(0), missing_dims="ignore")
+                attrs = {**integrity.MARK, **rows.attrs, **attrs}
             _check_same(rows, first, number)
-            # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
+            # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {name: _chunks(variable, height) for name, variable in plain.variables.items()}
+            chunks = {name: _chunks(array, height) for name, array in plain.variables.items()}
+            encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
+            options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
+                options = {"mode": "a", "append_dim": "y"}
                 constant = [
-                    name for name, variable in plain.variables.items() if "y" not in variable.dims
+                    name for name, array in plain.variables.items() if "y" not in array.dims
                 ]
                 plain = plain.drop_vars(constant)
-            for name, variable in plain.variables.items():
-                if variable.chunks is not None:  # those of dask are written as those of the store
-                    plain[name] = variable.chunk(
-                        dict(zip(variable.dims, chunks[name], strict=True))
-                    )
-            encoding = {
-                name: {"chunks": shape, "compressors": _COMPRESSORS}
-                for name, shape in chunks.items()
-            }
+            # Arrays of dask are written in the chunks of the store.
+            lazy = {name: array for name, array in plain.variables.items() if array.chunks}
+            for name, array in lazy.items():
+                plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
             plain.to_zarr(
-                SummedStore(folder),
+                integrity.SummedStore(folder),
                 zarr_format=3,
                 consolidated=False,
                 write_empty_chunks=True,
-                **(options if number else {"mode": "w-", "encoding": encoding}),
+                **options,
             )
-        (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
+        (folder / integrity.SUMS).write_bytes(integrity.sums_file(integrity.last_sums(folder)))
 
 
 def chunks_in_turn() -> AbstractContextManager[Any]:
@@ -191,6 +177,7 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
 
 def _check(dataset: xr.Dataset) -> None:
     """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
+    # Attributes of the dataset and its variables.
     attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
     for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
         for key, value in attrs.items():
@@ -203,6 +190,7 @@ def _check(dataset: xr.Dataset) -> None:
             except (AttributeError, TypeError) as error:
                 label = f"Invalid attribute '{key}' of {owner}, of type {type(value).__name__}"
                 raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
+    # Names and types of the variables.
     for name, variable in dataset.variables.items():
         if "/" in str(name):
             raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
@@ -222,17 +210,12 @@ def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
     """Refuse a part whose variables, units or coordinates are not those of the first."""
     for name in rows.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
-    for name, variable in rows.variables.items():
+    for name, variable in rows.isel(y=slice(0), missing_dims="ignore").variables.items():
         reference = first.variables[name]
-        equal = variable.dims == reference.dims and variable.dtype == reference.dtype
-        sizes = [
-            [candidate.sizes[dim] for dim in candidate.dims if dim != "y"]
-            for candidate in (variable, reference)
-        ]
-        equal &= sizes[0] == sizes[1] and variable.attrs.get("units") == reference.attrs.get(
-            "units"
-        )
-        if equal and name in rows.coords and "y" not in variable.dims:
+        equal = (variable.dims, variable.shape) == (reference.dims, reference.shape)
+        equal &= variable.dtype == reference.dtype
+        equal &= variable.attrs.get("units") == reference.attrs.get("units")
+        if equal and name in rows.coords:
             equal = bool(variable.equals(reference))  # type: ignore[no-untyped-call]
         if not equal:
             raise ValueError(
@@ -286,38 +269,42 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
         raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
-    checked = CheckedStore(path)
+    checked = integrity.CheckedStore(path)
     dataset = _open(checked) if checked.closed else _open_valid_part(checked)
-    dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in MARK}
+    for name in integrity.MARK:
+        dataset.attrs.pop(name, None)
     return _with_text_as(dataset, "T", np.dtype(str))
 
 
-def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
+def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
         checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
     )
     return dataset
 
 
-def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
+def _open_valid_part(checked: integrity.CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends, arrays = valid_part(checked.attrs), []
+    ends = {"time": min(checked.attrs["frames_written"].values())}  # of all bands
+    ends["log"] = checked.attrs["log_written"]
     names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
-    for name in sorted(names):
-        array = _open(checked, leave=names - {name})
-        arrays.append(array.isel({d: slice(end) for d, end in ends.items() if d in array.dims}))
+    opened = (_open(checked, leave=names - {name}) for name in sorted(names))
+    arrays = [
+        array.isel({dim: slice(end) for dim, end in ends.items()}, missing_dims="ignore")
+        for array in opened
+    ]
     # The attributes as checked, for they may have gone on since.
     return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
 
 
-def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
+def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
     """Join datasets of rows that follow one another; their chunks are linked, and not read.
 
     Parameters
     ----------
-    parts : iterable of str or Path
-        Folders from `save_rows`, each a part of its own, of one `height` but the last. They stay as
-        they are; on a disk without hard links their chunks are copied.
+    folders : iterable of str or Path
+        From `save_rows`, all of one `height` except the last. They stay as they are; on a disk
+        without hard links their chunks are copied.
     path : str or Path
         Folder ``*.zarr`` of the whole, with the attributes of the first.
 
@@ -328,30 +315,32 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     >>> from dbthermal import store
     >>> rows = [xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3)]
     >>> with TemporaryDirectory() as folder:
-    ...     parts = [f"{folder}/{number}.zarr" for number in range(3)]
-    ...     for row, part in zip(rows, parts):
-    ...         store.save_rows([row], part, store.provenance({}))
-    ...     store.join_parts(parts, f"{folder}/wall.zarr")
+    ...     paths = [f"{folder}/{number}.zarr" for number in range(3)]
+    ...     for row, path in zip(rows, paths):
+    ...         store.save_rows([row], path, store.provenance({}))
+    ...     store.join_parts(paths, f"{folder}/wall.zarr")
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    if not (folders := [texts.as_path(source) for source in parts]):
+    if not (sources := [texts.as_path(folder) for folder in folders]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
-    first, *following = folders
     with whole(path, ".zarr") as folder:
-        shutil.copytree(first, folder, copy_function=_link)
+        # The first folder, then the chunks of all others in their places.
+        shutil.copytree(sources[0], folder, copy_function=_link)
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
-        along = {file: array for file, array in metadata.items() if "y" in array["dimension_names"]}
-        sums = last_sums(folder)
-        for source in following:
-            for file, array in along.items():
-                sums |= _added(source / file.parent.name, file.parent, array)
-        for file, array in along.items():
+        sums = integrity.last_sums(folder)
+        for file, array in metadata.items():
+            if "y" not in array["dimension_names"]:
+                continue
+            for source in sources[1:]:
+                sums |= _linked_chunks(source, folder, file.parent.name, array)
+            # The metadata, of all rows, in a file of its own: that of the first is linked.
+            content = json.dumps(array, indent=2).encode()
             file.unlink()
-            file.write_text(json.dumps(array, indent=2))
-            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(file.read_bytes()):08x}"
-        (folder / SUMS).unlink()
-        (folder / SUMS).write_bytes(sums_file(sums))
+            file.write_bytes(content)
+            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(content):08x}"
+        (folder / integrity.SUMS).unlink()
+        (folder / integrity.SUMS).write_bytes(integrity.sums_file(sums))
 
 
 def _link(source: str | Path, target: str | Path) -> None:
@@ -362,26 +351,28 @@ def _link(source: str | Path, target: str | Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _added(source: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
-    """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
-    place = array["dimension_names"].index("y")
-    end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
-    part_sums, sums = last_sums(source.parent), {}
+def _linked_chunks(
+    source: Path, folder: Path, name: str, metadata: dict[str, Any]
+) -> dict[str, str]:
+    """Link the chunks of an array of a part behind those of the whole; checksums by file."""
+    axis, sums = metadata["dimension_names"].index("y"), {}
+    end, rows = (
+        metadata["shape"][axis],
+        metadata["chunk_grid"]["configuration"]["chunk_shape"][axis],
+    )
     if end % rows:
-        raise ValueError(
-            f"Invalid part '{source.parent}' after {end} rows in chunks of {rows}. Must follow "
-            "whole chunks."
-        )
-    for chunk in [chunk for chunk in (source / "c").rglob("*") if chunk.is_file()]:
-        numbers = list(chunk.relative_to(source / "c").parts)
-        numbers[place] = str(int(numbers[place]) + end // rows)
-        added = whole.joinpath("c", *numbers)
-        sums[added.relative_to(whole.parent).as_posix()] = part_sums[
-            chunk.relative_to(source.parent).as_posix()
-        ]
-        added.parent.mkdir(parents=True, exist_ok=True)
-        _link(chunk, added)
-    array["shape"][place] += json.loads((source / "zarr.json").read_text())["shape"][place]
+        label = f"Invalid part '{source}' after {end} rows in chunks of {rows}"
+        raise ValueError(f"{label}. Must follow whole chunks.")
+    for key, crc in integrity.last_sums(source).items():
+        if key.startswith(f"{name}/c/"):
+            numbers = key.split("/")
+            numbers[axis + 2] = str(int(numbers[axis + 2]) + end // rows)
+            target = folder.joinpath(*numbers)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _link(source / key, target)
+            sums["/".join(numbers)] = crc
+    added = json.loads((source / name / integrity.GROUP).read_text())
+    metadata["shape"][axis] += added["shape"][axis]
     return sums
 
 

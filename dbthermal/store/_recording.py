@@ -20,8 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,26 +29,19 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.core.buffer import Buffer
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store._integrity import (
-    GROUP,
-    GROWING,
-    MARK,
-    SUMS,
-    TIME,
-    SummedStore,
-    add_sums,
-    last_sums,
-    missing_files,
-    sums_file,
-)
+from dbthermal.store import _integrity as integrity
+from dbthermal.store._results import whole
 
 Values = npt.NDArray[Any]
 
-_NO_NODES: Final = "band"  # folder of an array, in which zarr seeks no nodes: for unfinished files
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _THREADS: Final = 8
-_LOOKS: Final = 10  # for a folder, which may be moved between the two steps of a look
-_COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
+_LOOKS: Final = 10  # for a folder, which may be moved while its path is read and compared
+# A chunk of zeros is written too: a missing one was never recorded.
+_FORM: Final[Any] = {
+    "compressors": (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec()),
+    "config": {"write_empty_chunks": True},
+}
 
 
 class Recording:
@@ -85,35 +77,33 @@ class Recording:
         attrs: Mapping[str, Any],
         fills: Mapping[str, float] | None = None,
     ) -> None:
+        # A new path, and the attributes of an empty recording.
         self.path, self.chunk, self._closed = Path(path), chunk, False
-        if self.path.suffix != ".zarr":
-            raise ValueError(f"Invalid path '{path}'. Must end in '.zarr'.")
         if self.path.exists():
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
-        self._attrs = json.loads(
-            json.dumps({**GROWING, **attrs, "complete": False, "closed": False}, allow_nan=False)
-        )
+        attrs = {**integrity.GROWING, **attrs, "complete": False, "closed": False}
+        self._attrs = json.loads(json.dumps(attrs, allow_nan=False))
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
-        whole = {**sizes, "band": len(bands), "time": chunk}
-        with made_beside(self.path.absolute()) as part:
-            part.mkdir()
-            group = zarr.open_group(
-                SummedStore(part), mode="w-", zarr_format=3, attributes=self._attrs
-            )
-            for name, variable in variables.items():
-                _create(group, name, variable, whole, (fills or {}).get(name))
+        sizes = {**sizes, "band": len(bands), "time": chunk}
+        # The store with empty arrays, on the disk before it has its name.
+        with whole(self.path, ".zarr") as draft:
+            draft.mkdir()
+            self._store = DurableStore(draft)
+            group = zarr.open_group(self._store, mode="w-", zarr_format=3, attributes=self._attrs)
+            self._arrays = {
+                name: _create(group, name, variable, sizes, (fills or {}).get(name))
+                for name, variable in variables.items()
+            }
             names = np.array(bands, dtype=np.dtypes.StringDType())
-            group.create_array(
-                "band", data=names, compressors=_COMPRESSORS, dimension_names=("band",)
+            self._arrays["band"] = group.create_array(
+                "band", data=names, dimension_names=("band",), **_FORM
             )
-            self._folder = HeldFolder(part, self.path)
-        self.root = self._folder.root
-        self._store = DurableStore(self.root)
-        group = zarr.open_group(self._store, mode="r+", use_consolidated=False)
-        # A chunk of zeros is written too: a missing one was never recorded.
-        config: Any = {"write_empty_chunks": True}
-        self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
+            tree_to_disk([draft], draft)
+            self._folder = HeldFolder(draft, self.path)
+        to_disk([self.path.parent])
+        # From here on it is written to wherever it is moved.
+        self.root = self._store.root = self._folder.root
         self._inside = {name: (self.root / name).stat() for name in self._arrays}
 
     def place(self) -> Path:
@@ -148,24 +138,30 @@ class Recording:
         `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
         with self._held():
-            place, start = list(self.frames).index(band), self.frames[band]
-            stop = start + len(next(iter(block.values())))
-            for name, values in block.items():
-                _grow(self._arrays[name], 1, stop)
-                self._arrays[name][place, start:stop] = values
-            self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
-            self.frames[band] = stop
+            place = list(self.frames).index(band)
+            self.frames[band] = self._write(block, (place,), self.frames[band], self.chunk)
 
     def append_log(self, columns: Mapping[str, Values]) -> None:
         """Write rows of the log, every variable (row,); valid with the next `commit`."""
         with self._held():
-            start, end = self.rows, self.rows + len(next(iter(columns.values())))
-            for name, values in columns.items():
-                _grow(self._arrays[name], 0, end)
-                self._arrays[name][start:end] = values
-            chunks = range(start // _LOG_CHUNK, (end - 1) // _LOG_CHUNK + 1)
-            self._to_disk(columns, [Path("c", str(number)) for number in chunks])
-            self.rows = end
+            self.rows = self._write(columns, (), self.rows, _LOG_CHUNK)
+
+    def _write(
+        self, block: Mapping[str, Values], place: tuple[int, ...], start: int, chunk: int
+    ) -> int:
+        """Write rows, (row, ...), of variables at a place from a start on; return their end."""
+        stop = start + len(next(iter(block.values())))
+        for name, values in block.items():
+            _grow(self._arrays[name], len(place), stop)
+            self._arrays[name][(*place, slice(start, stop))] = values
+        # Bring the chunks, their checksums and the folders around them to the disk.
+        chunks = [
+            self.root.joinpath(name, "c", *map(str, place), str(number))
+            for name in block
+            for number in range(start // chunk, (stop - 1) // chunk + 1)
+        ]
+        tree_to_disk([*chunks, self.root / integrity.SUMS], self.root)
+        return stop
 
     def read(self, name: str, band: str) -> Values:
         """Values (frame, ...) of a band, as many as the longest band has frames."""
@@ -178,8 +174,7 @@ class Recording:
         with self._held():
             self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
             content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
-            text = json.dumps(content, allow_nan=False)
-            self._store.replace(GROUP, text.encode(), self._part(GROUP))
+            self._store.replace(integrity.GROUP, json.dumps(content, allow_nan=False).encode())
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
         """Bring all bands to one number of frames, once, with `time` [s] as coordinate.
@@ -189,73 +184,56 @@ class Recording:
         if self._closed:
             return
         with self._held():
+            # All bands in as many frames as the longest, all arrays without empty room.
             self.commit()
             frames = max(self.frames.values())
             for place, recorded in enumerate(self.frames.values()):
                 if 0 < recorded < frames:
-                    self._repeat_last(place, recorded, frames)
+                    last = np.asarray(self._arrays["counts"][place, recorded - 1])
+                    copies = np.broadcast_to(last, (frames - recorded, *last.shape))
+                    self._write({"counts": copies}, (place,), recorded, self.chunk)
             for array in self._arrays.values():
-                shape, metadata = {"time": frames, "log": self.rows}, cast("Any", array.metadata)
-                sizes = zip(metadata.dimension_names, array.shape, strict=True)
-                array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
+                valid, dims = {"time": frames, "log": self.rows}, array.metadata.dimension_names
+                sizes = zip(dims, array.shape, strict=True)
+                array.resize(tuple(valid.get(dim, size) for dim, size in sizes))
+            # The common clock.
             if time is not None:
                 zarr.create_array(
                     self._store,
-                    name=TIME,
+                    name=integrity.TIME,
                     data=time.astype(np.float64),
-                    compressors=_COMPRESSORS,
                     dimension_names=("time",),
                     attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
-                    config={"write_empty_chunks": True},
+                    **_FORM,
                 )
-                self._to_disk([TIME], [Path()])
-            if lost := missing_files(self.root):
+                tree_to_disk([self.root / integrity.TIME, self.root / integrity.SUMS], self.root)
+            # Nothing was lost, and one state of every file counts from here on.
+            if lost := integrity.missing_files(self.root):
                 raise FileNotFoundError(
                     f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "
                     f"{len(lost)} that were deleted. Must stay while it is written to."
                 )
-            self.commit(complete=complete, closed=True, **MARK, **attrs)
-            replace(self.root / SUMS, sums_file(last_sums(self.root)), self._part(SUMS))
+            self.commit(complete=complete, closed=True, **integrity.MARK, **attrs)
+            replace(self.root / integrity.SUMS, integrity.sums_file(integrity.last_sums(self.root)))
             self.path, self._closed = self.place(), True
             self._folder.close()
-
-    def _repeat_last(self, place: int, recorded: int, frames: int) -> None:
-        """Fill a band up to a number of frames with copies of its last one, chunk by chunk."""
-        counts = self._arrays["counts"]
-        _grow(counts, 1, frames)
-        last = np.asarray(counts[place, recorded - 1])
-        start = recorded
-        while start < frames:
-            number = start // self.chunk
-            stop = min(frames, (number + 1) * self.chunk)
-            counts[place, start:stop] = np.broadcast_to(last, (stop - start, *last.shape))
-            self._to_disk(["counts"], [Path("c", str(place), str(number))])
-            start = stop
-
-    def _part(self, name: str) -> Path:
-        return self.root / _NO_NODES / f".{name}.part"
-
-    def _to_disk(self, names: Iterable[str], chunks: Sequence[Path]) -> None:
-        """Bring chunks of some arrays to the disk, their checksums, and the folders around them."""
-        places = [self.root / name / chunk for name in names for chunk in chunks]
-        tree_to_disk([*places, self.root / SUMS], self.root)
 
 
 def _create(
     group: zarr.Group, name: str, variable: Variable, sizes: dict[str, int], fill: float | None
-) -> None:
+) -> Any:
     """Make an empty array with room for one chunk of frames, or for no row of the log."""
-    whole, chunks = {**sizes, "log": 0}, {**sizes, "band": 1, "log": _LOG_CHUNK}
+    chunks = {**sizes, "band": 1, "log": _LOG_CHUNK}
     missing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
-    group.create_array(
+    return group.create_array(
         name,
-        shape=tuple(whole[dim] for dim in variable.dims),
+        shape=tuple({**sizes, "log": 0}[dim] for dim in variable.dims),
         chunks=tuple(chunks[dim] for dim in variable.dims),
         dtype=variable.dtype,
-        compressors=_COMPRESSORS,
         fill_value=missing if fill is None else fill,
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),
+        **_FORM,
     )
 
 
@@ -300,7 +278,7 @@ class HeldFolder:
         )
 
 
-class DurableStore(SummedStore):
+class DurableStore(integrity.SummedStore):
     """Zarr store in a folder in which an existing file is replaced in one step.
 
     New files are brought to the disk by `tree_to_disk`, for many at once take the time of one.
@@ -311,48 +289,35 @@ class DurableStore(SummedStore):
         self._written: set[str] = set()
 
     def set_sync(self, key: str, value: Buffer) -> None:
-        """Write a file by its relative name; if that fails, the old one stays, if it is there."""
+        """Write a file by its relative name; if that fails, the old one stays, if it exists."""
         path = self.root / key
         if path.exists():
-            self.replace(key, value.to_bytes(), path.with_name(f".{path.name}.part"))
+            self.replace(key, value.to_bytes())
         elif key in self._written:
             raise FileNotFoundError(errno.ENOENT, "Deleted while it was written to", str(path))
         else:
             super().set_sync(key, value)
         self._written.add(key)
 
-    def replace(self, key: str, content: bytes, part: Path) -> None:
+    def replace(self, key: str, content: bytes) -> None:
         """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""
-        replace(self.root / key, content, part, before=[add_sums(self.root, {key: content})])
+        replace(self.root / key, content, before=[integrity.add_sum(self.root, key, content)])
 
 
-def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ()) -> None:
+def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
     """Replace a file in one step: a power loss leaves the old content or the new one.
 
-    The new content is written to `part`, on the same file system. If that fails, the old file
-    stays, and nothing beside it. The files `before` are brought to the disk with it.
+    The new content is written beside it first. If that fails, the old file stays, and nothing
+    beside it. The files `before` are brought to the disk with it.
     """
+    draft = path.with_name(f".{path.name}.part")
     try:
-        part.write_bytes(content)
-        to_disk([part, *before])
-        part.replace(path)
+        draft.write_bytes(content)
+        to_disk([draft, *before])
+        draft.replace(path)
     except OSError:
-        part.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
         raise
-    to_disk([path.parent])
-
-
-@contextmanager
-def made_beside(path: Path) -> Iterator[Path]:
-    """Yield a folder to make beside `path`; move it there when it is complete and on the disk."""
-    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
-    with TemporaryDirectory(
-        prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
-    ) as place:
-        part = Path(place) / path.name
-        yield part
-        tree_to_disk([part], part)
-        part.rename(path)
     to_disk([path.parent])
 
 

@@ -131,8 +131,8 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     suffix = ".html" if texts.as_path(path).suffix == ".html" else ".md"
     # A string in it can neither end the comment nor begin a tag.
     content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
-    with whole(path, suffix) as part:
-        part.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
+    with whole(path, suffix) as draft:
+        draft.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
 
 
 def save_figure(
@@ -173,8 +173,8 @@ def save_figure(
     }
     kind = suffix if suffix in metadata else ".png"
     fonts: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}
-    with rc_context(fonts), whole(path, kind) as part:
-        figure.savefig(part, dpi=dpi, metadata=metadata[kind])
+    with rc_context(fonts), whole(path, kind) as draft:
+        figure.savefig(draft, dpi=dpi, metadata=metadata[kind])
 
 
 def save_video(
@@ -202,15 +202,17 @@ def save_video(
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
+    # Codec and rate, before a file is made.
     if codec not in _ENCODERS:
         raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
     encoder, options = _ENCODERS[codec]
     frequency = _numbers.real_number("rate [Hz]", rate, (0.01, 1e6))
-    with whole(path, ".mp4") as part, av.open(part, "w") as film:
+    with whole(path, ".mp4") as draft, av.open(draft, "w") as film:
         film.metadata["comment"] = as_json(provenance)
         fraction = Fraction(frequency).limit_denominator(1000)
         stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
+        # Frames, of the size of the first.
         for frame in frames:
             height, width = frame.shape[:2]
             if stream.width == 0:
@@ -223,6 +225,7 @@ def save_video(
             film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if stream.width == 0:
             raise ValueError("Invalid film without frames. Must have at least one.")
+        # Frames that the encoder still holds.
         film.mux(stream.encode())
 
 
@@ -254,12 +257,15 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """
     path = check_place(path, suffix)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
-        part = Path(folder) / path.name
-        yield part
+    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
+    with TemporaryDirectory(
+        prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
+        draft = Path(folder) / path.name
+        yield draft
         if path.is_dir():  # a folder cannot be renamed onto another
             path.rename(Path(folder) / "replaced")
-        part.replace(path)
+        draft.replace(path)
 
 
 def as_json(content: Mapping[str, Any], indent: int | None = None) -> str:
