@@ -11,6 +11,7 @@ Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/inclu
 cbbb877). Facts alone, none of the vendor's text or code.
 """
 
+import contextlib
 import struct
 import threading
 from collections.abc import Callable
@@ -109,23 +110,17 @@ class Setting(Generic[EnumT]):
         return struct.pack(">i", value)
 
 
-def _text(raw: bytes) -> str:
-    """Text up to its padding of zeros."""
-    return raw.split(b"\0", 1)[0].decode("ascii")
-
-
-def _kelvin(tenths: int) -> float:
-    """Temperature [K] of signed tenths of a degree Celsius."""
-    return float(tenths / 10.0 + zero_Celsius)
-
-
 SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
-PART_NUMBER: Final = Reading("part number", 0x00050004, ">20s", _text)
+PART_NUMBER: Final = Reading(
+    "part number", 0x00050004, ">20s", lambda raw: raw.split(b"\0", 1)[0].decode("ascii")
+)
 SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
 SOFTWARE_REVISION: Final = Reading(
     "software revision", 0x00050022, ">III", lambda *numbers: ".".join(map(str, numbers))
 )
-FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvin)
+FPA_TEMPERATURE: Final = Reading(
+    "FPA temperature [K]", 0x00050030, ">h", lambda tenths: float(tenths / 10.0 + zero_Celsius)
+)
 FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
 LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
@@ -136,8 +131,9 @@ IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
 TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
 TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
 
-_MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
-SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
+SETTINGS: Final[tuple[Setting[Any], ...]] = (
+    *(FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION),
+)
 RUN_FFC: Final = 0x00050007  # command that starts a flat-field correction
 
 # Meaning of each status of a refusal.
@@ -214,10 +210,8 @@ class Boson(Closing):
         # From the time of day, so that a reply to a program that ended is not taken for a new one.
         moment = int(1e6 * transport.clock.utc().timestamp())
         first = moment if first_sequence is None else first_sequence
-        self.is_simulated = transport.is_simulated
-        self.timeout = timeout
-        self._transport = transport
-        self._clock = transport.clock
+        self.is_simulated, self.timeout = transport.is_simulated, timeout
+        self._transport, self._clock = transport, transport.clock
         self._decoder = fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
@@ -274,14 +268,13 @@ class Boson(Closing):
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
-        settings: list[tuple[Setting[Any], IntEnum]] = [
-            (IR16_MODE, Ir16Mode.COUNTS_16),
-            (FFC_MODE, FfcMode.MANUAL),
-            (TELEMETRY, Switch(bool(telemetry_rows))),
-        ]
-        if telemetry_rows:
-            settings.append((TELEMETRY_LOCATION, TelemetryLocation.BOTTOM))
-        for setting, value in settings:
+        settings: dict[Setting[Any], IntEnum] = {
+            IR16_MODE: Ir16Mode.COUNTS_16,
+            FFC_MODE: FfcMode.MANUAL,
+            TELEMETRY: Switch(bool(telemetry_rows)),
+            **({TELEMETRY_LOCATION: TelemetryLocation.BOTTOM} if telemetry_rows else {}),
+        }
+        for setting, value in settings.items():
             self.set(setting, value)
             state = self.get(setting)
             if state != value:
@@ -317,18 +310,14 @@ class Boson(Closing):
     def _tell(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
         if reply := self._exchange(name, command, data):
-            raise BosonReplyError(
-                f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty."
-            )
+            size = len(reply)
+            raise BosonReplyError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again if no reply comes, and return the data of its reply."""
-        # A reading is requested again.
         for _ in range(repeats):
-            try:
+            with contextlib.suppress(BosonTimeoutError):
                 return self._exchange(name, command, data)
-            except BosonTimeoutError:
-                continue
         # The exchange, under a new number.
         with self._clock.hold(self._lock):
             self._sequence = fslp.next_sequence(self._sequence)

@@ -161,7 +161,8 @@ def test_dialogue_of_a_move() -> None:
     ]
     with Dialogue([*PAIRS, *talk]) as dialogue:
         wheel = FilterWheel(dialogue, FILTERS)
-        assert wheel.connect().model == "BSC201"
+        wheel.connect()
+        assert wheel.identity()["model"] == "BSC201"
         wheel.move_to(2)
 
 

@@ -10,33 +10,23 @@ AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as i
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated.world import Device, Line, World
+from dbthermal.instruments.filterwheel import BSC10X, BSC20X
 
 SERIAL_NUMBER: Final = 40_000_000
-NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
+NOTES: Final = b"emulated, not hardware"  # in its `Info`
 SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
 WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
 
 
-class Model(NamedTuple):
-    """Counts of a turn, device units of 1 count/s and of 1 count/s^2; a rack has bays."""
-
-    turn: int
-    velocity: float
-    acceleration: float
-    is_rack: bool
-
-
-_RACK = Model(409_600, 53.68, 53.68 * 204.94e-6, is_rack=True)
-_UNIT = Model(25_600, 1.0, 1.0, is_rack=False)
 MODELS: Final = MappingProxyType(
-    {"BSC201": _RACK, "BSC203": _RACK, "SCC201": _RACK, "BSC101": _UNIT, "KDC101": _UNIT}
+    {"BSC201": BSC20X, "BSC203": BSC20X, "SCC201": BSC20X, "BSC101": BSC10X, "KDC101": BSC10X}
 )
-"""Controllers by the name they give (KDC101 drives no wheel), with numbers of their own."""
+"""Controllers by the name they give (KDC101 drives no wheel); those of many counts are racks."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +80,16 @@ class EmulatedApt(Device):
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
         super().__init__()
-        self.info = apt.Info(serial_number, model, "1.0.0", NOTES)
-        self.model = MODELS[model]
-        self.unit = apt.RACK if self.model.is_rack else apt.UNIT
-        self.address = apt.BAY_1 if self.model.is_rack else apt.UNIT
+        self.info = apt.Info(serial_number, model.encode(), notes=NOTES)
+        self.model, is_rack = MODELS[model], MODELS[model] is BSC20X
+        self.unit, self.address = (apt.RACK, apt.BAY_1) if is_rack else (apt.UNIT, apt.UNIT)
         self.world = world
         self.position, self.enabled, self.homed = 0, False, False
         slot = 1 if world.wheel_position is None else world.wheel_position
         self._slot_offset = slot_offset
         self.wheel = ((slot - 1) / 6 + slot_offset / 360.0) * self.model.turn
         self._drive: Drive | None = None
-        self._speeds = apt.VelocityParameters(1, 0, 0, 0)
-        self._home = apt.HomeParameters(1, 2, 1, 0, 0)
+        self._speeds, self._home = apt.Speeds(1, 0, 0, 0), apt.Home(1, 2, 1, 0, 0)
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
 
     def receive(self, data: bytes) -> None:
@@ -126,22 +114,22 @@ class EmulatedApt(Device):
         """Carry out a message; an unknown one is ignored."""
         match message.id:
             case Id.HW_REQ_INFO:
-                self.reply(Id.HW_GET_INFO, self.info.pack(), source=message.destination)
+                self.reply(Id.HW_GET_INFO, apt.pack(self.info), source=message.destination)
             case Id.MOD_SET_CHANENABLESTATE:
                 self.enabled = message.param2 == apt.YES
             case Id.MOD_REQ_CHANENABLESTATE:
                 state = apt.YES if self.enabled else apt.NO
                 self.reply(Id.MOD_GET_CHANENABLESTATE, param1=1, param2=state)
             case Id.MOT_SET_VELPARAMS:
-                self._speeds = apt.VelocityParameters.parse(message)
+                self._speeds = apt.parse(apt.Speeds, message)
             case Id.MOT_REQ_VELPARAMS:
-                self.reply(Id.MOT_GET_VELPARAMS, self._speeds.pack())
+                self.reply(Id.MOT_GET_VELPARAMS, apt.pack(self._speeds))
             case Id.MOT_SET_HOMEPARAMS:
-                self._home = apt.HomeParameters.parse(message)
+                self._home = apt.parse(apt.Home, message)
             case Id.MOT_REQ_HOMEPARAMS:
-                self.reply(Id.MOT_GET_HOMEPARAMS, self._home.pack())
+                self.reply(Id.MOT_GET_HOMEPARAMS, apt.pack(self._home))
             case Id.MOT_REQ_STATUSUPDATE:
-                self.reply(Id.MOT_GET_STATUSUPDATE, self.status().pack())
+                self.reply(Id.MOT_GET_STATUSUPDATE, apt.pack(self.status()))
             case _:
                 self._move(message)
 
@@ -153,8 +141,8 @@ class EmulatedApt(Device):
             way = -self.wheel % self.model.turn if forward else -(self.wheel % self.model.turn)
             self.start(way + self._home.offset, self._home.velocity, homing=True)
         elif message.id == Id.MOT_MOVE_ABSOLUTE and message.data:
-            target = apt.Position.parse(message).position
-            self.start(target - self.position, self._speeds.maximum)
+            target = apt.parse(apt.Position, message).position
+            self.start(target - self.position, self._speeds.velocity)
         elif message.id == Id.MOT_MOVE_STOP:  # at once, ramps are left out
             self._drive = None
             self.report(Id.MOT_MOVE_STOPPED)
@@ -192,10 +180,10 @@ class EmulatedApt(Device):
         *,
         param1: int = 0,
         param2: int = 0,
-        source: int | None = None,
+        source: int = 0,
     ) -> None:
-        """Send a message."""
-        address = self.address if source is None else source
+        """Send a message; its source is the motor's address by default."""
+        address = source or self.address
         message = apt.Message(identifier, param1, param2, apt.HOST, address, data)
         self._replies.append(apt.encode(message))
 
@@ -204,7 +192,7 @@ class EmulatedApt(Device):
         bits = StatusBits.CONNECTED
         bits |= StatusBits.ENABLED if self.enabled else 0
         bits |= StatusBits.HOMED if self.homed else 0
-        bits |= StatusBits.JOGGING_FORWARD if self.info.model == "SCC201" else 0  # it sticks
+        bits |= StatusBits.JOGGING_FORWARD if self.info.model == b"SCC201" else 0  # it sticks
         if self._drive is not None:
             forward = self._drive.distance > 0
             bits |= StatusBits.MOVING_FORWARD if forward else StatusBits.MOVING_REVERSE
@@ -220,10 +208,8 @@ class EmulatedApt(Device):
             if now >= drive.start + drive.duration:
                 self._drive = None
                 self.finish(drive)
-        sixths = (self.wheel / self.model.turn - self._slot_offset / 360.0) * 6
-        nearest = round(sixths)
-        rests = self._drive is None and abs(sixths - nearest) * 60.0 <= WINDOW
-        self.world.wheel_position = nearest % 6 + 1 if rests else None
+        slot = self.model.position(self.wheel, self._slot_offset, WINDOW)
+        self.world.wheel_position = slot if self._drive is None else None
 
 
 def start(_: str, world: World | None) -> Line:

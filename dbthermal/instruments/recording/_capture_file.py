@@ -111,7 +111,7 @@ _LAYOUT: Final = (
     "16-bit words of a Boson; likely, not certain, are the words (of a longer number the high one "
     "first; value = number / steps + zero): "
     + ", ".join(
-        f"{name} {place.word} to {place.word + place.words - 1}"
+        f"{name} {place.word} to {place.word + np.dtype(place.dtype).itemsize // 2 - 1}"
         + (f" (steps {place.steps}, zero {place.zero:g})" if place.steps else "")
         for name, place in telemetry.FIELDS.items()
     )
