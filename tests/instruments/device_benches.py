@@ -93,5 +93,5 @@ class LoggerBench:
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""
-        self.driver.open().set_channels([1, 2])
+        self.driver.open().set_channels({1: "plate", 2: "room"})
         return self.driver

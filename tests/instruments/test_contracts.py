@@ -151,7 +151,7 @@ def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
 def test_a_logger_reads_a_room(opened: Opened) -> None:
     """Cold junction and tip have temperatures that rooms have; a socket that is off has none."""
     logger: TC08 = opened.device
-    logger.set_channels([1])
+    logger.set_channels({1: "plate"})
     scan = logger.single()
     assert 273.0 < scan.temperature[0] < 320.0
     assert 200.0 < scan.temperature[1] < 400.0
