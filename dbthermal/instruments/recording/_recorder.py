@@ -15,8 +15,9 @@ import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
@@ -221,13 +222,9 @@ def record(
     _check(session, sources)
     clock = next(iter(sources.values())).clock
     with raised_signals(), clock.joined():
-        # The file.
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-        start = clock()  # to make the file may have taken a while
-        file.begin(start, _utc(clock))
-        # The threads: the writer starts the rest, this one shows the preview.
-        end, stop = start + session.duration, stop or threading.Event()
-        run = _Run(file, sources, readings, limits, clock, start, end, stop)
+        # The writer starts the other threads, this one shows the preview.
+        run = _Run(file, sources, readings, limits, session.duration, stop or threading.Event())
         # No daemon: it ends its work whatever becomes of this thread.
         writer = Task(clock, "writer", run.write, daemon=False)
         try:
@@ -303,20 +300,23 @@ def _utc(clock: Clock) -> str:
     return clock.utc().isoformat(timespec="milliseconds")
 
 
-@dataclass(eq=False)
 class _Run:
     """A recording: the threads that fetch, read and write, and their shared state."""
 
-    file: CaptureFile
-    sources: Mapping[str, FrameSource]
-    readings: Mapping[str, Reading]
-    limits: Limits
-    clock: Clock
-    start: float
-    end: float
-    stop: threading.Event
-
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        file: CaptureFile,
+        sources: Mapping[str, FrameSource],
+        readings: Mapping[str, Reading],
+        limits: Limits,
+        duration: float,
+        stop: threading.Event,
+    ) -> None:
+        self.file, self.readings, self.limits, self.stop = file, readings, limits, stop
+        self.clock = next(iter(sources.values())).clock
+        self.start = self.clock()  # to make the file may have taken a while
+        self.end = self.start + duration
+        file.begin(self.start, _utc(self.clock))
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
@@ -324,68 +324,69 @@ class _Run:
         self.totals: Totals = {}
         self.last_frames: dict[str, Frame] = {}
         self.last_readings: dict[str, float] = {}
-        # (band, frame, number refused before it); at most `limits.queue` frames of each band.
-        self._frames: queue.SimpleQueue[tuple[str, Frame, int]] = queue.SimpleQueue()
-        self._room = {band: threading.Semaphore(self.limits.queue) for band in self.sources}
-        self._notes: queue.SimpleQueue[tuple[Note, str, float, float]] = queue.SimpleQueue()
+        # Work for the writer: notes, and at most `limits.queue` frames of each band.
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._room = {band: threading.Semaphore(limits.queue) for band in sources}
+        self._written = 0  # frames
         self._lost_sources: list[str] = []
         self._refused_last: dict[str, int] = {}
         self._fetching = [
-            Task(self.clock, band, self.fetch, band, source)
-            for band, source in self.sources.items()
+            Task(self.clock, band, self._guarded, partial(self._fetch, band, source))
+            for band, source in sources.items()
         ]
-        self._reading = Task(self.clock, "readings", self.read)
+        reading = Task(self.clock, "readings", self._guarded, self._read)
+        self._threads = [*self._fetching, reading]
 
-    def is_going(self) -> bool:
+    def _is_going(self) -> bool:
         """True until the end of the duration, a stop or an error."""
         return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
 
-    def fetch(self, band: str, source: FrameSource) -> None:
-        """Put the frames of a source into the queue, until the end.
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do a thread's work; an error ends the recording, and is raised in the caller's thread."""
+        try:
+            work()
+        except BaseException as error:  # noqa: BLE001
+            self.errors.append(error)
+            self.over.set()
+
+    def _put_note(self, kind: Note, source: str, value: float = math.nan) -> None:
+        self._work.put(partial(self._note, kind, source, self.clock(), value))
+
+    def _fetch(self, band: str, source: FrameSource) -> None:
+        """Queue the frames of a source for the writer, until the end.
 
         Without room a frame is refused; the next accepted one carries the number of refused ones.
         """
         refused = 0
         try:
-            while self.is_going():
-                # The next frame.
+            while self._is_going():
                 try:
                     frame = source.read(self.limits.silence)
                 except NoFrameError:
-                    self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
+                    self._put_note(Note.NO_FRAME, band, self.limits.silence)
                     continue
-                # Into the queue, if there is room.
                 if self.clock.has_room(self._room[band]):
-                    self._frames.put((band, frame, refused))
+                    self._work.put(partial(self._frame, band, frame, refused))
                     refused = 0
                 else:
                     refused += 1
         except SourceLostError:
             self._lost_sources.append(band)
-            self._notes.put((Note.SOURCE_LOST, band, self.clock(), math.nan))
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            self._fail(error)
+            self._put_note(Note.SOURCE_LOST, band)
         finally:
             self._refused_last[band] = refused
 
-    def read(self) -> None:
+    def _read(self) -> None:
         """Read the instruments in turn, until the end."""
-        try:
-            while self.readings and self.is_going():
-                for name, reading in self.readings.items():
-                    try:
-                        value, kind = float(reading.read()), Note.READING
-                    except (OSError, RuntimeError, ValueError):
-                        value, kind = math.nan, Note.READING_FAILED
-                    self._notes.put((kind, name, self.clock(), value))
-                remaining = max(0.0, self.end - self.clock())
-                self.clock.wait(self.over, min(self.limits.reading_period, remaining))
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
-
-    def _fail(self, error: BaseException) -> None:
-        self.errors.append(error)
-        self.over.set()
+        while self.readings and self._is_going():
+            for name, reading in self.readings.items():
+                try:
+                    value, kind = float(reading.read()), Note.READING
+                except (OSError, RuntimeError, ValueError):
+                    value, kind = math.nan, Note.READING_FAILED
+                self._put_note(kind, name, value)
+            remaining = max(0.0, self.end - self.clock())
+            self.clock.wait(self.over, min(self.limits.reading_period, remaining))
 
     def show(self, preview: Callable[[Preview], None] | None) -> None:
         """Call the preview at its period, until the last frame is written."""
@@ -393,7 +394,7 @@ class _Run:
         period = _SHOW_POLL  # until there is something to show
         # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.
         while not self.clock.wait(self.done, period):
-            if preview and self.last_frames and self.is_going():
+            if preview and self.last_frames and self._is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
                 time, totals = self.clock() - self.start, self.totals
                 frames, readings = dict(self.last_frames), dict(self.last_readings)
@@ -404,64 +405,51 @@ class _Run:
 
         Errors go to `errors`. After an error of writing itself the file stays as it is on the disk.
         """
-        threads = (*self._fetching, self._reading)
-        try:
-            for thread in threads:
-                thread.start()
-            self._write_frames()
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
+        self._guarded(self._write)
         self.over.set()
-        for thread in threads:
-            self._join(thread)
-        try:
-            if not self.file.broken:
-                self._finish()
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
-        finally:
-            self.done.set()
+        for thread in self._threads:
+            # A thread that hangs in its device must not keep what was recorded.
+            if thread.ident and not self.clock.wait(thread.ended, self.limits.patience):
+                late = f"within {self.limits.patience} s after the end. Must keep its time limits."
+                message = f"No answer of the device of '{thread.name}' {late}"
+                self.errors.append(TimeoutError(message))
+        if not self.file.broken:
+            self._guarded(self._finish)
+        self.done.set()
 
-    def _write_frames(self) -> None:
-        number = 0
-        while self.is_going() and not all(task.ended.is_set() for task in self._fetching):
-            self._take_notes()
-            try:
-                band, frame, refused = self.clock.get(self._frames, _WRITE_POLL)
-            except queue.Empty:
-                continue
-            self._take(band, frame, refused)
-            self._room[band].release()
-            number += 1
-            if number % self.limits.chunk == 0:
-                _check_space(self.file.recording.root, self.limits.reserve)
+    def _write(self) -> None:
+        for thread in self._threads:
+            thread.start()
+        while self._is_going() and not all(task.ended.is_set() for task in self._fetching):
+            with suppress(queue.Empty):
+                self.clock.get(self._work, _WRITE_POLL)()
 
     def _finish(self) -> None:
-        """Write what is left in the queues, and close the file."""
-        while not self._frames.empty():
-            self._take(*self._frames.get_nowait())
-        self._take_notes()
+        """Write what is left in the queue, and close the file."""
+        while not self._work.empty():
+            self._work.get_nowait()()
         for band, number in self._refused_last.items():
             self.file.refused(band, number, self.clock())
         self.ended = self._reason()
         self.file.close(complete=self.ended in {"duration", "stopped"}, ended=self.ended)
 
-    def _take(self, band: str, frame: Frame, refused: int) -> None:
+    def _frame(self, band: str, frame: Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
         has_device_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
         early = frame.device_time < self.start and frame.host_time < self.start + _HELD
-        if band not in self.last_frames and early and not has_device_clock:
-            return
-        flags = self.file.frame(band, frame, refused)
-        self.last_frames[band] = replace(frame, flags=flags)
-        self.totals = self.file.totals
+        if band in self.last_frames or not early or has_device_clock:
+            flags = self.file.frame(band, frame, refused)
+            self.last_frames[band] = replace(frame, flags=flags)
+            self.totals = self.file.totals
+        self._room[band].release()
+        self._written += 1
+        if self._written % self.limits.chunk == 0 and self._is_going():
+            _check_space(self.file.recording.root, self.limits.reserve)
 
-    def _take_notes(self) -> None:
-        while not self._notes.empty():
-            kind, source, time, value = self._notes.get_nowait()
-            self.file.note(kind, source, time, value)
-            if kind in {Note.READING, Note.READING_FAILED}:
-                self.last_readings[source] = value
+    def _note(self, kind: Note, source: str, time: float, value: float) -> None:
+        self.file.note(kind, source, time, value)
+        if kind in {Note.READING, Note.READING_FAILED}:
+            self.last_readings[source] = value
 
     def _reason(self) -> str:
         """Reason for the end of the recording, in one or two words."""
@@ -474,14 +462,6 @@ class _Run:
         if len(self.last_frames) < len(self._room):
             return "no frames"
         return "stopped" if self.stop.is_set() else "duration"
-
-    def _join(self, thread: Task) -> None:
-        """Wait for a thread; if it hangs in its device it must not keep what was recorded."""
-        if thread.ident is None:
-            return
-        if not self.clock.wait(thread.ended, self.limits.patience):
-            late = f"within {self.limits.patience} s after the end. Must keep its time limits."
-            self.errors.append(TimeoutError(f"No answer of the device of '{thread.name}' {late}"))
 
 
 def _check_space(path: Path, least: int) -> None:
