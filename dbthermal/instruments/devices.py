@@ -35,7 +35,7 @@ class Devices:
     cameras: Mapping[str, CameraControl] = field(default_factory=dict)  # command ports by band
     wheel: FilterWheel | None = None
     thermocouples: TC08 | None = None  # their logger
-    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
+    world: Any = None  # emulated bench (`emulated.World`) of an emulated session
 
     @property
     def clock(self) -> Clock:
@@ -144,7 +144,7 @@ def open_devices(
 ) -> Iterator[Devices]:
     """Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
-    `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
+    `world` is the emulated bench, an `emulated.World`, by default one at room temperature,
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
     [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
@@ -168,9 +168,9 @@ def open_devices(
     """
     # The bench of an emulated session.
     if session.simulated and world is None:
-        world = _emulated("world").emulated_world(session, waits=True)
+        world = _emulated().emulated_world(session, waits=True)
         if pictures is None:
-            pictures = _emulated("camera").blackbody_pictures(session, world)
+            pictures = _emulated(".camera").blackbody_pictures(session, world)
     if not session.simulated and (world is not None or pictures):
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
@@ -185,7 +185,7 @@ def open_devices(
             else:
                 beam = None if band == session.filtered else band
                 view = world, band, pictures or {}, beam, *form
-                source = _emulated("camera").EmulatedCamera(*view, kind=camera.kind)
+                source = _emulated(".camera").EmulatedCamera(*view, kind=camera.kind)
             sources[band] = stack.enter_context(source)
             if camera.control is not None and kind.open_control is not None:
                 url = camera.control if world is None else f"sim://{camera.kind}/{band}"
@@ -201,12 +201,14 @@ def open_devices(
             if world is None:
                 logger = TC08.from_url(session.devices[LOGGER])
             else:
-                unit = _emulated("tc08").EmulatedTC08(world.thermocouple_temperature, world.clock)
+                unit = _emulated(".devices").EmulatedTC08(
+                    world.thermocouple_temperature, world.clock
+                )
                 logger = TC08(unit).open()
             stack.enter_context(logger).set_channels(session.thermocouples)
         yield Devices(session, sources, controls, wheel, logger, world)
 
 
-def _emulated(module: str) -> Any:
-    """A module of the emulators, which nothing imports before it is needed."""
-    return importlib.import_module(f"dbthermal.instruments.emulated.{module}")
+def _emulated(module: str = "") -> Any:
+    """A module of the emulators, or the bench; nothing imports them before they are needed."""
+    return importlib.import_module(f"dbthermal.instruments.emulated{module}")

@@ -312,7 +312,8 @@ class FilterWheel(Closing):
         self._controller.send(identifier, data=apt.pack(wanted))
         reply = self._controller.request(Id(identifier + 1), Id(identifier + 2))
         actual = apt.parse(type(wanted), reply)
-        for name, value, expected in zip(wanted._fields, actual, wanted, strict=True):
+        for name, expected in reversed(wanted._asdict().items()):
+            value = getattr(actual, name)
             if abs(value - expected) > ACCURACY * abs(expected):
                 has = f"The controller has {prefix}{name} {value}"
                 raise WheelError(f"{has}. Must be {expected} [device units].")

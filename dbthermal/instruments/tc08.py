@@ -135,10 +135,11 @@ class TC08(Closing):
 
     Examples
     --------
-    >>> from dbthermal.instruments.emulated import tc08, world
-    >>> bench = world.World(blackbody_temperature=310.0)
+    >>> from dbthermal.instruments.emulated import World, devices
+    >>> bench = World(blackbody_temperature=310.0)
     >>> bench.thermocouples[1] = "blackbody"
-    >>> with TC08(tc08.EmulatedTC08(bench.thermocouple_temperature, bench.clock)).open() as logger:
+    >>> unit = devices.EmulatedTC08(bench.thermocouple_temperature, bench.clock)
+    >>> with TC08(unit).open() as logger:
     ...     logger.set_channels({1: "blackbody"})
     ...     print(f"{logger.read(1):.2f} K")
     310.00 K

@@ -25,7 +25,7 @@ SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's 
 # Module of each emulator, imported when it is started by its ``start(name, world)``.
 EMULATORS: Final[Mapping[str, str]] = {
     "boson": "dbthermal.instruments.emulated.camera",
-    "apt": "dbthermal.instruments.emulated.apt",
+    "apt": "dbthermal.instruments.emulated.devices",
 }
 
 _NODE = r"/dev/(?!\S*\.\.)[^\s?#\\]+"

@@ -8,7 +8,7 @@ from faulty_devices import Fault, FaultyApt, FaultyBoson, FaultyTC08
 
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.clock import EmulatedClock
-from dbthermal.instruments.emulated.world import Line, World
+from dbthermal.instruments.emulated import Line, World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 

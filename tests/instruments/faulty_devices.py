@@ -15,10 +15,9 @@ from typing import Any
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
 
 
 @dataclass

@@ -11,8 +11,8 @@ from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal.instruments.emulated.apt import EmulatedApt
-from dbthermal.instruments.emulated.world import Line, World
+from dbthermal.instruments.emulated import Line, World
+from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,

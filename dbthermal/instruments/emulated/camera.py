@@ -35,7 +35,7 @@ from dbthermal.instruments.camera import (
     NoFrameError,
     SourceLostError,
 )
-from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, Device, Line, World
+from dbthermal.instruments.emulated import SERIAL_NUMBERS, Device, Line, World
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 

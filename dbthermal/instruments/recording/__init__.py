@@ -18,15 +18,8 @@ from dbthermal import schema, store
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
-from dbthermal.instruments.recording._recorder import (
-    Limits,
-    Preview,
-    Reading,
-    SignalExit,
-    Summary,
-    raised_signals,
-    record,
-)
+from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
+from dbthermal.instruments.recording._signals import SignalExit, raised_signals
 from dbthermal.instruments.session import BLACKBODY
 
 __all__ = [

@@ -12,15 +12,13 @@ import math
 import os
 import queue
 import shutil
-import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final
+from typing import Final
 
 from dbthermal import store
 from dbthermal.instruments.camera import (
@@ -32,6 +30,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
+from dbthermal.instruments.recording._signals import SignalExit, raised_signals
 from dbthermal.instruments.session import Session
 
 Identities = Mapping[str, Mapping[str, str | bool]]
@@ -41,8 +40,6 @@ _SHOW_POLL: Final = 0.01  # least wait between two looks for a preview [s]
 _WRITE_POLL: Final = 0.05  # how long the writer waits for a frame [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
 _BYTES: Final = 2  # of a pixel
-_STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
-_ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @dataclass(frozen=True)
@@ -123,56 +120,6 @@ class Summary:
     totals: Totals
 
 
-class SignalExit(SystemExit):
-    """End of the program by a signal, with the exit status of a shell: 128 and its number.
-
-    Parameters
-    ----------
-    number : int
-        Of the signal.
-    """
-
-    def __init__(self, number: int) -> None:
-        super().__init__(_STATUS + number)
-        self.status, self.name = _STATUS + number, signal.Signals(number).name
-
-
-@contextmanager
-def raised_signals() -> Iterator[None]:
-    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
-
-    A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
-    first signal is raised, those after it are ignored: what is being closed must be left to end. A
-    signal that the program handles by itself or ignores, as under ``nohup``, stays so.
-    """
-    previous: dict[int, Any] = {}
-    raised: list[int] = []
-    late: list[int] = []  # came while the handlers were put back
-    closing = False
-
-    def end(number: int, _: FrameType | None) -> None:
-        if closing:
-            late.append(number)
-        elif not raised:
-            raised.append(number)
-            raise SignalExit(number)
-
-    try:
-        # Only signals that would end the program, and only in the main thread, which gets them.
-        if threading.current_thread() is threading.main_thread():
-            for number in _ENDING:
-                if signal.getsignal(number) is signal.SIG_DFL:
-                    previous[number] = signal.signal(number, end)
-        yield
-    finally:
-        closing = True
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        if not raised:
-            for number in late:
-                signal.raise_signal(number)
-
-
 def record(
     session: Session,
     sources: Mapping[str, FrameSource],
@@ -219,8 +166,7 @@ def record(
         the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
-    _check(session, sources)
-    clock = next(iter(sources.values())).clock
+    clock = _check(session, sources)
     with raised_signals(), clock.joined():
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
         # The writer starts the other threads, this one shows the preview.
@@ -243,23 +189,20 @@ def record(
     return Summary(file.recording.place(), run.ended, file.totals)
 
 
-def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
-    """Raise unless the sources are those of the session, on one clock."""
+def _check(session: Session, sources: Mapping[str, FrameSource]) -> Clock:
+    """Clock of the sources; ValueError unless they are those of the session."""
     if tuple(sources) != session.bands:
-        raise ValueError(
-            f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
-        )
+        rule = f"Must be the bands {list(session.bands)}"
+        raise ValueError(f"Invalid sources {list(sources)}. {rule}.")
     clock = next(iter(sources.values())).clock
     for band, source in sources.items():
         if source.clock is not clock:
             raise ValueError(f"Invalid clock of band '{band}'. Must be that of the other sources.")
-        for name, value, expected in (
-            ("is_simulated", source.is_simulated, session.simulated),
-            ("shape", source.shape, session.shape),
-        ):
-            if value != expected:
+        for name, expected in (("is_simulated", session.simulated), ("shape", session.shape)):
+            if (value := getattr(source, name)) != expected:
                 rule = f"Must be {expected}, as the session says"
                 raise ValueError(f"Invalid source of band '{band}': {name} is {value}. {rule}.")
+    return clock
 
 
 def _new_file(
@@ -271,13 +214,11 @@ def _new_file(
     limits: Limits,
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
-    # Room on the disk.
-    folder = path.absolute().parent
-    folder.mkdir(parents=True, exist_ok=True)
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
-    _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
+    size = int(_BYTES * math.prod(session.shape) * frames)
+    _check_space(path.absolute().parent, limits.reserve + size)
     clock = next(iter(sources.values())).clock
-    # What the recording says of its devices.
     devices = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
