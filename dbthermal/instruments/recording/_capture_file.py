@@ -18,20 +18,8 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.alignment import fill_times
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import (
-    DAMAGED,
-    FFC_READING,
-    GOOD,
-    UNTIMED,
-    FfcStatus,
-    Frame,
-    FrameFlag,
-    FrameSource,
-    Metadata,
-    Shutter,
-    next_shutter,
-)
+from dbthermal.instruments import camera, telemetry
+from dbthermal.instruments.camera import FfcStatus, Frame, FrameFlag, FrameSource
 from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
 CHUNK: Final = 30  # frames of a chunk: half a second at 60 Hz, the most that a kill may cost
@@ -142,7 +130,7 @@ class _Band:
         self.block: list[dict[str, Any]] = []  # frames that are not written yet
         self.last: Frame | None = None
         self.device_time = -math.inf  # latest valid stamp
-        self.shutter = Shutter()
+        self.shutter = camera.Shutter()
         self.ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
         self.totals = dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
 
@@ -218,10 +206,10 @@ class CaptureFile:
         # Flags, from the frame before and from the shutter.
         flags = frame.flags | self._compared(band, frame, refused)
         flags |= self._watch_shutter(band, frame, flags)
-        if flags & DAMAGED:
+        if flags & camera.DAMAGED:
             state.totals["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
-        timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
+        timed = not flags & (camera.UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,
             "exposure_time": frame.device_time - self._origin if timed else math.nan,
@@ -231,7 +219,7 @@ class CaptureFile:
             "frame_flags": int(flags),
         }
         if self._sizes["telemetry_row"]:
-            decoded = frame.metadata or Metadata()
+            decoded = frame.metadata or camera.Metadata()
             rows = np.zeros((self._sizes["telemetry_row"], self._sizes["x"]), np.uint16)
             values["telemetry"] = rows if frame.telemetry is None else frame.telemetry
             values["fpa_temperature"] = decoded.fpa_temperature
@@ -244,7 +232,7 @@ class CaptureFile:
 
     def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
         """Put a line into the log: a kind, a band or the name of a reading, time [s], value."""
-        band = source.removeprefix(FFC_READING)
+        band = source.removeprefix(camera.FFC_READING)
         if kind is Note.READING and source != band and band in self._bands:
             status = FfcStatus(int(value)) if value in set(FfcStatus) else None
             self._bands[band].ffc_status = time, status
@@ -272,7 +260,7 @@ class CaptureFile:
 
     def _compared(self, band: str, frame: Frame, refused: int) -> FrameFlag:
         """Flags from the frame before, with notes of the frames that are missing between them."""
-        state, flags = self._bands[band], GOOD
+        state, flags = self._bands[band], camera.GOOD
         self.refused(band, refused, frame.host_time)
         step = 1 if state.last is None else frame.sequence - state.last.sequence
         lost = step - 1 - refused
@@ -282,7 +270,7 @@ class CaptureFile:
         elif lost > 0:
             state.totals["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
-        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
+        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else camera.GOOD
         if state.last is not None and np.array_equal(frame.counts, state.last.counts):
             flags |= FrameFlag.IMAGE_REPEATED
         state.last = frame
@@ -296,14 +284,14 @@ class CaptureFile:
         if not frame.device_time > state.device_time:  # NaN too
             return FrameFlag.TIME_STANDS
         state.device_time = frame.device_time
-        return GOOD
+        return camera.GOOD
 
     def _watch_shutter(self, band: str, frame: Frame, flags: FrameFlag) -> FrameFlag:
         """Flag of a closed shutter, from telemetry, serial line and image."""
         state = self._bands[band]
         read_at, status = state.ffc_status
         before = state.shutter
-        state.shutter = next_shutter(
+        state.shutter = camera.next_shutter(
             before,
             repeated=FrameFlag.IMAGE_REPEATED in flags,
             last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
@@ -315,7 +303,7 @@ class CaptureFile:
         renewed = state.shutter.last_ffc_frame
         if renewed is not None and before.last_ffc_frame not in {None, renewed}:
             self.note(Note.CORRECTION, band, frame.host_time, renewed)
-        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else GOOD
+        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else camera.GOOD
 
     def _write(self, band: str) -> None:
         state = self._bands[band]

@@ -21,13 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal import store
-from dbthermal.instruments.camera import (
-    Frame,
-    FrameFlag,
-    FrameSource,
-    NoFrameError,
-    SourceLostError,
-)
+from dbthermal.instruments import camera
 from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.recording._signals import SignalExit, raised_signals
@@ -96,7 +90,7 @@ class Preview:
     """
 
     time: float
-    frames: Mapping[str, Frame]
+    frames: Mapping[str, camera.Frame]
     totals: Totals
     readings: Mapping[str, float]
     units: Mapping[str, str] = field(default_factory=dict)
@@ -122,7 +116,7 @@ class Summary:
 
 def record(
     session: Session,
-    sources: Mapping[str, FrameSource],
+    sources: Mapping[str, camera.FrameSource],
     path: str | Path,
     *,
     readings: Mapping[str, Reading] | None = None,
@@ -189,7 +183,7 @@ def record(
     return Summary(file.recording.place(), run.ended, file.totals)
 
 
-def _check(session: Session, sources: Mapping[str, FrameSource]) -> Clock:
+def _check(session: Session, sources: Mapping[str, camera.FrameSource]) -> Clock:
     """Clock of the sources; ValueError unless they are those of the session."""
     if tuple(sources) != session.bands:
         rule = f"Must be the bands {list(session.bands)}"
@@ -207,7 +201,7 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> Clock:
 
 def _new_file(
     session: Session,
-    sources: Mapping[str, FrameSource],
+    sources: Mapping[str, camera.FrameSource],
     readings: Mapping[str, Reading],
     identities: Identities,
     path: Path,
@@ -247,7 +241,7 @@ class _Run:
     def __init__(
         self,
         file: CaptureFile,
-        sources: Mapping[str, FrameSource],
+        sources: Mapping[str, camera.FrameSource],
         readings: Mapping[str, Reading],
         limits: Limits,
         duration: float,
@@ -263,7 +257,7 @@ class _Run:
         self.interrupted, self.ended = "", ""
         # For the preview, after each frame is written: totals, last frames, last readings.
         self.totals: Totals = {}
-        self.last_frames: dict[str, Frame] = {}
+        self.last_frames: dict[str, camera.Frame] = {}
         self.last_readings: dict[str, float] = {}
         # Work for the writer: notes, and at most `limits.queue` frames of each band.
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -293,7 +287,7 @@ class _Run:
     def _put_note(self, kind: Note, source: str, value: float = math.nan) -> None:
         self._work.put(partial(self._note, kind, source, self.clock(), value))
 
-    def _fetch(self, band: str, source: FrameSource) -> None:
+    def _fetch(self, band: str, source: camera.FrameSource) -> None:
         """Queue the frames of a source for the writer, until the end.
 
         Without room a frame is refused; the next accepted one carries the number of refused ones.
@@ -303,7 +297,7 @@ class _Run:
             while self._is_going():
                 try:
                     frame = source.read(self.limits.silence)
-                except NoFrameError:
+                except camera.NoFrameError:
                     self._put_note(Note.NO_FRAME, band, self.limits.silence)
                     continue
                 if self.clock.has_room(self._room[band]):
@@ -311,7 +305,7 @@ class _Run:
                     refused = 0
                 else:
                     refused += 1
-        except SourceLostError:
+        except camera.SourceLostError:
             self._lost_sources.append(band)
             self._put_note(Note.SOURCE_LOST, band)
         finally:
@@ -374,9 +368,9 @@ class _Run:
         self.ended = self._reason()
         self.file.close(complete=self.ended in {"duration", "stopped"}, ended=self.ended)
 
-    def _frame(self, band: str, frame: Frame, refused: int) -> None:
+    def _frame(self, band: str, frame: camera.Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
-        has_device_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
+        has_device_clock = camera.FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
         early = frame.device_time < self.start and frame.host_time < self.start + _HELD
         if band in self.last_frames or not early or has_device_clock:
             flags = self.file.frame(band, frame, refused)
