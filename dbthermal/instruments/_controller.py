@@ -1,6 +1,8 @@
 """An APT controller at the end of a line: requests, replies, and what it reports by itself.
 
-A controller that is addressed wrongly says nothing: its address is searched for.
+A controller that is addressed wrongly says nothing: its address is searched for. APT has no
+sequence numbers, and a controller reports the end of a move at any time: the next message is not
+always the reply. So messages are told apart by identifier, source and channel.
 """
 
 import logging
@@ -40,11 +42,7 @@ class WrongDeviceError(WheelError):
 
 
 class Controller:
-    """Requests to a controller and its replies, with what it reports by itself.
-
-    APT has no sequence numbers, and a controller reports the end of a move at any time: the next
-    message is not always the reply. So messages are told apart by identifier, source and channel.
-    """
+    """Requests to a controller and its replies, with what it reports by itself."""
 
     def __init__(self, transport: Transport) -> None:
         self.unit, self.motor = SEARCHED[0]

@@ -56,8 +56,7 @@ def encode(
 ) -> bytes:
     """Bytes of a frame; header, data and checksum are all escaped.
 
-    TypeError or ValueError if a number is not whole or does not fit its field, see `Frame`, or
-    there are more than `MAXIMUM_DATA` bytes of data.
+    TypeError or ValueError if a number does not fit its field, or the data are too long.
 
     Examples
     --------
@@ -78,10 +77,7 @@ def encode(
 
 
 def next_sequence(sequence: int) -> int:
-    """Next larger sequence number without a byte that would be escaped; 0 after the largest.
-
-    The vendor's software avoids such numbers too.
-    """
+    """Next larger sequence number without a byte that would be escaped; 0 after the largest."""
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
     for position, value in enumerate(following):
         if value in _SPECIAL:  # the least number above: the bytes behind start from zero

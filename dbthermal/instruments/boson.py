@@ -1,9 +1,9 @@
 """FLIR Boson: driver of the camera's command port, and the commands that it sends.
 
-A busy camera answers late, after its driver gave up; without sequence numbers every later command
-then gets the reply of the command before (openmv/openmv, pull request 3265). Here each request has
-a new number, and frames without it are discarded. Connecting sends and resets nothing, and nothing
-is ever written to the camera's flash memory. `KIND` opens camera and command port for a session.
+A busy camera answers late; without sequence numbers every later command then gets the reply of the
+command before (openmv/openmv, pull request 3265). Here each request has a new number, and frames
+without it are discarded. Connecting sends and resets nothing, and nothing is ever written to the
+camera's flash memory. `KIND` opens camera and command port for a session.
 
 References
 ----------
@@ -51,7 +51,7 @@ EnumT = TypeVar("EnumT", bound=IntEnum)
 
 
 class Switch(IntEnum):
-    """State of a function that is either off or on."""
+    """State of a function."""
 
     OFF = 0
     ON = 1
@@ -81,13 +81,6 @@ class Reading(Generic[T]):
     layout: str  # data of the reply, as in `struct`, big-endian
     convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
 
-    def value(self, data: bytes) -> T:
-        """Value of the data of a reply; ValueError if they are of another size or meaning."""
-        size = struct.calcsize(self.layout)
-        if len(data) != size:
-            raise ValueError(f"Invalid {self.name} of {len(data)} bytes. Must have {size}.")
-        return self.convert(*struct.unpack(self.layout, data))
-
 
 @dataclass(frozen=True)
 class Setting(Generic[EnumT]):
@@ -101,13 +94,6 @@ class Setting(Generic[EnumT]):
     def reading(self) -> Reading[EnumT]:
         """Command that reads the mode back."""
         return Reading(self.name, self.set_command + 1, ">i", self.kind)
-
-    def data(self, value: EnumT) -> bytes:
-        """Data of the command that sets it; ValueError if the value is not of its enumeration."""
-        if value not in {*self.kind}:
-            choices = ", ".join(f"{member.value} ({member.name})" for member in self.kind)
-            raise ValueError(f"Invalid {self.name} {value}. Must be one of {choices}.")
-        return struct.pack(">i", value)
 
 
 SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
@@ -228,19 +214,26 @@ class Boson(Closing):
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
         """Value of a `Reading`, in the unit that its name says."""
-        reply = self._exchange(reading.name, reading.command, repeats=repeats)
+        data = self._exchange(reading.name, reading.command, repeats=repeats)
+        size, name = struct.calcsize(reading.layout), reading.name
+        if len(data) != size:
+            message = f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}."
+            raise BosonReplyError(message)
         try:
-            return reading.value(reply)
+            return reading.convert(*struct.unpack(reading.layout, data))
         except ValueError as error:
-            raise BosonReplyError(f"Invalid reply to '{reading.name}': {error}") from error
+            raise BosonReplyError(f"Invalid reply to '{name}': {error}") from error
 
     def get(self, setting: Setting[EnumT]) -> EnumT:
-        """State of one of `SETTINGS`."""
+        """State of a setting."""
         return self.read(setting.reading)
 
     def set(self, setting: Setting[EnumT], value: EnumT) -> None:
         """Set one of `SETTINGS` until power-off; a wrong value is a ValueError."""
-        self._tell(f"set {setting.name}", setting.set_command, setting.data(value))
+        if value not in {*setting.kind}:
+            choices = ", ".join(f"{member.value} ({member.name})" for member in setting.kind)
+            raise ValueError(f"Invalid {setting.name} {value}. Must be one of {choices}.")
+        self._command(f"set {setting.name}", setting.set_command, struct.pack(">i", value))
 
     def serial_number(self) -> int:
         """Serial number of the camera."""
@@ -292,7 +285,7 @@ class Boson(Closing):
         """
         before = self.read(LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE
-        self._tell("run FFC", RUN_FFC)
+        self._command("run FFC", RUN_FFC)
         deadline = self._clock() + timeout
         while True:
             try:
@@ -307,7 +300,7 @@ class Boson(Closing):
                 raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
             self._clock.sleep(POLL)
 
-    def _tell(self, name: str, command: int, data: bytes = b"") -> None:
+    def _command(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
         if reply := self._exchange(name, command, data):
             size = len(reply)

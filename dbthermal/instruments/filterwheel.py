@@ -167,8 +167,9 @@ class FilterWheel(Closing):
     ) -> Self:
         """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
         line = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
+        wheel = cls(line, filters, settings)
         with ExitStack() as stack:
-            wheel = stack.enter_context(cls(line, filters, settings))
+            stack.enter_context(wheel)
             wheel.connect()
             stack.pop_all()
         return wheel

@@ -158,7 +158,7 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
     assert list(scan.flag[:3]) == [0, 0, Flag.MISSING]
     assert np.isnan(scan.temperature[2])
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
-        logger.set_channels([9])
+        logger.set_channels({9: "tip"})
 
 
 @opens(*VIDEOS)

@@ -1,12 +1,12 @@
 """Recorder of captures, and reader of recordings.
 
 `record` writes the frames of all cameras and the readings beside them; `open_capture` opens a
-recording as stage `capture`, `notes` its log, `overview` a folder of recordings, and `open_sweep`
-and `bench_series` those of a blackbody: a recording for each temperature and filter, which says
-which session it is of. See `dbthermal.instruments.protocols` for whole procedures.
+recording, `notes` its log, `overview` a folder of recordings, and `open_sweep` and `bench_series`
+those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -220,16 +220,12 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         fewer good frames in a band, or no reading of the blackbody, or those of a step differ by
         more than the session's stability.
     """
-    # The movie and the mean temperature of each step.
     steps, stability, shared = _sweep(folder, name)
-    temperatures, movies = [], []
-    for paths in steps:
-        temperatures.append(_agreed(paths, BLACKBODY, stability))
-        movies.append(_movie(paths, frames))
-    # In the order of the temperatures.
-    order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
-    axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
-    counts = xr.concat([movies[place] for place in order], "temperature")
+    movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]
+    movies.sort(key=itemgetter(0))
+    attrs = schema.COORDINATES["temperature"].attrs
+    axis = xr.Variable("temperature", [temperature for temperature, _ in movies], attrs)
+    counts = xr.concat([movie for _, movie in movies], "temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x")
     joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
     return schema.check(joined.assign_attrs(shared), "blackbody_movies")

@@ -1,10 +1,10 @@
 """The recorder: the frames of all cameras and the readings beside them, into one capture file.
 
-A thread for each camera fetches its frames, a further thread reads the instruments, so that none
-waits for another: a camera that corrects its offsets answers late, and that costs no frame. A queue
-of bounded length leads to the thread that writes. If the disk is too slow the queue fills, frames
-are refused, and the log has their number and time. The caller's thread shows the preview; whatever
-ends that, the frames that came before are written.
+A thread for each camera fetches its frames, a further thread reads the instruments: a camera that
+corrects its offsets answers late, and that costs no frame. A queue of bounded length leads to the
+thread that writes. If the disk is too slow the queue fills, frames are refused, and the log has
+their number and time. The caller's thread shows the preview; whatever ends that, the frames that
+came before are written.
 """
 
 import errno
@@ -127,9 +127,9 @@ def record(
 ) -> Summary:
     """Record until the end of the session's duration, a stop, or the loss of the last camera.
 
-    Frames that a driver buffered before the start, by their stamps, are not recorded: they show
-    another filter, or another scene. Two seconds after the start such a stamp counts as wrong. If
-    the folder, or one above it, is renamed or moved on its disk, the recording goes on in it.
+    Frames that a driver buffered before the start, by their stamps, are not recorded. Two seconds
+    after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
+    moved on its disk, the recording goes on in it.
 
     Parameters
     ----------
@@ -142,11 +142,6 @@ def record(
     limits, preview, stop : optional
         `Limits`; a function called now and then with a `Preview` in the caller's thread, which may
         take its time; and an event whose setting ends the recording.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames; also in the store.
 
     Raises
     ------
