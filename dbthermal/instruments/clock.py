@@ -16,6 +16,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final, TypeVar
 
+__all__ = ["START", "SYSTEM", "Clock", "EmulatedClock", "Task"]
+__dir__ = __all__.copy
+
 Item = TypeVar("Item")
 
 START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # at time 0 of every emulated clock

@@ -190,7 +190,6 @@ def open_devices(
             if camera.control is not None and kind.open_control is not None:
                 url = camera.control if world is None else f"sim://{camera.kind}/{band}"
                 controls[band] = stack.enter_context(kind.open_control(url, world))
-        # The wheel.
         wheel = logger = None
         if session.filters:
             url = session.devices[WHEEL] if world is None else "sim://apt"

@@ -158,8 +158,7 @@ class TC08(Closing):
     def from_url(cls, url: str = "tc08:") -> Self:
         """Load the vendor's library and open the first free unit, at the address ``tc08:``.
 
-        No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
-        another address; else the errors of `load` and `open`.
+        ValueError if it is another address; else the errors of `load` and `open`.
         """
         parse(url, ("tc08",))
         return cls(load()).open()
@@ -177,7 +176,6 @@ class TC08(Closing):
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
-        # The library opens a unit meanwhile.
         if not self._library.usb_tc08_open_unit_async():
             raise self._error("be opened")
         # Wait until its firmware is there.
@@ -190,28 +188,27 @@ class TC08(Closing):
                     "firmware by then: pull it out and plug it in again."
                 )
             self.clock.sleep(POLL)
-        # The result.
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
-            raise ConnectionError(
-                "No TC-08. Must be plugged in, and free: no other program may have it."
-            )
+            rule = "Must be plugged in, and free: no other program may have it"
+            raise ConnectionError(f"No TC-08. {rule}.")
         self._handle = int(handle[0])
         return self
 
     def close(self) -> None:
         """Close the unit, once; TC08Error if the library could not, as after unplugging."""
-        handle, self._handle, self.channels = self._handle, 0, {}
-        if handle and not self._library.usb_tc08_close_unit(handle):
-            raise TC08Error("close", self._library.usb_tc08_get_last_error(handle))
+        if self._handle:
+            try:
+                self._call("close_unit", "close")
+            finally:
+                self._handle, self.channels = 0, {}
 
     def identity(self) -> Identity:
         """Identity of the unit; TC08Error or RuntimeError if the library fails or it is closed."""
         unit = (UnitInfo * 1)()
         unit[0].size = ctypes.sizeof(UnitInfo)
-        if not self._library.usb_tc08_get_unit_info(self._open_handle(), unit):
-            raise self._error("read its identity")
+        self._call("get_unit_info", "read its identity", unit)
         texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
         serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
         return {
@@ -237,8 +234,8 @@ class TC08(Closing):
         self.channels = {}  # until all are set
         for channel in range(CHANNELS):
             letter = (KIND if channel in channels else " ") if channel else "C"
-            if not self._library.usb_tc08_set_channel(self._open_handle(), channel, ord(letter)):
-                raise self._error(f"set channel {channel} to '{letter}'")
+            action = f"set channel {channel} to '{letter}'"
+            self._call("set_channel", action, channel, ord(letter))
         self.channels = dict(channels)
 
     def read(self, channel: int) -> float:
@@ -264,21 +261,20 @@ class TC08(Closing):
 
         TC08Error or RuntimeError if the library fails, the unit is closed, or no channels are set.
         """
-        handle = self._open_handle()
-        if not self.channels:
+        if self._handle and not self.channels:
             raise RuntimeError("The TC-08 has no channels yet. Must be set by set_channels first.")
         values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
         start = self.clock()
-        done = self._library.usb_tc08_get_single(handle, values, overflow, KELVIN)
+        self._call("get_single", "take a single reading", values, overflow, KELVIN)
         middle = 0.5 * (start + self.clock())
-        if not done:
-            raise self._error("take a single reading")
         return Scan(middle, *flagged(np.array(values, dtype=np.float64), overflow[0]))
 
-    def _open_handle(self) -> int:
+    def _call(self, function: str, action: str, *arguments: Any) -> None:
+        """Call a function of the library on the open unit; it returns 0 if it fails."""
         if not self._handle:
             raise RuntimeError("The TC-08 is closed. Must be opened first.")
-        return self._handle
+        if not getattr(self._library, f"usb_tc08_{function}")(self._handle, *arguments):
+            raise self._error(action)
 
     def _error(self, action: str) -> TC08Error:
         return TC08Error(action, self._library.usb_tc08_get_last_error(self._handle))

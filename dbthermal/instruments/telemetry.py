@@ -18,6 +18,9 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments.camera import Counts, Metadata
 
+__all__ = ["FIELDS", "ROWS", "WORDS", "Field", "decode", "encode", "metadata"]
+__dir__ = __all__.copy
+
 ROWS: Final = 2  # of telemetry on USB: 514 rows of the frame are requested instead of 512
 WORDS: Final = 142  # least number of words that hold all the fields
 

@@ -19,6 +19,9 @@ from dbthermal.instruments.clock import SYSTEM, Clock
 if TYPE_CHECKING:
     import serial
 
+__all__ = ["SerialTransport", "Transport", "TransportError", "open_serial", "parse"]
+__dir__ = __all__.copy
+
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 

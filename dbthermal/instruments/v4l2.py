@@ -28,6 +28,9 @@ from dbthermal.instruments.camera import Counts, Frame, FrameFlag, Metadata, Str
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
+__all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
+__dir__ = __all__.copy
+
 # Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control.
 Y16: Final = 0x20363159
 # Frames that the kernel holds while no program reads, the most it can: half a second at 60 Hz, in

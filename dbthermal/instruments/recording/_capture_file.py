@@ -138,10 +138,10 @@ class _Band:
 class CaptureFile:
     """A new recording at `path` that takes frames and notes in the order in which they come.
 
-    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], and
-    `chunk` is the number of frames that are written together. FileExistsError if `path` exists;
-    ValueError if the sources differ in shape or telemetry. After a failed write `broken` is True:
-    what was written before is valid, and nothing more may be written.
+    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], `chunk`
+    the number of frames that are written together. FileExistsError if `path` exists; ValueError if
+    the sources differ in shape or telemetry. After a failed write `broken` is True: what was
+    written before is valid, and nothing more may be written.
     """
 
     def __init__(
@@ -154,14 +154,12 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
-        # The variables, of one size.
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
             raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
         (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
-        # The state of the recording.
         self._origin, self._chunk = origin, chunk
         self._clock = next(iter(sources.values())).clock
         self._start: dict[str, Any] = {}  # attributes of `begin`
