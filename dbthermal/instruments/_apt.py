@@ -144,7 +144,7 @@ class Status(NamedTuple):
 
 
 class Info(NamedTuple):
-    """Identity of a controller; versions of its hardware, which follow, are not read."""
+    """Identity of a controller; by default the versions are those of an emulated one."""
 
     serial_number: int
     model: bytes  # ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say
@@ -153,6 +153,9 @@ class Info(NamedTuple):
     interim: int = 0
     major: int = 1
     notes: bytes = b""  # that only the maker understands
+    hardware: int = 1
+    modification: int = 0
+    channels: int = 1
 
 
 class Notice(NamedTuple):
@@ -169,7 +172,7 @@ _LAYOUTS: Final[dict[type[tuple[Any, ...]], struct.Struct]] = {
     Speeds: struct.Struct("<Hiii"),
     Home: struct.Struct("<HHHii"),
     Status: struct.Struct("<HiiI"),
-    Info: struct.Struct("<I8sH3Bx60s6x"),
+    Info: struct.Struct("<I8sH3Bx60sHHH"),
     Notice: struct.Struct("<HH64s"),
 }
 Record = TypeVar("Record", bound=tuple[Any, ...])

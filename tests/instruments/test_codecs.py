@@ -39,7 +39,7 @@ LIMITS = apt.StatusBits(0b111)
 RECORDS: list[tuple[str, tuple[Any, ...]]] = [
     (STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
     (LONG_STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
-    (INFO, apt.Info(94_000_009, b"ION001 \0", 44, 2, 1, 57, bytes(60))),
+    (INFO, apt.Info(94_000_009, b"ION001 \0", 44, 2, 1, 57, bytes(60), 1, 3, 1)),
 ]
 # Identifiers and lengths of data [byte] of PnPQ, thorlabs-apt-protocol and the maker's examples,
 # which agree.
@@ -130,7 +130,7 @@ records = st.one_of(
     st.builds(apt.Speeds, st.just(1), number, number, number),
     st.builds(apt.Home, st.just(1), st.just(2), st.just(4), number, number),
     st.builds(apt.Status, st.just(1), number, number, st.integers(0, 2**32 - 1)),
-    st.builds(apt.Info, st.integers(0, 2**32 - 1), raw, st.just(45), byte, byte, byte, notes),
+    st.builds(apt.Info, st.integers(0, 2**32 - 1), raw, *4 * [byte], notes, *3 * [byte]),
 )
 IDENTIFIERS: dict[type[tuple[Any, ...]], Id] = {
     apt.Position: Id.MOT_MOVE_ABSOLUTE,
