@@ -269,6 +269,7 @@ class Decoder:
             if length is None:
                 start, self.dropped = start + 1, self.dropped + 1
                 continue
+            # A message, or its beginning.
             end = start + _HEADER + length
             if len(self.pending) < end:
                 break
@@ -289,6 +290,7 @@ class Decoder:
     def _data_length(self, start: int) -> int | None:
         """Length of the data after a header [byte], None if the header is impossible."""
         identifier, length, destination, source = _LONG.unpack_from(self.pending, start)
+        # The long form is marked in the destination.
         is_long = bool(destination & _HAS_DATA)
         length = length if is_long else 0
         lengths = _LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())

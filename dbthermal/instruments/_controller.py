@@ -75,6 +75,7 @@ class Controller:
                 reply = self._exchange(Id.HW_REQ_INFO, Id.HW_GET_INFO, self.unit, 0, attempts=1)
             except NoReplyError:
                 continue
+            # Whatever it said of the greeting is forgotten.
             self._collect()
             self._notices.clear()  # it need not know all messages of the greeting
             return apt.parse(apt.Info, reply)

@@ -215,6 +215,7 @@ class Boson(Closing):
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
         """Value of a `Reading`, in the unit that its name says."""
         data = self._exchange(reading.name, reading.command, repeats=repeats)
+        # Data of the size and with the meaning of this reading.
         size, name = struct.calcsize(reading.layout), reading.name
         if len(data) != size:
             message = f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}."

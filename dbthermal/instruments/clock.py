@@ -173,6 +173,7 @@ class EmulatedClock(Clock):
 
         The thread runs now; a new one, with an event, after all that wait.
         """
+        # A place in the order.
         turn = _Wait(lambda: True, self._now)
         with self._lock:
             is_member = turn.thread in self._members
@@ -218,6 +219,7 @@ class EmulatedClock(Clock):
         """Let the next thread run, if none does."""
         while self._waits and not self._running:
             chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
+            # No condition holds: the clock leaps to the earliest end.
             if chosen is None:
                 chosen = min(self._waits, key=lambda wait: wait.end)
                 if math.isinf(chosen.end):

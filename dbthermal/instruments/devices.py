@@ -69,6 +69,7 @@ class Devices:
         for band, source in self.sources.items():
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
             control = self.cameras[band].identity() if band in self.cameras else {}
+            # Frames and command port must be those of one camera.
             numbers = identity.get("serial_number"), control.get("serial_number")
             if None not in numbers and numbers[0] != numbers[1]:
                 raise ValueError(
@@ -190,6 +191,7 @@ def open_devices(
             if camera.control is not None and kind.open_control is not None:
                 url = camera.control if world is None else f"sim://{camera.kind}/{band}"
                 controls[band] = stack.enter_context(kind.open_control(url, world))
+        # The wheel.
         wheel = logger = None
         if session.filters:
             url = session.devices[WHEEL] if world is None else "sim://apt"

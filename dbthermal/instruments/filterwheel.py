@@ -180,6 +180,7 @@ class FilterWheel(Closing):
         model = apt.text(info.model)
         if expected is not None and info.serial_number != expected:
             raise WrongDeviceError(f"Wrong controller {info.serial_number}. Must be {expected}.")
+        # Its scale, by the beginning of its name.
         scales = [scale for beginning, scale in MODELS.items() if model.startswith(beginning)]
         if not scales:
             rule = f"Its model must begin with one of {sorted(MODELS)}"
@@ -238,6 +239,7 @@ class FilterWheel(Closing):
         scale = self._scale
         target = scale.target(position, self.settings.home_offset)
         self._resting(homed=True)
+        # The move, until the wheel is there.
         data = apt.pack(apt.Position(CHANNEL, target))
         self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=data)
 
@@ -287,6 +289,7 @@ class FilterWheel(Closing):
     def _prepare(self) -> None:
         """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
         settings, scale, request = self.settings, self._scale, self._controller.request
+        # The speeds of moves.
         speed = scale.turn * scale.velocity  # of one turn/s [device units]
         acceleration = round(settings.acceleration * scale.turn * scale.acceleration)
         speeds = apt.Speeds(CHANNEL, 0, acceleration, round(settings.velocity * speed))

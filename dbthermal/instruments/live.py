@@ -105,6 +105,7 @@ class Watch:
             frames = {_metadata(band, shown).last_ffc_frame for shown in (before, preview)}
             if _ffc(band, preview) == _IN_PROGRESS or (None not in frames and len(frames) > 1):
                 self._ffc_times[band] = preview.time
+        # Numbers of frames and times of arrival, for the frame rate.
         marks = {
             band: (preview.totals[band]["frames"], frame.host_time)
             for band, frame in preview.frames.items()

@@ -188,6 +188,7 @@ class TC08(Closing):
                     "firmware by then: pull it out and plug it in again."
                 )
             self.clock.sleep(POLL)
+        # What became of it.
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
@@ -232,6 +233,7 @@ class TC08(Closing):
             if channel not in range(1, CHANNELS):
                 raise ValueError(f"Invalid channel {channel}. Must lie in 1 to {CHANNELS - 1}.")
         self.channels = {}  # until all are set
+        # The cold junction, and a type or off for each socket.
         for channel in range(CHANNELS):
             letter = (KIND if channel in channels else " ") if channel else "C"
             action = f"set channel {channel} to '{letter}'"
@@ -243,6 +245,7 @@ class TC08(Closing):
 
         `ReadingError` if it is no temperature; else the errors of `single`.
         """
+        # A scan is used while it is new, and once by each channel.
         with self.clock.hold(self._lock):
             scan = self._scan
             if scan is None or channel in self._used or self.clock() - scan.time > SCAN_AGE:

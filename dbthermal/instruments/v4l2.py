@@ -120,6 +120,7 @@ class Capture(Closing):
         try:
             self.identity: Mapping[str, str] = {"device": path, **self._capability()}
             self._agree()
+            # Buffers, as many as the kernel grants, all of them queued.
             (count, *_) = self._ask(REQBUFS, REQUEST, BUFFERS, _CAPTURE, _MMAP)
             for index in range(count):
                 offset, length = self._ask(QUERYBUF, BUFFER, *_buffer(index))[9:]
@@ -135,6 +136,7 @@ class Capture(Closing):
         if self._file is None:
             raise camera.SourceLostError(f"No frames from '{self.path}': it is closed.")
         deadline = self.clock() + timeout
+        # Until a frame is announced, and is there.
         while self._kernel.select([self._file], [], [], max(0.0, deadline - self.clock()))[0]:
             try:
                 buffer = self._ask(DQBUF, BUFFER, *_buffer(0))
@@ -145,6 +147,7 @@ class Capture(Closing):
                     raise
                 text = f"No more frames from '{self.path}': {error.strerror}."
                 raise camera.SourceLostError(text) from error
+            # A copy of it; the buffer goes back to the kernel whatever happens.
             try:
                 return self._frame(buffer, self.clock())
             finally:
@@ -168,7 +171,8 @@ class Capture(Closing):
             self._kernel.close(file)
 
     def _ask(self, number: int, layout: struct.Struct, *values: Any) -> tuple[Any, ...]:
-        assert self._file is not None
+        if self._file is None:
+            raise camera.SourceLostError(f"No frames from '{self.path}': it is closed.")
         return self._kernel.ask(self._file, number, layout, *values)
 
     def _capability(self) -> dict[str, str]:
@@ -183,6 +187,7 @@ class Capture(Closing):
                     break
                 raise
             offered.append(entry[4])
+        # It must offer the format.
         if Y16 not in offered:
             codes = [code.to_bytes(4, "little") for code in offered]
             names = [code.decode("ascii", "backslashreplace") for code in codes]
@@ -223,12 +228,15 @@ class Capture(Closing):
     def _frame(self, buffer: tuple[int, ...], host_time: float) -> Frame:
         """Copy a frame out of its buffer and translate the kernel's flags."""
         index, _, used, state, _, seconds, micros, sequence, *_ = buffer
+        # The image, with zeros in place of missing bytes.
         image = np.zeros((self.stream.rows, self.shape[1]), dtype="<u2")
         size = min(used, image.nbytes)
         image.reshape(-1).view(np.uint8)[:size] = np.frombuffer(self._maps[index], np.uint8, size)
+        # The state of the frame and of its stamp.
         flags = FrameFlag.DRIVER_ERROR if state & _ERROR else camera.GOOD
         flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else camera.GOOD
         flags |= FrameFlag.FOREIGN_CLOCK if state & _CLOCK_MASK != _MONOTONIC else camera.GOOD
+        # Image and telemetry apart.
         counts, rows, metadata = image.astype(np.uint16, copy=False), None, None
         if self.telemetry_rows:
             counts, rows = counts[: self.shape[0]], counts[self.shape[0] :]

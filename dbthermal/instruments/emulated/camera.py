@@ -121,8 +121,10 @@ class EmulatedCamera(Closing):
             if due >= max(self._state.ffc_until, 0.0) + MODELS[self.kind][1]:
                 self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
+        # The image, unless the shutter is closed.
         if not frozen:
             self._last = self.image(due)
+        # The telemetry.
         rows = metadata = None
         if self.telemetry_rows:
             values = {
@@ -225,6 +227,7 @@ class EmulatedBoson(Device):
             return _STATUS, b""
         if command not in {boson.RUN_FFC, *self.settings, *readings}:
             return _UNKNOWN, b""
+        # The size of its data.
         size = 4 if command in self.settings else 0
         if len(data) != size:
             return (_FEW if len(data) < size else _MANY), b""

@@ -201,6 +201,7 @@ class EmulatedApt(Device):
 
     def status(self) -> apt.Status:
         """State of the motor, as the controller reports it."""
+        # The state at rest, and of a motion.
         bits = StatusBits.CONNECTED
         bits |= StatusBits.ENABLED if self.enabled else 0
         bits |= StatusBits.HOMED if self.homed else 0
@@ -220,6 +221,7 @@ class EmulatedApt(Device):
             if now >= drive.start + drive.duration:
                 self._drive = None
                 self.finish(drive)
+        # The slot that is in the beam of a wheel at rest.
         slot = self.model.position(self.wheel, self._slot_offset, WINDOW)
         self.world.wheel_position = slot if self._drive is None else None
 

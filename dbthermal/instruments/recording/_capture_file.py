@@ -207,6 +207,7 @@ class CaptureFile:
         if flags & camera.DAMAGED:
             state.totals["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
+        # Values of the frame, into the chunk.
         timed = not flags & (camera.UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,
@@ -216,7 +217,7 @@ class CaptureFile:
             "sequence": frame.sequence,
             "frame_flags": int(flags),
         }
-        if self._sizes["telemetry_row"]:
+        if self._sizes["telemetry_row"]:  # zeros if a frame came without
             decoded = frame.metadata or camera.Metadata()
             rows = np.zeros((self._sizes["telemetry_row"], self._sizes["x"]), np.uint16)
             values["telemetry"] = rows if frame.telemetry is None else frame.telemetry
@@ -307,6 +308,7 @@ class CaptureFile:
         state = self._bands[band]
         if state.block:
             self.broken = True
+            # The frames of the chunk, variable by variable.
             columns = {name: [values[name] for values in state.block] for name in state.block[0]}
             dtypes = {name: self._variables[name].dtype for name in columns}
             block = {name: np.array(column, dtypes[name]) for name, column in columns.items()}

@@ -203,11 +203,13 @@ def _new_file(
     limits: Limits,
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
+    # Room on the disk.
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
     size = int(_BYTES * math.prod(session.shape) * frames)
     _check_space(path.absolute().parent, limits.reserve + size)
     clock = next(iter(sources.values())).clock
+    # What the recording says of its devices.
     devices = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
@@ -221,9 +223,8 @@ def _new_file(
         "provenance": store.provenance(asdict(session)),
     }
     units = {name: reading.units for name, reading in readings.items()}
-    return CaptureFile(
-        path, sources, readings=units, origin=clock(), attrs=attrs, chunk=limits.chunk
-    )
+    origin, chunk = clock(), limits.chunk
+    return CaptureFile(path, sources, readings=units, origin=origin, attrs=attrs, chunk=chunk)
 
 
 def _utc(clock: Clock) -> str:
@@ -257,8 +258,7 @@ class _Run:
         # Work for the writer: notes, and at most `limits.queue` frames of each band.
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._room = {band: threading.Semaphore(limits.queue) for band in sources}
-        self._written = 0  # frames
-        self._lost_sources: list[str] = []
+        self._lost_sources, self._written = list[str](), 0  # frames
         self._refused_last: dict[str, int] = {}
         self._fetching = [
             Task(self.clock, band, self._guarded, partial(self._fetch, band, source))
