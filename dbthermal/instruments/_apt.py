@@ -1,6 +1,5 @@
 """Thorlabs APT, the binary protocol of stepper controllers: bytes to messages, and back.
 
-Pure functions and a `Decoder`, without input or output, for `dbthermal.instruments.filterwheel`.
 A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
 ``id, id, length, length, destination | 0x80, source`` followed by data; all little-endian, without
 checksum or start byte. A receiver therefore drops bytes until identifier, length and both addresses
@@ -15,9 +14,8 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 
 import struct
 from collections.abc import Collection
-from dataclasses import astuple, dataclass
 from enum import IntEnum, IntFlag
-from typing import Any, ClassVar, Final, Self
+from typing import Any, Final, NamedTuple, Self, TypeVar
 
 # Addresses: computer, a rack's own board (a BSC20x counts as a rack), the first of its ten bays,
 # and a controller that is not a rack.
@@ -26,24 +24,23 @@ RACK: Final = 0x11
 BAY_1: Final = 0x21
 UNIT: Final = 0x50
 CONTROLLERS: Final = frozenset({RACK, *range(BAY_1, BAY_1 + 10), UNIT})
-ADDRESSES: Final = CONTROLLERS | {HOST}
 
 YES: Final = 1
 NO: Final = 2
 
-_HEADER: Final = 6  # [byte]
 _SHORT = struct.Struct("<HBBBB")
 _LONG = struct.Struct("<HHBB")
+_HEADER = _SHORT.size
 _HAS_DATA = 0x80
 _LONGEST = 0xFF  # data, as documented [byte]
 _IDENTIFIERS = 0x1000  # all documented identifiers of controllers are below
-_RACK_TYPE = 45  # of a controller in its `Info`
 
 
 class Id(IntEnum):
     """Messages that a filter wheel needs, and that a controller may send, by the maker's names.
 
-    `lengths` are those that the data of a message can have [byte], 0 without data.
+    `lengths` are those that the data of a message can have [byte], 0 without data. After
+    ``SET`` comes the number of the request of the same parameters, then that of its reply.
     """
 
     lengths: tuple[int, ...]
@@ -82,8 +79,25 @@ class Id(IntEnum):
 _LENGTHS = {int(identifier): identifier.lengths for identifier in Id}
 
 
-@dataclass(frozen=True)
-class Message:
+class StatusBits(IntFlag):
+    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
+
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
+    """
+
+    MOVING_FORWARD = 1 << 4
+    MOVING_REVERSE = 1 << 5
+    JOGGING_FORWARD = 1 << 6
+    JOGGING_REVERSE = 1 << 7
+    CONNECTED = 1 << 8
+    HOMING = 1 << 9
+    HOMED = 1 << 10
+    POSITION_ERROR = 1 << 14
+    OVERLOAD = 1 << 24
+    ENABLED = 1 << 31
+
+
+class Message(NamedTuple):
     """A message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
 
     id: int
@@ -92,6 +106,94 @@ class Message:
     destination: int
     source: int
     data: bytes = b""
+
+
+class Position(NamedTuple):
+    """Absolute position [count]."""
+
+    channel: int
+    position: int
+
+
+class Speeds(NamedTuple):
+    """Speeds of a move; the largest, `velocity`, is near 0 after power-on of some controllers."""
+
+    channel: int
+    minimum: int
+    acceleration: int
+    velocity: int
+
+
+class Home(NamedTuple):
+    """Search for the home switch; with a `velocity` near 0, as after power-on, it does nothing."""
+
+    channel: int
+    direction: int  # 1 forward, 2 reverse
+    limit_switch: int  # 1 the reverse switch, 4 the forward one
+    velocity: int
+    offset: int  # from the switch to the position 0 [count]
+
+
+class Status(NamedTuple):
+    """Position counter, encoder counter (a filter wheel has none) [count] and `StatusBits`."""
+
+    channel: int
+    position: int
+    encoder: int
+    bits: int
+
+
+class Info(NamedTuple):
+    """Identity of a controller; by default the versions are those of an emulated one."""
+
+    serial_number: int
+    model: bytes  # ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say
+    kind: int = 45  # a rack
+    minor: int = 0  # parts of the firmware's version
+    interim: int = 0
+    major: int = 1
+    notes: bytes = b""  # that only the maker understands
+    hardware: int = 1
+    modification: int = 0
+    channels: int = 1
+
+
+class Notice(NamedTuple):
+    """Error that the controller reports by itself: message that caused it (or 0), code, text."""
+
+    id: int = 0
+    code: int = 0
+    notes: bytes = b"an error without a text"
+
+
+# Data of each record, whose fields are in this order; data behind the last field are not read.
+_LAYOUTS: Final[dict[type[tuple[Any, ...]], struct.Struct]] = {
+    Position: struct.Struct("<Hi"),
+    Speeds: struct.Struct("<Hiii"),
+    Home: struct.Struct("<HHHii"),
+    Status: struct.Struct("<HiiI"),
+    Info: struct.Struct("<I8sH3Bx60sHHH"),
+    Notice: struct.Struct("<HH64s"),
+}
+Record = TypeVar("Record", bound=tuple[Any, ...])
+
+
+def parse(kind: type[Record], message: Message) -> Record:
+    """Record in the data of a message from a `Decoder`."""
+    return kind(*_LAYOUTS[kind].unpack_from(message.data))
+
+
+def pack(record: tuple[Any, ...]) -> bytes:
+    """Data of a message; ValueError if a number does not fit its field."""
+    try:
+        return _LAYOUTS[type(record)].pack(*record)
+    except struct.error as error:
+        raise ValueError(f"Invalid {record}. Its fields must hold it: {error}.") from error
+
+
+def text(raw: bytes) -> str:
+    """Text up to its padding; bytes that are not ASCII are spelled out."""
+    return raw.split(b"\0")[0].rstrip(b" ").decode("ascii", "backslashreplace")
 
 
 def encode(message: Message) -> bytes:
@@ -107,7 +209,7 @@ def encode(message: Message) -> bytes:
         raise ValueError(f"Invalid {message} with data. Its parameters must be 0.")
     try:
         if not size:
-            return _SHORT.pack(*astuple(message)[:-1])
+            return _SHORT.pack(*message[:-1])
         destination = message.destination | _HAS_DATA
         return _LONG.pack(message.id, size, destination, message.source) + message.data
     except struct.error as error:
@@ -146,7 +248,9 @@ class Decoder:
     """
 
     def __init__(
-        self, destinations: Collection[int] = ADDRESSES, sources: Collection[int] = ADDRESSES
+        self,
+        destinations: Collection[int] = CONTROLLERS | {HOST},
+        sources: Collection[int] = CONTROLLERS | {HOST},
     ) -> None:
         self.dropped = 0
         self.pending = bytearray()  # may begin a message whose end has not come
@@ -164,11 +268,17 @@ class Decoder:
             length = self._data_length(start)
             if length is None:
                 start, self.dropped = start + 1, self.dropped + 1
-            elif len(self.pending) - start < _HEADER + length:
+                continue
+            # A message, or its beginning.
+            end = start + _HEADER + length
+            if len(self.pending) < end:
                 break
-            else:
-                messages.append(self._message(start, length))
-                start += _HEADER + length
+            identifier, *params, destination, source = _SHORT.unpack_from(self.pending, start)
+            first, second = (0, 0) if length else params
+            data = bytes(self.pending[start + _HEADER : end])
+            address = destination & ~_HAS_DATA
+            messages.append(Message(identifier, first, second, address, source, data))
+            start = end
         del self.pending[:start]
         return messages
 
@@ -180,6 +290,7 @@ class Decoder:
     def _data_length(self, start: int) -> int | None:
         """Length of the data after a header [byte], None if the header is impossible."""
         identifier, length, destination, source = _LONG.unpack_from(self.pending, start)
+        # The long form is marked in the destination.
         is_long = bool(destination & _HAS_DATA)
         length = length if is_long else 0
         lengths = _LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())
@@ -190,153 +301,3 @@ class Decoder:
             and bool(length) == is_long
         )
         return length if possible else None
-
-    def _message(self, start: int, length: int) -> Message:
-        identifier, *params, destination, source = _SHORT.unpack_from(self.pending, start)
-        first, second = (0, 0) if length else params
-        data = bytes(self.pending[start + _HEADER : start + _HEADER + length])
-        return Message(identifier, first, second, destination & ~_HAS_DATA, source, data)
-
-
-class StatusBits(IntFlag):
-    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
-
-    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
-    """
-
-    MOVING_FORWARD = 1 << 4
-    MOVING_REVERSE = 1 << 5
-    JOGGING_FORWARD = 1 << 6
-    JOGGING_REVERSE = 1 << 7
-    CONNECTED = 1 << 8
-    HOMING = 1 << 9
-    HOMED = 1 << 10
-    POSITION_ERROR = 1 << 14
-    OVERLOAD = 1 << 24
-    ENABLED = 1 << 31
-
-
-@dataclass(frozen=True)
-class Record:
-    """Data of a message from a `Decoder`: numbers in the order of the record's fields.
-
-    Data behind the last field are not read.
-    """
-
-    _FORMAT: ClassVar[struct.Struct]
-
-    @classmethod
-    def parse(cls, message: Message) -> Self:
-        """Record of a message."""
-        return cls(*cls._FORMAT.unpack_from(message.data))
-
-    def pack(self) -> bytes:
-        """Data of the message; ValueError if a number or a text does not fit its field."""
-        try:
-            return self._FORMAT.pack(*self._fields())
-        except struct.error as error:
-            raise ValueError(f"Invalid {self}. Its fields must hold it: {error}.") from error
-
-    def _fields(self) -> tuple[Any, ...]:
-        return astuple(self)
-
-
-@dataclass(frozen=True)
-class Position(Record):
-    """Absolute position [count]."""
-
-    _FORMAT = struct.Struct("<Hi")
-
-    channel: int
-    position: int
-
-
-@dataclass(frozen=True)
-class VelocityParameters(Record):
-    """Speeds of a move; `maximum` is near 0 when some controllers are switched on."""
-
-    _FORMAT = struct.Struct("<Hiii")
-
-    channel: int
-    minimum: int
-    acceleration: int
-    maximum: int
-
-
-@dataclass(frozen=True)
-class HomeParameters(Record):
-    """Search for the home switch; with a `velocity` near 0, as after power-on, it does nothing."""
-
-    _FORMAT = struct.Struct("<HHHii")
-
-    channel: int
-    direction: int  # 1 forward, 2 reverse
-    limit_switch: int  # 1 the reverse switch, 4 the forward one
-    velocity: int
-    offset: int  # from the switch to the position 0 [count]
-
-
-@dataclass(frozen=True)
-class Status(Record):
-    """Position counter, encoder counter (a filter wheel has none) [count] and state of a motor."""
-
-    _FORMAT = struct.Struct("<HiiI")
-
-    channel: int
-    position: int
-    encoder: int
-    bits: StatusBits
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "bits", StatusBits(self.bits))
-
-
-@dataclass(frozen=True)
-class Info(Record):
-    """Identity of a controller, in HW_GET_INFO.
-
-    Versions of the hardware follow, which are not read, and are packed as those of a rack.
-    """
-
-    _FORMAT = struct.Struct("<I8sH4B60sHHH")
-
-    serial_number: int
-    model: str  # ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say
-    firmware: str  # ``major.interim.minor``
-    notes: bytes = bytes(60)  # that only the maker understands
-
-    @classmethod
-    def parse(cls, message: Message) -> Self:
-        """Identity of a message; bytes of the model that are not ASCII are spelled out."""
-        number, model, _, minor, interim, major, _, notes, *_ = cls._FORMAT.unpack(message.data)
-        return cls(number, _text(model.rstrip(b"\0 ")), f"{major}.{interim}.{minor}", notes)
-
-    def _fields(self) -> tuple[Any, ...]:
-        if len(self.model) > 8 or not self.model.isascii():
-            raise ValueError(f"Invalid model '{self.model}'. Must be at most 8 ASCII characters.")
-        major, interim, minor = map(int, self.firmware.split("."))
-        identity = (self.serial_number, self.model.encode("ascii"), _RACK_TYPE)
-        return *identity, minor, interim, major, 0, self.notes, 1, 0, 1
-
-
-@dataclass(frozen=True)
-class Notice(Record):
-    """Error that the controller reports by itself: message that caused it (or 0), code, text."""
-
-    _FORMAT = struct.Struct("<HH64s")
-
-    id: int
-    code: int
-    notes: str
-
-    @classmethod
-    def parse(cls, message: Message) -> Self:
-        """Error of HW_RICHRESPONSE, or of HW_RESPONSE, which has no further data."""
-        if message.id == Id.HW_RESPONSE:
-            return cls(0, 0, "an error without a text")
-        cause, code, notes = cls._FORMAT.unpack(message.data)
-        return cls(cause, code, _text(notes.split(b"\0")[0]))
-
-
-def _text(raw: bytes) -> str:
-    return raw.decode("ascii", errors="backslashreplace")

@@ -28,8 +28,6 @@ _SHIFT = 0x0D  # an escaped byte is sent as the escape byte and the value less t
 _ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
 _HEADER = struct.Struct(">BIII")
 _CHECKSUM = struct.Struct(">H")
-# CRC-16/AUG-CCITT, also called SPI-FUJITSU: polynomial 0x1021, no reflection, no final xor.
-_CHECKSUM_START = 0x1D0F
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,8 @@ class Frame:
 
 
 def checksum(content: bytes) -> int:
-    """CRC-16/AUG-CCITT of an unescaped frame, from channel to data; 0xE5CC for "123456789"."""
-    return binascii.crc_hqx(content, _CHECKSUM_START)
+    """CRC-16/AUG-CCITT (SPI-FUJITSU) of an unescaped frame, from channel to data."""
+    return binascii.crc_hqx(content, 0x1D0F)
 
 
 def encode(
@@ -58,8 +56,7 @@ def encode(
 ) -> bytes:
     """Bytes of a frame; header, data and checksum are all escaped.
 
-    TypeError or ValueError if a number is not whole or does not fit its field, see `Frame`, or
-    there are more than `MAXIMUM_DATA` bytes of data.
+    TypeError or ValueError if a number does not fit its field, or the data are too long.
 
     Examples
     --------
@@ -80,10 +77,7 @@ def encode(
 
 
 def next_sequence(sequence: int) -> int:
-    """Next larger sequence number without a byte that would be escaped; 0 after the largest.
-
-    The vendor's software avoids such numbers too.
-    """
+    """Next larger sequence number without a byte that would be escaped; 0 after the largest."""
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
     for position, value in enumerate(following):
         if value in _SPECIAL:  # the least number above: the bytes behind start from zero

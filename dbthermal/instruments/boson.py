@@ -1,9 +1,9 @@
 """FLIR Boson: driver of the camera's command port, and the commands that it sends.
 
-A busy camera answers late, after its driver gave up; without sequence numbers every later command
-then gets the reply of the command before (openmv/openmv, pull request 3265). Here each request has
-a new number, and frames without it are discarded. Connecting sends and resets nothing, and nothing
-is ever written to the camera's flash memory. `KIND` opens camera and command port for a session.
+A busy camera answers late; without sequence numbers every later command then gets the reply of the
+command before (openmv/openmv, pull request 3265). Here each request has a new number, and frames
+without it are discarded. Connecting sends and resets nothing, and nothing is ever written to the
+camera's flash memory. `KIND` opens camera and command port for a session.
 
 References
 ----------
@@ -11,6 +11,7 @@ Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/inclu
 cbbb877). Facts alone, none of the vendor's text or code.
 """
 
+import contextlib
 import struct
 import threading
 from collections.abc import Callable
@@ -50,7 +51,7 @@ EnumT = TypeVar("EnumT", bound=IntEnum)
 
 
 class Switch(IntEnum):
-    """State of a function that is either off or on."""
+    """State of a function."""
 
     OFF = 0
     ON = 1
@@ -80,13 +81,6 @@ class Reading(Generic[T]):
     layout: str  # data of the reply, as in `struct`, big-endian
     convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
 
-    def value(self, data: bytes) -> T:
-        """Value of the data of a reply; ValueError if they are of another size or meaning."""
-        size = struct.calcsize(self.layout)
-        if len(data) != size:
-            raise ValueError(f"Invalid {self.name} of {len(data)} bytes. Must have {size}.")
-        return self.convert(*struct.unpack(self.layout, data))
-
 
 @dataclass(frozen=True)
 class Setting(Generic[EnumT]):
@@ -101,31 +95,18 @@ class Setting(Generic[EnumT]):
         """Command that reads the mode back."""
         return Reading(self.name, self.set_command + 1, ">i", self.kind)
 
-    def data(self, value: EnumT) -> bytes:
-        """Data of the command that sets it; ValueError if the value is not of its enumeration."""
-        if value not in {*self.kind}:
-            choices = ", ".join(f"{member.value} ({member.name})" for member in self.kind)
-            raise ValueError(f"Invalid {self.name} {value}. Must be one of {choices}.")
-        return struct.pack(">i", value)
-
-
-def _text(raw: bytes) -> str:
-    """Text up to its padding of zeros."""
-    return raw.split(b"\0", 1)[0].decode("ascii")
-
-
-def _kelvin(tenths: int) -> float:
-    """Temperature [K] of signed tenths of a degree Celsius."""
-    return float(tenths / 10.0 + zero_Celsius)
-
 
 SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
-PART_NUMBER: Final = Reading("part number", 0x00050004, ">20s", _text)
+PART_NUMBER: Final = Reading(
+    "part number", 0x00050004, ">20s", lambda raw: raw.split(b"\0", 1)[0].decode("ascii")
+)
 SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
 SOFTWARE_REVISION: Final = Reading(
     "software revision", 0x00050022, ">III", lambda *numbers: ".".join(map(str, numbers))
 )
-FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvin)
+FPA_TEMPERATURE: Final = Reading(
+    "FPA temperature [K]", 0x00050030, ">h", lambda tenths: float(tenths / 10.0 + zero_Celsius)
+)
 FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
 LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
@@ -136,8 +117,9 @@ IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
 TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
 TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
 
-_MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
-SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
+SETTINGS: Final[tuple[Setting[Any], ...]] = (
+    *(FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION),
+)
 RUN_FFC: Final = 0x00050007  # command that starts a flat-field correction
 
 # Meaning of each status of a refusal.
@@ -214,10 +196,8 @@ class Boson(Closing):
         # From the time of day, so that a reply to a program that ended is not taken for a new one.
         moment = int(1e6 * transport.clock.utc().timestamp())
         first = moment if first_sequence is None else first_sequence
-        self.is_simulated = transport.is_simulated
-        self.timeout = timeout
-        self._transport = transport
-        self._clock = transport.clock
+        self.is_simulated, self.timeout = transport.is_simulated, timeout
+        self._transport, self._clock = transport, transport.clock
         self._decoder = fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
@@ -234,19 +214,27 @@ class Boson(Closing):
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
         """Value of a `Reading`, in the unit that its name says."""
-        reply = self._exchange(reading.name, reading.command, repeats=repeats)
+        data = self._exchange(reading.name, reading.command, repeats=repeats)
+        # Data of the size and with the meaning of this reading.
+        size, name = struct.calcsize(reading.layout), reading.name
+        if len(data) != size:
+            message = f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}."
+            raise BosonReplyError(message)
         try:
-            return reading.value(reply)
+            return reading.convert(*struct.unpack(reading.layout, data))
         except ValueError as error:
-            raise BosonReplyError(f"Invalid reply to '{reading.name}': {error}") from error
+            raise BosonReplyError(f"Invalid reply to '{name}': {error}") from error
 
     def get(self, setting: Setting[EnumT]) -> EnumT:
-        """State of one of `SETTINGS`."""
+        """State of a setting."""
         return self.read(setting.reading)
 
     def set(self, setting: Setting[EnumT], value: EnumT) -> None:
         """Set one of `SETTINGS` until power-off; a wrong value is a ValueError."""
-        self._tell(f"set {setting.name}", setting.set_command, setting.data(value))
+        if value not in {*setting.kind}:
+            choices = ", ".join(f"{member.value} ({member.name})" for member in setting.kind)
+            raise ValueError(f"Invalid {setting.name} {value}. Must be one of {choices}.")
+        self._command(f"set {setting.name}", setting.set_command, struct.pack(">i", value))
 
     def serial_number(self) -> int:
         """Serial number of the camera."""
@@ -274,14 +262,13 @@ class Boson(Closing):
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
-        settings: list[tuple[Setting[Any], IntEnum]] = [
-            (IR16_MODE, Ir16Mode.COUNTS_16),
-            (FFC_MODE, FfcMode.MANUAL),
-            (TELEMETRY, Switch(bool(telemetry_rows))),
-        ]
-        if telemetry_rows:
-            settings.append((TELEMETRY_LOCATION, TelemetryLocation.BOTTOM))
-        for setting, value in settings:
+        settings: dict[Setting[Any], IntEnum] = {
+            IR16_MODE: Ir16Mode.COUNTS_16,
+            FFC_MODE: FfcMode.MANUAL,
+            TELEMETRY: Switch(bool(telemetry_rows)),
+            **({TELEMETRY_LOCATION: TelemetryLocation.BOTTOM} if telemetry_rows else {}),
+        }
+        for setting, value in settings.items():
             self.set(setting, value)
             state = self.get(setting)
             if state != value:
@@ -299,7 +286,7 @@ class Boson(Closing):
         """
         before = self.read(LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE
-        self._tell("run FFC", RUN_FFC)
+        self._command("run FFC", RUN_FFC)
         deadline = self._clock() + timeout
         while True:
             try:
@@ -314,21 +301,17 @@ class Boson(Closing):
                 raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
             self._clock.sleep(POLL)
 
-    def _tell(self, name: str, command: int, data: bytes = b"") -> None:
+    def _command(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
         if reply := self._exchange(name, command, data):
-            raise BosonReplyError(
-                f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty."
-            )
+            size = len(reply)
+            raise BosonReplyError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again if no reply comes, and return the data of its reply."""
-        # A reading is requested again.
         for _ in range(repeats):
-            try:
+            with contextlib.suppress(BosonTimeoutError):
                 return self._exchange(name, command, data)
-            except BosonTimeoutError:
-                continue
         # The exchange, under a new number.
         with self._clock.hold(self._lock):
             self._sequence = fslp.next_sequence(self._sequence)

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,40 +23,13 @@ from dbthermal.correction._shutter import FEWEST_COPIES
 from dbthermal.instruments.clock import Clock
 from dbthermal.schema import Flags
 
-__all__ = [
-    "DAMAGED",
-    "FFC_READING",
-    "FPA_READING",
-    "FRAME_TIMEOUT",
-    "GOOD",
-    "KINDS",
-    "UNTIMED",
-    "CameraControl",
-    "CameraKind",
-    "Counts",
-    "FfcMode",
-    "FfcStatus",
-    "Frame",
-    "FrameFlag",
-    "FrameSource",
-    "GainMode",
-    "Identity",
-    "Metadata",
-    "NoFrameError",
-    "Shutter",
-    "SourceLostError",
-    "Stream",
-    "camera_kind",
-    "next_shutter",
-]
+__all__ = ["KINDS", "CameraControl", "CameraKind", "Frame", "FrameFlag", "FrameSource", "Metadata"]
 __dir__ = __all__.copy
 
 Counts = npt.NDArray[np.uint16]
 Identity = Mapping[str, str | bool]
 
-FRAME_TIMEOUT: Final = (
-    1.0  # longest wait for a frame by default [s]; a Boson gives 30 or 60 a second
-)
+FRAME_TIMEOUT: Final = 1.0  # longest wait for a frame by default [s]
 # Beginnings of the names of two readings, which the band follows.
 FPA_READING: Final = "fpa "  # temperature of the focal-plane array [K]
 FFC_READING: Final = "ffc "  # `FfcStatus`
@@ -84,19 +57,13 @@ class FrameFlag(Flags):
 
 GOOD: Final = FrameFlag(0)  # no flag
 
-UNTIMED: Final = (
-    FrameFlag.DRIVER_ERROR
-    | FrameFlag.WRONG_SIZE
-    | FrameFlag.SEQUENCE_STANDS
-    | FrameFlag.TIME_STANDS
-    | FrameFlag.TIME_WRONG
-    | FrameFlag.PADDED
-)
-"""Flags of a frame that is recorded but is no measurement: it gets no exposure time. A repeated
-image keeps its time, for a closed aperture looks the same."""
-
 DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
 """Flags of a frame with wrong counts, and maybe wrong telemetry."""
+
+_WRONG_TIME = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS | FrameFlag.TIME_WRONG
+UNTIMED: Final = DAMAGED | _WRONG_TIME | FrameFlag.PADDED
+"""Flags of a frame that is recorded but is no measurement: it gets no exposure time. A repeated
+image keeps its time, for a closed aperture looks the same."""
 
 
 class FfcStatus(IntEnum):
@@ -223,9 +190,7 @@ class CameraKind:
     """A kind of camera: how to open frames and command port; see ``KIND`` of its module."""
 
     open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
-    open_control: Callable[[str, object | None], AbstractContextManager[CameraControl]] | None = (
-        None
-    )
+    open_control: Callable[[str, object], AbstractContextManager[CameraControl]] | None = None
     telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
 
 
@@ -238,8 +203,7 @@ def camera_kind(name: str) -> CameraKind:
     return kind
 
 
-@dataclass(frozen=True)
-class Shutter:
+class Shutter(NamedTuple):
     """State of a camera's shutter after a frame; see `next_shutter`."""
 
     closed: bool = False  # True if the frame is flagged `FrameFlag.SHUTTER_CLOSED`

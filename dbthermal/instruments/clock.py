@@ -60,16 +60,14 @@ class Clock:
             yield
 
     @contextmanager
-    def joined(self) -> Iterator[None]:
-        """Let this thread take part in the order of a clock that has an order."""
+    def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
+        """Let this thread take part in the order of a clock that has an order.
+
+        The event is for a new thread: it is set when the thread has its place in the order.
+        """
+        if entered is not None:
+            entered.set()
         yield
-
-    def enter(self, entered: threading.Event) -> None:
-        """Begin the work of a thread, and set an event when it has its place in the order."""
-        entered.set()
-
-    def leave(self) -> None:
-        """End the work of a thread."""
 
 
 SYSTEM: Final = Clock()
@@ -98,12 +96,11 @@ class Task(threading.Thread):
 
     def run(self) -> None:
         """Work until the end."""
-        self._clock.enter(self._entered)
-        try:
-            self._work(*self._values)
-        finally:
-            self.ended.set()
-            self._clock.leave()
+        with self._clock.joined(self._entered):
+            try:
+                self._work(*self._values)
+            finally:
+                self.ended.set()
 
 
 class _Wait:
@@ -126,8 +123,7 @@ class EmulatedClock(Clock):
         self._now = 0.0
         self._lock = threading.Lock()
         self._waits: list[_Wait] = []
-        self._members: set[int] = set()  # threads that take part in the order
-        self._running: set[int] = set()  # members that do not wait
+        self._members, self._running = set[int](), set[int]()  # of the order; that do not wait
 
     def __call__(self) -> float:
         """Time since the start [s]."""
@@ -172,33 +168,31 @@ class EmulatedClock(Clock):
                 lock.release()
 
     @contextmanager
-    def joined(self) -> Iterator[None]:
-        """Take part in the order while a block lasts, as the thread that runs now."""
+    def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
+        """Take part in the order while a block lasts.
+
+        The thread runs now; a new one, with an event, after all that wait.
+        """
+        # A place in the order.
+        turn = _Wait(lambda: True, self._now)
         with self._lock:
-            outer = threading.get_ident() in self._members
-            self._members.add(threading.get_ident())
-            self._running.add(threading.get_ident())
+            is_member = turn.thread in self._members
+            self._members.add(turn.thread)
+            if entered is None:
+                self._running.add(turn.thread)
+            else:
+                self._waits.append(turn)
+        if entered is not None:
+            entered.set()
+            self._await(turn)
         try:
             yield
         finally:
-            if not outer:
-                self.leave()
-
-    def enter(self, entered: threading.Event) -> None:
-        """Take a place in the order behind all that wait, and wait for the turn."""
-        with self._lock:
-            self._members.add(threading.get_ident())
-            turn = _Wait(lambda: True, self._now)
-            self._waits.append(turn)
-        entered.set()
-        self._await(turn)
-
-    def leave(self) -> None:
-        """Leave the order: the next thread runs."""
-        with self._lock:
-            self._members.discard(threading.get_ident())
-            self._running.discard(threading.get_ident())
-            self._next()
+            if not is_member:  # the next thread runs
+                with self._lock:
+                    self._members.discard(turn.thread)
+                    self._running.discard(turn.thread)
+                    self._next()
 
     def _wait(self, condition: Callable[[], bool], timeout: float = math.inf) -> bool:
         """Wait until a condition holds, at most `timeout` [s]; True if it does."""
@@ -225,6 +219,7 @@ class EmulatedClock(Clock):
         """Let the next thread run, if none does."""
         while self._waits and not self._running:
             chosen = next((wait for wait in self._waits if self._is_over(wait)), None)
+            # No condition holds: the clock leaps to the earliest end.
             if chosen is None:
                 chosen = min(self._waits, key=lambda wait: wait.end)
                 if math.isinf(chosen.end):

@@ -6,74 +6,24 @@ imported only then.
 """
 
 import importlib
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
-from dbthermal.instruments.camera import (
-    FFC_READING,
-    FPA_READING,
-    CameraControl,
-    Counts,
-    FrameFlag,
-    FrameSource,
-    Identity,
-    NoFrameError,
-    Stream,
-    camera_kind,
-)
+from dbthermal.instruments import camera as interface
+from dbthermal.instruments.camera import CameraControl, Counts, FrameSource, Identity
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import LOGGER, WHEEL, Session
-from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
+from dbthermal.instruments.tc08 import TC08
 
-__all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
+__all__ = ["Devices", "open_devices"]
 __dir__ = __all__.copy
 
-SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
 FLUSH_TIMEOUT: Final = 2.0  # longest time in which the frames that a driver holds are read [s]
-
-
-class ReadingError(RuntimeError):
-    """An instrument gave no number; a recording notes it and goes on."""
-
-
-@dataclass
-class Thermocouples:
-    """The logger's channels, by the places of their tips; one scan gives the readings of all."""
-
-    logger: TC08
-    names: Mapping[int, str]
-
-    def __post_init__(self) -> None:
-        self._lock = threading.Lock()
-        self._scan: Scan | None = None
-        self._used: set[int] = set()  # channels whose value in the scan was given
-
-    def read(self, channel: int) -> float:
-        """Temperature of a channel [K], never the same measurement twice.
-
-        `ReadingError` if it is no temperature, or the logger fails.
-        """
-        with self.logger.clock.hold(self._lock):
-            scan = self._scan
-            if scan is None or channel in self._used or self.logger.clock() - scan.time > SCAN_AGE:
-                try:
-                    self._scan = scan = self.logger.single()
-                except TC08Error as error:
-                    raise ReadingError(f"No temperatures: {error}") from error
-                self._used.clear()
-            self._used.add(channel)
-        if scan.flag[channel]:
-            raise ReadingError(
-                f"No temperature of thermocouple '{self.names[channel]}' in channel {channel}: "
-                f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
-            )
-        return float(scan.temperature[channel])
 
 
 @dataclass(frozen=True)
@@ -84,8 +34,8 @@ class Devices:
     sources: Mapping[str, FrameSource]  # frames by band, in the session's order
     cameras: Mapping[str, CameraControl] = field(default_factory=dict)  # command ports by band
     wheel: FilterWheel | None = None
-    thermocouples: Thermocouples | None = None  # readings of the logger
-    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
+    thermocouples: TC08 | None = None  # their logger
+    world: Any = None  # emulated bench (`emulated.World`) of an emulated session
 
     @property
     def clock(self) -> Clock:
@@ -99,12 +49,12 @@ class Devices:
         [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam.
         """
         readings: dict[str, Reading] = {}
-        if self.thermocouples is not None:
-            for channel, name in self.thermocouples.names.items():
-                readings[name] = Reading(partial(self.thermocouples.read, channel))
+        if (logger := self.thermocouples) is not None:
+            for channel, name in logger.channels.items():
+                readings[name] = Reading(partial(logger.read, channel))
         for band, camera in self.cameras.items():
-            readings[FPA_READING + band] = Reading(camera.fpa_temperature)
-            readings[FFC_READING + band] = Reading(camera.ffc_status, "1")
+            readings[interface.FPA_READING + band] = Reading(camera.fpa_temperature)
+            readings[interface.FFC_READING + band] = Reading(camera.ffc_status, "1")
         if self.wheel is not None:
             readings[WHEEL] = Reading(self.wheel.position, "1")
         return readings
@@ -117,23 +67,19 @@ class Devices:
         """
         identities: dict[str, Identity] = {}
         for band, source in self.sources.items():
-            # The frames of a camera, and its command port.
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
-            if band in self.cameras:
-                control = self.cameras[band].identity()
-                numbers = identity.get("serial_number"), control["serial_number"]
-                if numbers[0] not in {None, numbers[1]}:
-                    raise ValueError(
-                        f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
-                        "commands go to the second. Must be one camera."
-                    )
-                identity = {**identity, **control}
-            identities[band] = identity
-        # The devices.
-        if self.wheel is not None:
-            identities[WHEEL] = self.wheel.identity()
-        if self.thermocouples is not None:
-            identities[LOGGER] = self.thermocouples.logger.identity()
+            control = self.cameras[band].identity() if band in self.cameras else {}
+            # Frames and command port must be those of one camera.
+            numbers = identity.get("serial_number"), control.get("serial_number")
+            if None not in numbers and numbers[0] != numbers[1]:
+                raise ValueError(
+                    f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
+                    "commands go to the second. Must be one camera."
+                )
+            identities[band] = {**identity, **control}
+        for name, device in ((WHEEL, self.wheel), (LOGGER, self.thermocouples)):
+            if device is not None:
+                identities[name] = device.identity()
         return identities
 
     def prepare(self) -> None:
@@ -184,9 +130,10 @@ class Devices:
             while self.clock() - start < FLUSH_TIMEOUT:
                 try:
                     frame = source.read(0.0)
-                except NoFrameError:
+                except interface.NoFrameError:
                     break
-                if frame.device_time >= start and FrameFlag.FOREIGN_CLOCK not in frame.flags:
+                has_own_clock = interface.FrameFlag.FOREIGN_CLOCK in frame.flags
+                if frame.device_time >= start and not has_own_clock:
                     break
 
 
@@ -198,7 +145,7 @@ def open_devices(
 ) -> Iterator[Devices]:
     """Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
-    `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
+    `world` is the emulated bench, an `emulated.World`, by default one at room temperature,
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
     [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
@@ -222,25 +169,32 @@ def open_devices(
     """
     # The bench of an emulated session.
     if session.simulated and world is None:
-        world = _emulated("world").emulated_world(session, waits=True)
+        world = _emulated().emulated_world(session, waits=True)
         if pictures is None:
-            pictures = _emulated("camera").blackbody_pictures(session, world)
+            pictures = _emulated(".camera").blackbody_pictures(session, world)
     if not session.simulated and (world is not None or pictures):
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
         # Frames and command ports of the cameras.
+        form = session.shape, session.frame_rate, session.telemetry_rows
         sources: dict[str, FrameSource] = {}
-        cameras: dict[str, CameraControl] = {}
+        controls: dict[str, CameraControl] = {}
         for band, camera in session.cameras.items():
-            sources[band] = stack.enter_context(_frames(session, band, world, pictures or {}))
-            open_control = camera_kind(camera.kind).open_control
-            if camera.control is not None and open_control is not None:
-                url = f"sim://{camera.kind}/{band}" if session.simulated else camera.control
-                cameras[band] = stack.enter_context(open_control(url, world))
-        wheel = thermocouples = None
+            kind = interface.camera_kind(camera.kind)
+            if world is None:
+                source = kind.open_frames(camera.video, interface.Stream(*form))
+            else:
+                beam = None if band == session.filtered else band
+                view = world, band, pictures or {}, beam, *form
+                source = _emulated(".camera").EmulatedCamera(*view, kind=camera.kind)
+            sources[band] = stack.enter_context(source)
+            if camera.control is not None and kind.open_control is not None:
+                url = camera.control if world is None else f"sim://{camera.kind}/{band}"
+                controls[band] = stack.enter_context(kind.open_control(url, world))
         # The wheel.
+        wheel = logger = None
         if session.filters:
-            url = "sim://apt" if session.simulated else session.devices[WHEEL]
+            url = session.devices[WHEEL] if world is None else "sim://apt"
             opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
             wheel = stack.enter_context(opened)
         # The thermocouples.
@@ -248,28 +202,14 @@ def open_devices(
             if world is None:
                 logger = TC08.from_url(session.devices[LOGGER])
             else:
-                unit = _emulated("tc08").EmulatedTC08(world.thermocouple_temperature, world.clock)
+                unit = _emulated(".devices").EmulatedTC08(
+                    world.thermocouple_temperature, world.clock
+                )
                 logger = TC08(unit).open()
             stack.enter_context(logger).set_channels(session.thermocouples)
-            thermocouples = Thermocouples(logger, session.thermocouples)
-        yield Devices(session, sources, cameras, wheel, thermocouples, world)
+        yield Devices(session, sources, controls, wheel, logger, world)
 
 
-def _emulated(module: str) -> Any:
-    """A module of the emulators, which nothing imports before it is needed."""
-    return importlib.import_module(f"dbthermal.instruments.emulated.{module}")
-
-
-def _frames(
-    session: Session, band: str, world: Any, pictures: Mapping[str, Any]
-) -> AbstractContextManager[FrameSource]:
-    """Open the frames of a band's camera."""
-    camera = session.cameras[band]
-    form = session.shape, session.frame_rate, session.telemetry_rows
-    if world is None:
-        return camera_kind(camera.kind).open_frames(camera.video, Stream(*form))
-    unfiltered = None if band == session.filtered else band
-    source: AbstractContextManager[FrameSource] = _emulated("camera").EmulatedCamera(
-        world, band, pictures, unfiltered, *form, kind=camera.kind
-    )
-    return source
+def _emulated(module: str = "") -> Any:
+    """A module of the emulators, or the bench; nothing imports them before they are needed."""
+    return importlib.import_module(f"dbthermal.instruments.emulated{module}")

@@ -5,11 +5,9 @@ bare stepper stage, not to be confused with the FW102C and FW212C, which speak A
 encoder: its position is a count of commanded steps. A controller that stops short of its target, or
 never starts, is an error here; steps lost under way are not detected until `FilterWheel.home`.
 
-A controller that is addressed wrongly says nothing, one that was just switched on may have speeds
-near 0 and a motor without current, and one that was sold under one name may give another. So the
-address is searched for, the model is checked, and each setting is read back.
-
-A motion is over when the controller reports its end or the moving bits are clear, and the wheel is
+A controller that was just switched on may have speeds near 0 and a motor without current, and one
+that was sold under one name may give another: the model is checked, and each setting read back. A
+motion is over when the controller reports its end or the moving bits are clear, and the wheel is
 where it should be. Neither is enough alone: bits were seen to stick, the report of an earlier move
 may come late, and before a move starts the bits are clear too.
 
@@ -20,11 +18,9 @@ pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentk
 units, and addresses). Facts alone, no code.
 """
 
-import logging
-import threading
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import ConfigDict, Field
@@ -32,6 +28,13 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments._controller import (
+    CHANNEL,
+    Controller,
+    NoReplyError,
+    WheelError,
+    WrongDeviceError,
+)
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
@@ -48,18 +51,8 @@ __all__ = [
 __dir__ = __all__.copy
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
-CHANNEL: Final = 1  # of the motor at its address
 BAUDRATE: Final = 115_200  # [bit/s]
-
-ADDRESSES: Final = ((apt.RACK, apt.BAY_1), (apt.UNIT, apt.UNIT))
-"""Where a controller is looked for, in order: address of its identity, and of its motor. A BSC20x
-is a rack and silently ignores messages to a unit."""
-
-REPLY_TIMEOUT: Final = 1.0  # [s]
-ATTEMPTS: Final = 2  # number of times that a request is sent before its reply counts as missing
-READ_SIZE: Final = 256  # largest number of bytes that are read at once
-MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
-ACCURACY: Final = 0.01  # largest relative difference of a speed that is read back
+ACCURACY: Final = 0.01  # largest relative difference of a setting that is read back
 
 TOLERANCE: Final = 0.1  # largest distance of the wheel from a slot [deg]
 HOME_TIMEOUT: Final = 60.0  # longest search for the home switch [s]
@@ -73,10 +66,6 @@ CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is ov
 FAULTS: Final = StatusBits.POSITION_ERROR | StatusBits.OVERLOAD
 # Bits of a wheel that moves. The jogging bits are left out: they were seen to stick.
 MOVING: Final = StatusBits.MOVING_FORWARD | StatusBits.MOVING_REVERSE | StatusBits.HOMING
-
-_EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
-_NOTICES = (Id.HW_RESPONSE, Id.HW_RICHRESPONSE)
-_LOGGER = logging.getLogger(__name__)
 
 # Speeds are whole numbers of 32 bits to the controllers, which is 97 turns/s in the finer units;
 # slower than the lowest a turn would take longer than the wheel is waited for.
@@ -118,11 +107,11 @@ class Scale:
             raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
         return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
 
-    def position(self, count: int, offset: float) -> int | None:
-        """Slot within `TOLERANCE` of a place [count] of any turn; None between two slots."""
+    def position(self, count: float, offset: float, tolerance: float = TOLERANCE) -> int | None:
+        """Slot within a tolerance [deg] of a place [count] of any turn; None between two slots."""
         sixths = (count / self.turn - offset / 360.0) * POSITIONS
         nearest = round(sixths)
-        near = abs(sixths - nearest) * 360.0 / POSITIONS <= TOLERANCE
+        near = abs(sixths - nearest) * 360.0 / POSITIONS <= tolerance
         return nearest % POSITIONS + 1 if near else None
 
     def degrees(self, counts: int) -> float:
@@ -137,20 +126,8 @@ BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
 MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 
 
-class WheelError(RuntimeError):
-    """The wheel or its controller does not do what it should."""
-
-
-class NoReplyError(WheelError, TimeoutError):
-    """The controller did not reply in time."""
-
-
 class WheelTimeoutError(WheelError, TimeoutError):
     """The wheel moved, but did not arrive in time."""
-
-
-class WrongDeviceError(WheelError):
-    """Another device is at this address."""
 
 
 class StalledWheelError(WheelError):
@@ -159,131 +136,6 @@ class StalledWheelError(WheelError):
 
 class NotHomedError(WheelError):
     """The controller does not know where the wheel is."""
-
-
-class _Line:
-    """Requests to a controller and its replies, with what it reports by itself.
-
-    APT has no sequence numbers, and a controller reports the end of a move at any time: the next
-    message is not always the reply. So messages are told apart by identifier, source and channel.
-    """
-
-    def __init__(self, transport: Transport) -> None:
-        self.unit, self.motor = ADDRESSES[0]
-        self.decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
-        self._transport, self._clock = transport, transport.clock
-        # A recorder asks for the position in one thread while another turns the wheel.
-        self._lock = threading.Lock()
-        self._events: list[apt.Message] = []
-        self._notices: list[apt.Notice] = []
-
-    def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
-        """Send a message without a reply to the motor."""
-        message = apt.command(identifier, channel, value, data=data, destination=self.motor)
-        self._transport.write(message)
-
-    def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
-        """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
-        with self._clock.hold(self._lock):
-            self._collect()
-        self._events.clear()
-        self.check()
-        self.send(identifier, channel, data=data)
-
-    def greet(self) -> apt.Info | None:
-        """Identity of the controller at the address of the unit; None if it is silent."""
-        for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
-            self._transport.write(apt.command(identifier, destination=self.unit))
-        try:
-            reply = self._exchange(Id.HW_REQ_INFO, Id.HW_GET_INFO, self.unit, 0, attempts=1)
-        except NoReplyError:
-            return None
-        self._collect()
-        self._notices.clear()  # it need not know all messages of the greeting
-        return apt.Info.parse(reply)
-
-    def request(self, identifier: Id, reply: Id) -> apt.Message:
-        """Reply of the motor to a request; NoReplyError without a reply.
-
-        Only requests are repeated, never what moves the wheel. A late reply may be taken for that
-        of the repetition, and is older than it seems, but replies stay in order.
-        """
-        return self._exchange(identifier, reply, self.motor, CHANNEL, attempts=ATTEMPTS)
-
-    def has_reported(self, identifier: Id) -> bool:
-        """True if the motor reported this since the last start of a motion."""
-        return (identifier, self.motor) in {(event.id, event.source) for event in self._events}
-
-    def check(self) -> None:
-        """WheelError with the text of the errors that the controller reported by itself."""
-        if self._notices:
-            reported = self._reported()
-            self._notices.clear()
-            raise WheelError(f"The controller is not well.{reported}")
-
-    def _exchange(
-        self, identifier: Id, reply: Id, source: int, channel: int, attempts: int
-    ) -> apt.Message:
-        """Reply to a request; what came before the request is not its reply."""
-        request = apt.command(identifier, channel, destination=source)
-        # Ask, as often as needed.
-        with self._clock.hold(self._lock):
-            for _ in range(attempts):
-                self._collect()
-                self._transport.write(request)
-                if (message := self._wait(reply, source, channel)) is not None:
-                    return message
-                self.decoder.discard()  # half a message whose rest did not come in time
-        raise NoReplyError(
-            f"No answer {reply.name} from address 0x{source:02X} in {REPLY_TIMEOUT} s. "
-            f"The controller must be on and in no other program's use.{self._reported()}"
-        )
-
-    def _wait(self, reply: Id, source: int, channel: int) -> apt.Message | None:
-        """Read until the reply comes, of a channel unless 0; None if it does not in time."""
-        deadline = self._clock() + REPLY_TIMEOUT
-        while (remaining := deadline - self._clock()) > 0:
-            if not (received := self._transport.read(READ_SIZE, remaining)):
-                return None
-            for message in reversed(self._replies(received)):
-                data = message.data
-                about = int.from_bytes(data[:2], "little") if data else message.param1
-                if (message.id, message.source) == (reply, source) and channel in {0, about}:
-                    return message
-        return None
-
-    def _collect(self) -> None:
-        """Take in all bytes that have come so far."""
-        count = 0
-        while received := self._transport.read(READ_SIZE, 0.0):
-            self._replies(received)
-            count += len(received)
-            if count > MAXIMUM_UNSOLICITED:
-                rule = "Must be an APT controller"
-                raise WrongDeviceError(
-                    f"More than {MAXIMUM_UNSOLICITED} unsolicited bytes came. {rule}."
-                )
-
-    def _replies(self, received: bytes) -> list[apt.Message]:
-        """Messages that may be replies; events and notices are kept."""
-        replies = []
-        for message in self.decoder.feed(received):
-            if message.id in _EVENTS:
-                self._events.append(message)
-            elif message.id in _NOTICES:
-                notice = apt.Notice.parse(message)
-                _LOGGER.warning("Controller of the filter wheel: %s", notice)
-                self._notices.append(notice)
-            else:
-                replies.append(message)
-        return replies
-
-    def _reported(self) -> str:
-        """Sentences on the errors that the controller reported."""
-        return "".join(
-            f" It reported error {notice.code} of message 0x{notice.id:04X}: {notice.notes}."
-            for notice in self._notices
-        )
 
 
 class FilterWheel(Closing):
@@ -299,8 +151,9 @@ class FilterWheel(Closing):
         self.filters, self.settings = filters, settings or Settings()
         self.is_simulated = transport.is_simulated
         self._transport, self._clock = transport, transport.clock
-        self._line = _Line(transport)
-        self._info: apt.Info | None = None  # once it is connected
+        self._controller = Controller(transport)
+        self._identity: Identity = {}  # until it is connected
+        self._scale = BSC20X
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
@@ -321,39 +174,38 @@ class FilterWheel(Closing):
             stack.pop_all()
         return wheel
 
-    def connect(self) -> apt.Info:
+    def connect(self) -> None:
         """Find the controller, check its identity, set the speeds and enable the motor."""
-        for self._line.unit, self._line.motor in ADDRESSES:
-            if (info := self._line.greet()) is not None:
-                self._scale_of(info)
-                self._info = info
-                self._prepare()
-                return info
-        if dropped := self._line.decoder.dropped:
-            raise WrongDeviceError(
-                f"{dropped} bytes came that are no APT messages. Must be an APT controller."
-            )
-        tried = ", ".join(f"0x{unit:02X}" for unit, _ in ADDRESSES)
-        raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
+        info, expected = self._controller.connect(), self.settings.serial_number
+        model = apt.text(info.model)
+        if expected is not None and info.serial_number != expected:
+            raise WrongDeviceError(f"Wrong controller {info.serial_number}. Must be {expected}.")
+        # Its scale, by the beginning of its name.
+        scales = [scale for beginning, scale in MODELS.items() if model.startswith(beginning)]
+        if not scales:
+            rule = f"Its model must begin with one of {sorted(MODELS)}"
+            raise WrongDeviceError(f"Wrong device '{model}', number {info.serial_number}. {rule}.")
+        self._scale = scales[0]
+        self._identity = {
+            "model": model,
+            "serial_number": str(info.serial_number),
+            "firmware": f"{info.major}.{info.interim}.{info.minor}",
+            "addresses": f"0x{self._controller.unit:02X}, 0x{self._controller.motor:02X}",
+            "is_simulated": self.is_simulated,
+        }
+        self._prepare()
 
     def identity(self) -> Identity:
         """Model (not always that on the label), numbers and addresses of the controller."""
-        if self._info is None:
-            raise WheelError(
-                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
-            )
-        return {
-            "model": self._info.model,
-            "serial_number": str(self._info.serial_number),
-            "firmware": self._info.firmware,
-            "addresses": f"0x{self._line.unit:02X}, 0x{self._line.motor:02X}",
-            "is_simulated": self.is_simulated,
-        }
+        if not self._identity:
+            rule = "Must be opened by `FilterWheel.from_url`"
+            raise WheelError(f"The wheel is not connected. {rule}.")
+        return self._identity
 
     def status(self) -> apt.Status:
         """Position [count] and state of the motor."""
-        reply = self._line.request(Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE)
-        return apt.Status.parse(reply)
+        request = Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE
+        return apt.parse(apt.Status, self._controller.request(*request))
 
     def home(self) -> None:
         """Search for the home switch, from which all places count; the speeds are set before.
@@ -361,10 +213,11 @@ class FilterWheel(Closing):
         StalledWheelError or WheelTimeoutError if the wheel does not start, stops before the switch,
         or takes too long, and was stopped.
         """
+        self.identity()
         self._prepare()
-        self._require_rest()
+        self._resting(homed=False)
         self._is_lost = True
-        self._line.begin(Id.MOT_MOVE_HOME, CHANNEL)
+        self._controller.begin(Id.MOT_MOVE_HOME, CHANNEL)
 
         def is_home(status: apt.Status) -> bool:
             return status.bits & (StatusBits.HOMED | StatusBits.HOMING) == StatusBits.HOMED
@@ -385,9 +238,10 @@ class FilterWheel(Closing):
         """
         scale = self._scale
         target = scale.target(position, self.settings.home_offset)
-        self._require_home(self._require_rest())
-
-        self._line.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.Position(CHANNEL, target).pack())
+        self._resting(homed=True)
+        # The move, until the wheel is there.
+        data = apt.pack(apt.Position(CHANNEL, target))
+        self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=data)
 
         def has_arrived(status: apt.Status) -> bool:
             return abs(scale.degrees(status.position - target)) <= TOLERANCE
@@ -408,8 +262,7 @@ class FilterWheel(Closing):
 
     def position(self) -> int:
         """Slot in the beam, 1 to 6; WheelError between two slots, in a move, or if not homed."""
-        status = self._require_rest()
-        self._require_home(status)
+        status = self._resting(homed=True)
         position = self._scale.position(status.position, self.settings.home_offset)
         if position is None:
             raise WheelError(
@@ -427,91 +280,61 @@ class FilterWheel(Closing):
 
     def stop(self) -> None:
         """Stop the wheel by a ramp."""
-        self._line.send(Id.MOT_MOVE_STOP, CHANNEL, apt.NO)
+        self._controller.send(Id.MOT_MOVE_STOP, CHANNEL, apt.NO)
 
     def close(self) -> None:
         """Close the line; the wheel stays where it is. A second call does nothing."""
         self._transport.close()
 
-    def _identity(self) -> apt.Info:
-        """Identity of the controller; `WheelError` before `connect`."""
-        if self._info is None:
-            raise WheelError(
-                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
-            )
-        return self._info
-
-    @property
-    def _scale(self) -> Scale:
-        return self._scale_of(self._identity())
-
-    def _scale_of(self, info: apt.Info) -> Scale:
-        """Scale of a controller, if it is one that drives this wheel."""
-        expected = self.settings.serial_number
-        if expected is not None and info.serial_number != expected:
-            raise WrongDeviceError(f"Wrong controller {info.serial_number}. Must be {expected}.")
-        for beginning, scale in MODELS.items():
-            if info.model.startswith(beginning):
-                return scale
-        rule = f"Its model must begin with one of {sorted(MODELS)}"
-        raise WrongDeviceError(f"Wrong device '{info.model}', number {info.serial_number}. {rule}.")
-
     def _prepare(self) -> None:
         """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
-        settings, scale, request = self.settings, self._scale, self._line.request
-        units = scale.turn * scale.velocity  # of one turn/s
+        settings, scale, request = self.settings, self._scale, self._controller.request
         # The speeds of moves.
-        speeds = apt.VelocityParameters(
-            CHANNEL,
-            minimum=0,
-            acceleration=round(settings.acceleration * scale.turn * scale.acceleration),
-            maximum=round(settings.velocity * units),
-        )
-        self._line.send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
-        reply = request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
-        actual = apt.VelocityParameters.parse(reply)
-        _must_agree("velocity", actual.maximum, speeds.maximum)
-        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
+        speed = scale.turn * scale.velocity  # of one turn/s [device units]
+        acceleration = round(settings.acceleration * scale.turn * scale.acceleration)
+        speeds = apt.Speeds(CHANNEL, 0, acceleration, round(settings.velocity * speed))
+        self._set("", Id.MOT_SET_VELPARAMS, speeds)
         # The speed of homing, and direction and switch where the settings have them.
-        before = self._home_parameters()
-        wanted = replace(
-            before,
+        before = apt.parse(apt.Home, request(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS))
+        home = before._replace(
             direction=settings.home_direction or before.direction,
             limit_switch=settings.home_limit_switch or before.limit_switch,
-            velocity=round(settings.home_velocity * units),
+            velocity=round(settings.home_velocity * speed),
         )
-        self._line.send(Id.MOT_SET_HOMEPARAMS, data=wanted.pack())
-        home = self._home_parameters()
-        _must_agree("home velocity", home.velocity, wanted.velocity)
-        if replace(home, velocity=wanted.velocity) != wanted:
-            raise WheelError(f"The controller has {home}. Must be {wanted}.")
+        self._set("home ", Id.MOT_SET_HOMEPARAMS, home)
         # The motor's current.
-        self._line.send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
+        self._controller.send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
         state = request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE).param2
         if state not in {apt.YES, apt.NO}:
             raise WheelError(f"Unknown state {state} of the motor. Must be 1 or 2.")
         if state == apt.NO:
             raise WheelError("The controller did not enable the motor. It must be connected.")
-        self._line.check()
+        self._controller.check()
 
-    def _home_parameters(self) -> apt.HomeParameters:
-        reply = self._line.request(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS)
-        return apt.HomeParameters.parse(reply)
+    def _set(self, prefix: str, identifier: Id, wanted: apt.Speeds | apt.Home) -> None:
+        """Set a record of numbers, and read it back; WheelError if the controller has others."""
+        self._controller.send(identifier, data=apt.pack(wanted))
+        reply = self._controller.request(Id(identifier + 1), Id(identifier + 2))
+        actual = apt.parse(type(wanted), reply)
+        for name in reversed(wanted._fields):
+            value, expected = getattr(actual, name), getattr(wanted, name)
+            is_used = name != "minimum"  # the controllers ignore this speed
+            if is_used and abs(value - expected) > ACCURACY * abs(expected):
+                has = f"The controller has {prefix}{name} {value}"
+                raise WheelError(f"{has}. Must be {expected} [device units].")
 
-    def _require_rest(self) -> apt.Status:
-        """Status of a wheel that does not move."""
+    def _resting(self, *, homed: bool) -> apt.Status:
+        """Status of a wheel that must not move, and whose place the controller must know."""
+        self.identity()  # once it is connected
         status = self.status()
         if status.bits & MOVING:
             raise WheelError("The wheel is still moving. Must be at rest: wait, or stop it.")
-        return status
-
-    def _require_home(self, status: apt.Status) -> None:
-        """Raise unless the controller knows where the wheel is."""
-        if self._is_lost or not status.bits & StatusBits.HOMED:
+        if homed and (self._is_lost or not status.bits & StatusBits.HOMED):
             raise NotHomedError(
                 "The wheel was not homed since it was switched on, or has lost steps since. "
                 "Must be homed."
             )
+        return status
 
     def _place(self, status: apt.Status) -> str:
         return f"at {self._scale.degrees(status.position):.2f} deg"
@@ -533,11 +356,11 @@ class FilterWheel(Closing):
         moved, rests, confirmed, count = False, 0, 0, None
         while confirmed < CONFIRMATIONS:
             status = self.status()
-            self._line.check()
+            self._controller.check()
             if faults := status.bits & FAULTS:
                 self.stop()
                 raise StalledWheelError(
-                    f"The controller reports {faults.name}, and the wheel was stopped. "
+                    f"The controller reports {StatusBits(faults).name}, and the wheel was stopped. "
                     "Must be none."
                 )
             # The course of the motion so far.
@@ -548,7 +371,7 @@ class FilterWheel(Closing):
             rests = 0 if moving else rests + 1
             # Over, by its end and its place.
             rested = rests > 0 and (moved or not must_move)
-            ended = rested or self._line.has_reported(end)
+            ended = rested or self._controller.has_reported(end)
             confirmed = confirmed + 1 if ended and is_there(status) else 0
             # Failed: at rest elsewhere, too long under way, or standing still.
             place = self._place(status)
@@ -570,9 +393,3 @@ class FilterWheel(Closing):
                     "move, and was stopped. Must turn freely."
                 )
             self._clock.sleep(POLL_INTERVAL)
-
-
-def _must_agree(name: str, actual: int, expected: int) -> None:
-    """Raise if a controller did not take a speed."""
-    if abs(actual - expected) > ACCURACY * expected:
-        raise WheelError(f"The controller has {name} {actual}. Must be {expected} [device units].")

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import usb.core
 
@@ -21,9 +21,8 @@ __all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find", 
 __dir__ = __all__.copy
 
 
-@dataclass(frozen=True)
-class Kind:
-    """Type of device: its USB identity, and its families of nodes.
+class Kind(NamedTuple):
+    """Type of device: name, USB identity, and its families of nodes.
 
     A family of nodes has a name, the Linux module that makes it, and where sysfs lists its nodes.
     """
@@ -47,10 +46,10 @@ KINDS: Final = (
 
 # Name of each speed of libusb: 1.5, 12, 480, 5000 and 10000 Mbit/s.
 SPEEDS: Final = {1: "low", 2: "full", 3: "high", 4: "super", 5: "super plus"}
-# Largest data rate of a high-speed bus [bit/s]: 13 bulk packets of 512 bytes in 125 us (Universal
+# Largest data rate of a high-speed bus [Mbit/s]: 13 bulk packets of 512 bytes in 125 us (Universal
 # Serial Bus Specification 2.0, table 5-10).
-HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000
-PIXELS: Final = 640 * 512  # of a frame, 16 bits each
+HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000e-6
+FRAME: Final = 16e-6 * 640 * 512  # of 16-bit pixels [Mbit]
 RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"  # below 73, or ``uaccess`` comes too late
 
 
@@ -60,19 +59,14 @@ class LibusbMissingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Device:
-    """A device that is plugged in.
-
-    `bus` is the number of its bus, `ports` the port of each hub on the way, the root's first,
-    `serial` its USB serial number, empty if it is not known, `nodes` its files below ``/dev``.
-    `warnings` are obstacles to its use, each with the remedy.
-    """
+    """A device that is plugged in, with obstacles to its use, and their remedies, as `warnings`."""
 
     kind: Kind
     bus: int
-    ports: tuple[int, ...]
+    ports: tuple[int, ...]  # of each hub on the way, the root's first
     speed: str
-    serial: str = ""
-    nodes: tuple[str, ...] = ()
+    serial: str = ""  # USB serial number, if it is known
+    nodes: tuple[str, ...] = ()  # files below ``/dev``
     warnings: tuple[str, ...] = ()
 
     @property
@@ -96,7 +90,15 @@ def find(
     """
     devices = []
     for kind in KINDS:
-        of_kind = [_device(kind, raw, sysfs, dev) for raw in _enumerate(backend, kind)]
+        identity = {"idVendor": kind.vendor, "idProduct": kind.product}
+        try:
+            listed = [*usb.core.find(find_all=True, backend=backend, **identity)]
+        except usb.core.NoBackendError as error:
+            raise LibusbMissingError(
+                "No libusb found. Must be installed to see USB devices: "
+                "the package libusb-1.0-0 of Debian, libusb of Homebrew or conda."
+            ) from error
+        of_kind = [_device(kind, raw, sysfs, dev) for raw in listed]
         devices += sorted(of_kind, key=lambda device: (device.bus, device.ports))
     cameras = [device for device in devices if device.kind == BOSON]
     return [
@@ -131,18 +133,6 @@ def describe(devices: Iterable[Device]) -> str:
     return "\n".join(lines)
 
 
-def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
-    """Yield pyusb's devices of one kind."""
-    identity = {"idVendor": kind.vendor, "idProduct": kind.product}
-    try:
-        yield from usb.core.find(find_all=True, backend=backend, **identity)
-    except usb.core.NoBackendError as error:
-        raise LibusbMissingError(
-            "No libusb found. Must be installed to see USB devices: "
-            "the package libusb-1.0-0 of Debian, libusb of Homebrew or conda."
-        ) from error
-
-
 def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     """Device of the bus with its nodes and the warnings about their use."""
     # The device, where Linux lists it.
@@ -152,11 +142,9 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
         warning = f"Its nodes and number are not known: there is no {folder}."
         return replace(device, warnings=(warning,))
     # Its nodes, by families.
-    number, nodes, warnings = folder / "serial", list[Path](), list[str]()
+    nodes, warnings = list[Path](), list[str]()
     for family, module, pattern in kind.families:
-        names = sorted(
-            (entry.name for entry in folder.glob(pattern)), key=lambda name: (len(name), name)
-        )
+        names = sorted((path.name for path in folder.glob(pattern)), key=lambda n: (len(n), n))
         nodes += [dev / name for name in names]
         if not names:
             driver = f"Must have its kernel driver: run 'sudo modprobe {module}'"
@@ -174,28 +162,27 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
             f"No permission for {', '.join(map(str, denied))}. Type this, and plug it in again: "
             f"echo '{rule}' | sudo tee -a {RULES} && sudo udevadm control --reload"
         )
+    number, paths = folder / "serial", tuple(str(node) for node in nodes)
     serial = number.read_text("utf-8", "backslashreplace").strip() if number.exists() else ""
-    return replace(
-        device, serial=serial, nodes=tuple(str(node) for node in nodes), warnings=tuple(warnings)
-    )
+    return replace(device, serial=serial, nodes=paths, warnings=tuple(warnings))
 
 
 def _bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> Iterator[str]:
     """Yield a warning if a camera's video does not fit its bus with the rest of the cameras."""
-    rate = 16e-6 * PIXELS * frame_rate  # [Mbit/s]
+    rate, limit = FRAME * frame_rate, HIGH_SPEED_PAYLOAD
     if device in cameras and device.speed in {"low", "full"}:
         yield (
             f"It runs at {device.speed} speed, and {frame_rate:g} frames/s take {rate:.1f} Mbit/s. "
             "Must be at high speed: use another port or cable."
         )
     on_bus = [camera for camera in cameras if (camera.bus, camera.speed) == (device.bus, "high")]
-    total, limit = rate * len(on_bus), HIGH_SPEED_PAYLOAD / 1e6
+    total = rate * len(on_bus)
     if device in on_bus and total > limit:
-        paths = [camera.path for camera in on_bus if camera is not device]
+        paths = ", ".join(camera.path for camera in on_bus if camera is not device) or "no other"
         yield (
-            f"It shares bus {device.bus} with {', '.join(paths) or 'no other'}: {total:.1f} Mbit/s "
-            f"at {frame_rate:g} frames/s, of {limit:.1f} Mbit/s at most. Use ports of two "
-            "controllers, or fewer frames/s."
+            f"It shares bus {device.bus} with {paths}: {total:.1f} Mbit/s at {frame_rate:g} "
+            f"frames/s, of {limit:.1f} Mbit/s at most. Use ports of two controllers, or fewer "
+            "frames/s."
         )
 
 

@@ -1,14 +1,10 @@
 """Live view of a recording: its pictures, its losses, and the state of its cameras.
 
 A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows a picture of
-each band, in place, in a notebook or nowhere::
-
-    view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
-    record(session, devices.sources, path, readings=devices.readings(), preview=view)
-
-With a `Separation` it shows the temperatures of object and background beside them. A `Watch`
-computes the numbers that are shown, and draws nothing: matplotlib is loaded with the first picture.
-The queue of the recording has to bridge the time that an update takes.
+each band, in place, in a notebook or nowhere. With a `Separation` it shows the temperatures of
+object and background beside them. A `Watch` computes the numbers that are shown, and draws nothing:
+matplotlib is loaded with the first picture. The queue of the recording has to bridge the time that
+an update takes.
 """
 
 import io
@@ -21,14 +17,8 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments.camera import (
-    FFC_READING,
-    FPA_READING,
-    FfcStatus,
-    Frame,
-    FrameFlag,
-    Metadata,
-)
+from dbthermal.instruments import camera
+from dbthermal.instruments.camera import FFC_READING, FfcStatus, Frame, FrameFlag
 from dbthermal.instruments.recording import Preview
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
@@ -45,7 +35,6 @@ _PERIOD: Final = 1.0  # least time from picture to picture [s]; one takes a tent
 _PERCENTILES: Final = (1.0, 99.0)  # of the counts that are black and white in the picture [%]
 _LEAST_SHARE: Final = 0.01  # of pixels at either end of the range, from which a warning comes [1]
 _COMPRESSION: Final = 1  # of zlib's 1 to 9
-_RANGE: Final = np.iinfo(np.uint16)
 _FILMS: Final = ("object", "background")
 _STRIDE: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
 _FFC_STATES: Final = {float(state): state.name.lower().replace("_", " ") for state in FfcStatus}
@@ -84,19 +73,16 @@ class Status:
     @property
     def warning(self) -> str:
         """A line for each defect that makes the last frames useless; empty without any."""
-        warnings = [
-            (self.frames == 0, "no frame has come"),
-            (self.frames > 0 and self.frame_rate == 0, "no new frames come"),
-            (self.ffc == _IN_PROGRESS, "shutter closed: FFC in progress"),
-            (self.dead > _LEAST_SHARE, _at(self.dead, _RANGE.min, "dead")),
-            (self.saturated > _LEAST_SHARE, _at(self.saturated, _RANGE.max, "saturated")),
-            (self.lowest == self.highest, f"every pixel at {self.lowest:.0f}: nothing is seen"),
-        ]
-        return "\n".join(line for holds, line in warnings if holds)
-
-
-def _at(share: float, counts: int, meaning: str) -> str:
-    return f"{100 * share:.1f} % of the pixels at {counts}: {meaning}"
+        dead, saturated = f"{100 * self.dead:.1f}", f"{100 * self.saturated:.1f}"
+        warnings = {
+            "no frame has come": self.frames == 0,
+            "no new frames come": self.frames > 0 and self.frame_rate == 0,
+            "shutter closed: FFC in progress": self.ffc == _IN_PROGRESS,
+            f"{dead} % of the pixels at 0: dead": self.dead > _LEAST_SHARE,
+            f"{saturated} % of the pixels at 65535: saturated": self.saturated > _LEAST_SHARE,
+            f"every pixel at {self.lowest:.0f}: nothing is seen": self.lowest == self.highest,
+        }
+        return "\n".join(line for line, holds in warnings.items() if holds)
 
 
 class Watch:
@@ -119,6 +105,7 @@ class Watch:
             frames = {_metadata(band, shown).last_ffc_frame for shown in (before, preview)}
             if _ffc(band, preview) == _IN_PROGRESS or (None not in frames and len(frames) > 1):
                 self._ffc_times[band] = preview.time
+        # Numbers of frames and times of arrival, for the frame rate.
         marks = {
             band: (preview.totals[band]["frames"], frame.host_time)
             for band, frame in preview.frames.items()
@@ -159,23 +146,21 @@ class Watch:
 
 def _is_new(before: Preview, now: Preview) -> bool:
     """True if a preview is of another recording than the preview before it."""
-    return (
-        tuple(before.totals) != tuple(now.totals)
-        or now.time < before.time
-        or any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
-    )
+    if tuple(before.totals) != tuple(now.totals) or now.time < before.time:
+        return True
+    return any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
 
 
 def _fpa_temperature(band: str, preview: Preview) -> float:
     """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
-    reading = preview.readings.get(FPA_READING + band, math.nan)
+    reading = preview.readings.get(camera.FPA_READING + band, math.nan)
     return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
 
-def _metadata(band: str, preview: Preview | None) -> Metadata:
+def _metadata(band: str, preview: Preview | None) -> camera.Metadata:
     """Metadata of a band's last frame, empty without any."""
     frame = preview.frames.get(band) if preview else None
-    return (frame and frame.metadata) or Metadata()
+    return (frame and frame.metadata) or camera.Metadata()
 
 
 def _ffc(band: str, preview: Preview) -> str:
@@ -197,8 +182,8 @@ def _levels(frame: Frame | None) -> dict[str, Any]:
         "limits": (float(low), float(high)),
         "lowest": float(counts.min()),
         "highest": float(counts.max()),
-        "dead": np.count_nonzero(counts == _RANGE.min) / counts.size,
-        "saturated": np.count_nonzero(counts == _RANGE.max) / counts.size,
+        "dead": np.count_nonzero(counts == 0) / counts.size,
+        "saturated": np.count_nonzero(counts == 65535) / counts.size,
     }
 
 
@@ -265,10 +250,8 @@ class View:
         title: str = "recording",
         separation: Separation | None = None,
     ) -> None:
-        self._display = display
+        self._display, self._separation, self._watch = display, separation, Watch()
         self._title = f"{title} (emulated)" if is_simulated else title
-        self._watch = Watch()
-        self._separation = separation
         self._separated: xr.Dataset | None = None
         self._drawn: LiveFigure | None = None
         self._is_shown, self._time = False, -math.inf
@@ -340,7 +323,9 @@ def _temperature(name: str, separated: xr.Dataset | None) -> "Panel":
 
 def _foot(preview: Preview) -> str:
     """Readings that are not of a shown band: of thermocouples, of the blackbody."""
-    used = {prefix + band for prefix in (FPA_READING, FFC_READING) for band in preview.totals}
+    used = {
+        prefix + band for prefix in (camera.FPA_READING, FFC_READING) for band in preview.totals
+    }
     return ", ".join(
         f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"
         for name, value in preview.readings.items()
@@ -349,10 +334,8 @@ def _foot(preview: Preview) -> str:
 
 
 def _reading(name: str, value: float, unit: str) -> str:
-    if name.startswith(FFC_READING):
+    if math.isnan(value) or name.startswith(FFC_READING):
         return _ffc_state(value)
-    if math.isnan(value):
-        return "no answer"
     if unit == "K":
         return _celsius(value)
     return f"{value:g}" if unit == "1" else f"{value:g} {unit}"

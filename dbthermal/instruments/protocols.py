@@ -7,7 +7,7 @@ recording for each filter. `dbthermal.instruments.recording` opens the recording
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import store
 from dbthermal.instruments import recording
-from dbthermal.instruments.camera import Identity, SourceLostError
+from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary
@@ -190,23 +190,23 @@ def record_scene(
     >>> summary.ended, summary.totals["8-14"]["lost"]
     ('duration', 0)
     """
-    identities, expected = devices.identities(), devices.session.filtered
+    expected = devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:
         raise ValueError(f"Invalid filter in the beam. Must be '{expected}': prepare the devices.")
+    options = {"limits": limits, "preview": preview, "stop": stop}
+    return _record(devices, Path(path), begins=True, **options)
+
+
+def _record(devices: Devices, path: Path, *, begins: bool = False, **options: Any) -> Summary:
+    """Record all sources and readings of open devices, with the options of `recording.record`.
+
+    An emulated scene begins with the recording, or stands.
+    """
+    options |= {"readings": devices.readings(), "identities": devices.identities()}
     devices.flush()
-    if devices.world is not None:
+    if begins and devices.world is not None:
         devices.world.begin()
-    return _record(devices, path, identities, limits=limits, preview=preview, stop=stop)
-
-
-def _record(
-    devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
-) -> Summary:
-    """Record all sources and readings of open devices, with the options of `recording.record`."""
-    session, sources, readings = devices.session, devices.sources, devices.readings()
-    return recording.record(
-        session, sources, path, readings=readings, identities=identities, **options
-    )
+    return recording.record(devices.session, devices.sources, path, **options)
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
@@ -234,9 +234,7 @@ def _record_step(
 ) -> Summary:
     """Turn the filter into the beam, and record to the end."""
     selected = devices if band is None else devices.select(band)
-    identities = selected.identities()
-    selected.flush()
-    summary = _record(selected, path, identities, limits=limits, preview=preview)
+    summary = _record(selected, path, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
     recording.require_filter(summary.path, band)

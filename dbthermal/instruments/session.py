@@ -33,9 +33,8 @@ band is one of the filters is behind the wheel. No address names a library: the 
 
 import errno
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -59,26 +58,27 @@ _SCHEMES: Final = {WHEEL: "serial", LOGGER: "tc08"}  # of their addresses
 BLACKBODY: Final = "blackbody"  # name of its thermocouple, and of its readings [K]
 
 
-def _by(check: Callable[[Any], object]) -> AfterValidator:
-    """Validator of a value that a check lets pass."""
-    return AfterValidator(lambda value: (check(value), value)[1])
-
-
-def _check_printable(text: str) -> None:
+def _printable(text: str) -> str:
     if not text.isprintable() or text != text.strip():
         raise ValueError("Must be printable, without space at its ends")
+    return text
+
+
+def _address(scheme: str) -> AfterValidator:
+    """Validator of an address of a scheme."""
+    return AfterValidator(lambda url: (parse(url, (scheme,)), url)[1])
 
 
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(strict=True, ge=200.0, le=2000.0)]  # no degrees Celsius [K]
 Pixels = Annotated[int, Field(strict=True, ge=2, le=8192)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=64)]
-Label = Annotated[str, Field(min_length=1, max_length=64), _by(_check_printable)]
+Label = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
 DeviceName = Literal["filter_wheel", "thermocouples"]
-Video = Annotated[str, _by(partial(parse, schemes=("v4l2",)))]
-Port = Annotated[str, _by(partial(parse, schemes=("serial",)))]
+Video = Annotated[str, _address("v4l2")]
+Port = Annotated[str, _address("serial")]
 
 
 @dataclass(frozen=True, config=_CHECKED)

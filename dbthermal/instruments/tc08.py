@@ -12,12 +12,12 @@ blackbody, and see whether the reading follows.
 import ctypes
 import ctypes.util
 import os
-from collections.abc import Collection, Mapping
+import threading
+from collections.abc import Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
-from dataclasses import dataclass
 from enum import IntFlag
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,7 @@ from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
-__all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
+__all__ = ["ERRORS", "TC08", "Flag", "ReadingError", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
 # A library bound by `load`, or an object with the same functions, such as the emulated one. Where C
@@ -40,8 +40,10 @@ KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
 OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
 POLL: Final = 0.05  # [s] between two progress requests
 
+SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
+
 # Meaning of the library's error numbers; 15 and 16 are often taken for one another.
-ERRORS: Final[Mapping[int, str]] = MappingProxyType(
+ERRORS: Final = MappingProxyType(
     {
         0: "no error",
         1: "the operating system is not supported",
@@ -73,6 +75,10 @@ class TC08Error(RuntimeError):
         self.code = code
 
 
+class ReadingError(RuntimeError):
+    """A thermocouple gave no temperature; a recording notes it and goes on."""
+
+
 class UnitInfo(ctypes.Structure):
     """Identity of a unit as the library writes it: 40 bytes, whose number the caller sets."""
 
@@ -88,7 +94,7 @@ class UnitInfo(ctypes.Structure):
 
 
 # Argument types of the functions that are used; each of them returns 16 bits.
-SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
+SIGNATURES: Final = MappingProxyType(
     {
         "usb_tc08_open_unit_async": [],
         "usb_tc08_open_unit_progress": [POINTER(c_int16), POINTER(c_int16)],
@@ -110,8 +116,7 @@ class Flag(IntFlag):
     OUT_OF_RANGE = 4  # the temperature is not positive
 
 
-@dataclass(frozen=True)
-class Scan:
+class Scan(NamedTuple):
     """A reading of all nine channels, of which index 0 is the cold junction.
 
     `time` is the middle of the scan on the host's clock [s], for the channels are converted one
@@ -124,33 +129,36 @@ class Scan:
 
 
 class TC08(Closing):
-    """A TC-08, for one thread at a time; opened by `from_url` or `open`.
+    """A TC-08, opened by `from_url` or `open`; several threads may `read`.
 
     The `library` is from `load`, or an emulated one.
 
     Examples
     --------
-    >>> from dbthermal.instruments.emulated import tc08, world
-    >>> bench = world.World(blackbody_temperature=310.0)
+    >>> from dbthermal.instruments.emulated import World, devices
+    >>> bench = World(blackbody_temperature=310.0)
     >>> bench.thermocouples[1] = "blackbody"
-    >>> with TC08(tc08.EmulatedTC08(bench.thermocouple_temperature, bench.clock)).open() as logger:
-    ...     logger.set_channels([1])
-    ...     print(f"{logger.single().temperature[1]:.2f} K")
+    >>> unit = devices.EmulatedTC08(bench.thermocouple_temperature, bench.clock)
+    >>> with TC08(unit).open() as logger:
+    ...     logger.set_channels({1: "blackbody"})
+    ...     print(f"{logger.read(1):.2f} K")
     310.00 K
     """
 
     def __init__(self, library: Library) -> None:
         self._library = library
         self.clock: Clock = getattr(library, "clock", SYSTEM)  # an emulated library has its own
+        self.channels: Mapping[int, str] = {}  # place of the tip by channel
         self._handle = 0
-        self._has_channels = False
+        self._lock = threading.Lock()
+        self._scan: Scan | None = None
+        self._used: set[int] = set()  # channels whose value in the scan was given
 
     @classmethod
     def from_url(cls, url: str = "tc08:") -> Self:
         """Load the vendor's library and open the first free unit, at the address ``tc08:``.
 
-        No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
-        another address; else the errors of `load` and `open`.
+        ValueError if it is another address; else the errors of `load` and `open`.
         """
         parse(url, ("tc08",))
         return cls(load()).open()
@@ -168,7 +176,6 @@ class TC08(Closing):
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
-        # The library opens a unit meanwhile.
         if not self._library.usb_tc08_open_unit_async():
             raise self._error("be opened")
         # Wait until its firmware is there.
@@ -181,29 +188,28 @@ class TC08(Closing):
                     "firmware by then: pull it out and plug it in again."
                 )
             self.clock.sleep(POLL)
-        # The result.
+        # What became of it.
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
-            raise ConnectionError(
-                "No TC-08. Must be plugged in, and free: no other program may have it."
-            )
+            rule = "Must be plugged in, and free: no other program may have it"
+            raise ConnectionError(f"No TC-08. {rule}.")
         self._handle = int(handle[0])
         return self
 
     def close(self) -> None:
         """Close the unit, once; TC08Error if the library could not, as after unplugging."""
-        handle, self._handle = self._handle, 0
-        self._has_channels = False
-        if handle and not self._library.usb_tc08_close_unit(handle):
-            raise TC08Error("close", self._library.usb_tc08_get_last_error(handle))
+        if self._handle:
+            try:
+                self._call("close_unit", "close")
+            finally:
+                self._handle, self.channels = 0, {}
 
     def identity(self) -> Identity:
         """Identity of the unit; TC08Error or RuntimeError if the library fails or it is closed."""
         unit = (UnitInfo * 1)()
         unit[0].size = ctypes.sizeof(UnitInfo)
-        if not self._library.usb_tc08_get_unit_info(self._open_handle(), unit):
-            raise self._error("read its identity")
+        self._call("get_unit_info", "read its identity", unit)
         texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
         serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
         return {
@@ -215,44 +221,63 @@ class TC08(Closing):
             "is_simulated": self.is_simulated,
         }
 
-    def set_channels(self, channels: Collection[int]) -> None:
-        """Set the channels that have a thermocouple, of type T, 1 to 8; the rest are switched off.
+    def set_channels(self, channels: Mapping[int, str]) -> None:
+        """Set the channels that have a thermocouple, of type T, 1 to 8, and the places of the tips.
 
-        The cold junction is always read. ValueError for another channel, or none; TC08Error or
-        RuntimeError if the library fails, or the unit is not open.
+        All others are off, but the cold junction. ValueError for another channel, or none;
+        TC08Error or RuntimeError if the library fails, or the unit is not open.
         """
         if not channels:
             raise ValueError("Invalid channels. Must be one at least.")
         for channel in channels:
             if channel not in range(1, CHANNELS):
                 raise ValueError(f"Invalid channel {channel}. Must lie in 1 to {CHANNELS - 1}.")
-        self._has_channels = False  # until all are set
+        self.channels = {}  # until all are set
+        # The cold junction, and a type or off for each socket.
         for channel in range(CHANNELS):
             letter = (KIND if channel in channels else " ") if channel else "C"
-            if not self._library.usb_tc08_set_channel(self._open_handle(), channel, ord(letter)):
-                raise self._error(f"set channel {channel} to '{letter}'")
-        self._has_channels = True
+            action = f"set channel {channel} to '{letter}'"
+            self._call("set_channel", action, channel, ord(letter))
+        self.channels = dict(channels)
+
+    def read(self, channel: int) -> float:
+        """Temperature of a channel [K], never the same measurement twice; a scan serves all.
+
+        `ReadingError` if it is no temperature; else the errors of `single`.
+        """
+        # A scan is used while it is new, and once by each channel.
+        with self.clock.hold(self._lock):
+            scan = self._scan
+            if scan is None or channel in self._used or self.clock() - scan.time > SCAN_AGE:
+                self._scan = scan = self.single()
+                self._used.clear()
+            self._used.add(channel)
+        if scan.flag[channel]:
+            raise ReadingError(
+                f"No temperature of thermocouple '{self.channels[channel]}' in channel {channel}: "
+                f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
+            )
+        return float(scan.temperature[channel])
 
     def single(self) -> Scan:
         """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
 
         TC08Error or RuntimeError if the library fails, the unit is closed, or no channels are set.
         """
-        handle = self._open_handle()
-        if not self._has_channels:
+        if self._handle and not self.channels:
             raise RuntimeError("The TC-08 has no channels yet. Must be set by set_channels first.")
         values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
         start = self.clock()
-        done = self._library.usb_tc08_get_single(handle, values, overflow, KELVIN)
+        self._call("get_single", "take a single reading", values, overflow, KELVIN)
         middle = 0.5 * (start + self.clock())
-        if not done:
-            raise self._error("take a single reading")
         return Scan(middle, *flagged(np.array(values, dtype=np.float64), overflow[0]))
 
-    def _open_handle(self) -> int:
+    def _call(self, function: str, action: str, *arguments: Any) -> None:
+        """Call a function of the library on the open unit; it returns 0 if it fails."""
         if not self._handle:
             raise RuntimeError("The TC-08 is closed. Must be opened first.")
-        return self._handle
+        if not getattr(self._library, f"usb_tc08_{function}")(self._handle, *arguments):
+            raise self._error(action)
 
     def _error(self, action: str) -> TC08Error:
         return TC08Error(action, self._library.usb_tc08_get_last_error(self._handle))

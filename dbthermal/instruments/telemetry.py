@@ -10,9 +10,8 @@ the rows as they came. The meaning of the status bits is not public: the shutter
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.constants import zero_Celsius
@@ -26,42 +25,44 @@ ROWS: Final = 2  # of telemetry on USB: 514 rows of the frame are requested inst
 WORDS: Final = 142  # least number of words that hold all the fields
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(NamedTuple):
     """Position and scale of a number in the row: value = number / steps + zero."""
 
     word: int  # first 16-bit word
-    words: int = 1
-    signed: bool = False  # two's complement
+    dtype: str = ">u2"  # once the bytes of each word are swapped
     steps: int = 0  # per unit; 0 for a plain whole number
     zero: float = 0.0  # value of the number 0
-
-    @property
-    def span(self) -> slice:
-        """Words of the number."""
-        return slice(self.word, self.word + self.words)
 
 
 FIELDS: Final = MappingProxyType(
     {
         "revision": Field(0),
-        "camera_serial": Field(1, 2),
-        "sensor_serial": Field(3, 2),
+        "camera_serial": Field(1, ">u4"),
+        "sensor_serial": Field(3, ">u4"),
         "frame_rate": Field(28),
-        "status": Field(38, 4),
-        "frame_counter": Field(42, 2),
-        "last_ffc_frame": Field(44, 2),
+        "status": Field(38, ">u8"),
+        "frame_counter": Field(42, ">u4"),
+        "last_ffc_frame": Field(44, ">u4"),
         "fpa_temperature": Field(47, steps=10),
         "last_ffc_temperature": Field(48, steps=10),
-        "pipeline": Field(55, 2),
+        "pipeline": Field(55, ">u4"),
         "ffc_frames": Field(57),
         "nuc_table": Field(79),
         "desired_nuc_table": Field(80),
-        "core_temperature": Field(81, 2, signed=True, steps=1000, zero=zero_Celsius),
-        "uptime": Field(140, 2, steps=1000),
+        "core_temperature": Field(81, ">i4", steps=1000, zero=zero_Celsius),
+        "uptime": Field(140, ">u4", steps=1000),
     }
 )
 """Rates in Hz, temperatures in kelvin, times in seconds; counters count frames."""
+
+_ROW = np.dtype(
+    {
+        "names": [*FIELDS],
+        "formats": [field.dtype for field in FIELDS.values()],
+        "offsets": [2 * field.word for field in FIELDS.values()],
+        "itemsize": 2 * WORDS,
+    }
+)
 
 
 def decode(rows: Counts) -> dict[str, float]:
@@ -70,12 +71,11 @@ def decode(rows: Counts) -> dict[str, float]:
     Any content is read as if it were telemetry: there is no checksum. TypeError or ValueError if
     the rows are not of uint16, or hold fewer than `WORDS` words.
     """
-    words, values = _checked(rows), dict[str, float]()
-    for name, field in FIELDS.items():
-        data = words[field.span].astype(">u2").tobytes()
-        number = int.from_bytes(data, "big", signed=field.signed)
-        values[name] = number / field.steps + field.zero if field.steps else number
-    return values
+    (numbers,) = _checked(rows)[:WORDS].astype(">u2").view(_ROW).tolist()
+    return {
+        name: number / field.steps + field.zero if field.steps else number
+        for (name, field), number in zip(FIELDS.items(), numbers, strict=True)
+    }
 
 
 def metadata(rows: Counts) -> Metadata:
@@ -90,16 +90,15 @@ def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Count
 
     ValueError if these are too few, or a value does not fit its field.
     """
-    words = _checked(np.zeros(rows * columns, dtype=np.uint16))
+    words, row = _checked(np.zeros(rows * columns, dtype=np.uint16)), np.zeros(1, _ROW)
     for name, value in values.items():
         field = FIELDS[name]
         number = round((value - field.zero) * field.steps) if field.steps else int(value)
         try:
-            data = number.to_bytes(2 * field.words, "big", signed=field.signed)
+            row[name] = number
         except OverflowError as error:
-            rule = f"Must fit {field.words} words: {error}"
-            raise ValueError(f"Invalid {name} of {number} steps. {rule}.") from error
-        words[field.span] = np.frombuffer(data, ">u2")
+            raise ValueError(f"Invalid {name} of {number} steps. Must fit: {error}.") from error
+    words[:WORDS] = row.view(">u2")
     return words.reshape(rows, columns)
 
 

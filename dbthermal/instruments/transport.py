@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
 
 from dbthermal import _text as texts
@@ -25,11 +25,11 @@ __dir__ = __all__.copy
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 
-EMULATORS: Final = MappingProxyType(
-    {"boson": "dbthermal.instruments.emulated.camera", "apt": "dbthermal.instruments.emulated.apt"}
-)
-"""Module of each emulator, imported when it is started: its ``start(name, world)`` returns a
-`Transport`."""
+# Module of each emulator, imported when it is started by its ``start(name, world)``.
+EMULATORS: Final[Mapping[str, str]] = {
+    "boson": "dbthermal.instruments.emulated.camera",
+    "apt": "dbthermal.instruments.emulated.devices",
+}
 
 _NODE = r"/dev/(?!\S*\.\.)[^\s?#\\]+"
 
@@ -96,7 +96,7 @@ class TransportError(OSError):
 
 
 class Transport(Protocol):
-    """A line to a device; each method raises `TransportError` if the device is gone."""
+    """A line to a device, on its clock; each method raises `TransportError` if it is gone."""
 
     is_simulated: bool  # True if the device is emulated
 
@@ -115,13 +115,12 @@ class Transport(Protocol):
 
 
 class SerialTransport(Closing):
-    """An open serial port of pyserial, see `open_serial`; `url` is its name in messages."""
+    """A `Transport` over an open port of pyserial; `url` is its name in messages."""
 
     is_simulated, clock = False, SYSTEM
 
     def __init__(self, port: "serial.Serial", url: str) -> None:
-        self.url = url
-        self._port = port
+        self.url, self._port = url, port
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
@@ -169,27 +168,23 @@ def open_serial(
     emulator pass for hardware; TransportError if the port cannot be opened.
     """
     scheme, path, name = parse(url, ("serial", "sim"))
-    # An emulator.
     if scheme == "sim":
         if path not in EMULATORS:
             rule = f"Must be one of {sorted(EMULATORS)} after sim://"
             raise ValueError(f"Invalid address '{url}'. {rule}.")
         emulated: Transport = importlib.import_module(EMULATORS[path]).start(name, world)
         return emulated
-    # A serial port.
     if Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
 
     import serial  # noqa: PLC0415 - an optional package, which cameras without a port do without
 
+    options = {"rtscts": rtscts, "exclusive": True, "write_timeout": WRITE_TIMEOUT}
     try:
-        port = serial.Serial(
-            path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
-        )
+        port = serial.Serial(path, baudrate, **options)
     except OSError as error:
         rule = "It must exist, be yours to use, and in no other program's use"
         raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
-    # Its flow control.
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:

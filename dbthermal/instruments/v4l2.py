@@ -23,19 +23,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from dbthermal.instruments.camera import (
-    DAMAGED,
-    FRAME_TIMEOUT,
-    GOOD,
-    CameraKind,
-    Counts,
-    Frame,
-    FrameFlag,
-    Metadata,
-    NoFrameError,
-    SourceLostError,
-    Stream,
-)
+from dbthermal.instruments import camera
+from dbthermal.instruments.camera import Counts, Frame, FrameFlag, Metadata, Stream
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
@@ -65,9 +54,10 @@ FORMAT = struct.Struct("=I4xIIIIIII172x")
 REQUEST = struct.Struct("=III8x")
 BUFFER = struct.Struct("=IIIII4xqq16xIIQI12x")
 PARAMETERS = struct.Struct("=IIIIIII176x")
+_TYPE = struct.Struct("=I")
 
-CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
-MMAP: Final = 1  # V4L2_MEMORY_MMAP
+_CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+_MMAP: Final = 1  # V4L2_MEMORY_MMAP
 _PROGRESSIVE: Final = 1  # V4L2_FIELD_NONE
 _CAPTURES: Final = 0x04000001  # V4L2_CAP_VIDEO_CAPTURE | V4L2_CAP_STREAMING
 _ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
@@ -75,9 +65,7 @@ _CLOCK_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
 _MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
 _GONE: Final = (errno.ENODEV, errno.EIO)
 _BYTES: Final = 2  # of a pixel
-_MICRO: Final = 1e-6
 _RATE_TOLERANCE: Final = 1e-3
-_TYPE: Final = struct.pack("=I", CAPTURE)
 
 Decode = Callable[[Counts], Metadata]
 
@@ -97,14 +85,15 @@ class Kernel:
     select: Callable[..., tuple[Sequence[Any], Sequence[Any], Sequence[Any]]] = select.select
     clock: Clock = SYSTEM
 
-    def ask(self, file: int, number: int, argument: bytearray) -> None:
-        """Call `ioctl`, again where a signal came between; OSError if the kernel refuses."""
+    def ask(self, file: int, number: int, layout: struct.Struct, *values: Any) -> tuple[Any, ...]:
+        """Answer to a call, made again where a signal came between; OSError if it is refused."""
+        argument = bytearray(layout.pack(*values))
         while True:
             try:
                 self.ioctl(file, number, argument)
             except InterruptedError:
                 continue
-            return
+            return layout.unpack(argument)
 
 
 class Capture(Closing):
@@ -121,70 +110,101 @@ class Capture(Closing):
     def __init__(
         self, path: str, stream: Stream, kernel: Kernel | None = None, decode: Decode | None = None
     ) -> None:
-        self.path, self.stream = path, stream
+        self.path, self.stream, self._decode = path, stream, decode
         self.shape, self.frame_rate = stream.shape, stream.frame_rate
         self.telemetry_rows = stream.telemetry_rows
         self._kernel = kernel or Kernel()
-        self.clock, self._decode = self._kernel.clock, decode
+        self.clock = self._kernel.clock
         self._maps: list[Any] = []
         self._file: int | None = self._kernel.open(path, os.O_RDWR | os.O_NONBLOCK)
         try:
-            self.identity: Mapping[str, str] = {"device": path, **self._agree(self._file)}
-            self._map_buffers(self._file)
-            self._kernel.ask(self._file, STREAMON, bytearray(_TYPE))
+            self.identity: Mapping[str, str] = {"device": path, **self._capability()}
+            self._agree()
+            # Buffers, as many as the kernel grants, all of them queued.
+            (count, *_) = self._ask(REQBUFS, REQUEST, BUFFERS, _CAPTURE, _MMAP)
+            for index in range(count):
+                offset, length = self._ask(QUERYBUF, BUFFER, *_buffer(index))[9:]
+                self._maps.append(self._kernel.map(self._file, length, offset))
+                self._ask(QBUF, BUFFER, *_buffer(index))
+            self._ask(STREAMON, _TYPE, _CAPTURE)
         except BaseException:
             self.close()
             raise
 
-    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+    def read(self, timeout: float = camera.FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame, a copy; see `camera.FrameSource.read`."""
         if self._file is None:
-            raise SourceLostError(f"No frames from '{self.path}': it is closed.")
-        file, buffer, clock = self._file, _buffer(0), self.clock
-        deadline = clock() + timeout
-        while self._kernel.select([file], [], [], max(0.0, deadline - clock()))[0]:
-            if self._taken(file, buffer):
-                break
-        else:
-            raise NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
-        try:
-            return self._frame(buffer, clock())
-        finally:
-            self._give_back(file, buffer)
+            raise camera.SourceLostError(f"No frames from '{self.path}': it is closed.")
+        deadline = self.clock() + timeout
+        # Until a frame is announced, and is there.
+        while self._kernel.select([self._file], [], [], max(0.0, deadline - self.clock()))[0]:
+            try:
+                buffer = self._ask(DQBUF, BUFFER, *_buffer(0))
+            except BlockingIOError:
+                continue  # announced, and missing
+            except OSError as error:
+                if error.errno not in _GONE:
+                    raise
+                text = f"No more frames from '{self.path}': {error.strerror}."
+                raise camera.SourceLostError(text) from error
+            # A copy of it; the buffer goes back to the kernel whatever happens.
+            try:
+                return self._frame(buffer, self.clock())
+            finally:
+                self._give_back(buffer[0])
+        raise camera.NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
 
     def close(self) -> None:
         """Stop the stream and close the node; a second call does nothing."""
         if self._file is None:
             return
-        file, self._file = self._file, None
         try:
-            self._kernel.ask(file, STREAMOFF, bytearray(_TYPE))
+            self._ask(STREAMOFF, _TYPE, _CAPTURE)
         except OSError as error:
             if error.errno != errno.ENODEV:  # unplugged: nothing is left to stop
                 raise
         finally:
+            file, self._file = self._file, None
             for mapped in self._maps:
                 mapped.close()
             self._maps.clear()
             self._kernel.close(file)
 
-    def _agree(self, file: int) -> dict[str, str]:
-        """Set format and rate; a driver sets the nearest that it can, which is an error here."""
-        # The node must give video in the format.
-        captures, identity = _capability(file, self._kernel)
-        offered = _formats(file, self._kernel) if captures else []
+    def _ask(self, number: int, layout: struct.Struct, *values: Any) -> tuple[Any, ...]:
+        if self._file is None:
+            raise camera.SourceLostError(f"No frames from '{self.path}': it is closed.")
+        return self._kernel.ask(self._file, number, layout, *values)
+
+    def _capability(self) -> dict[str, str]:
+        """Identity of the node, which must give video in the format."""
+        *texts, version, _, node = self._ask(QUERYCAP, CAPABILITY, b"", b"", b"", 0, 0, 0)
+        offered: list[int] = []
+        while node & _CAPTURES == _CAPTURES:  # others of a camera's nodes give metadata
+            try:
+                entry = self._ask(ENUM_FMT, FORMAT_ENTRY, len(offered), _CAPTURE, 0, b"", 0)
+            except OSError as error:
+                if error.errno == errno.EINVAL:  # the end of the list
+                    break
+                raise
+            offered.append(entry[4])
+        # It must offer the format.
         if Y16 not in offered:
-            names = [
-                code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered
-            ]
+            codes = [code.to_bytes(4, "little") for code in offered]
+            names = [code.decode("ascii", "backslashreplace") for code in codes]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
+        driver, model, bus = (
+            raw.rstrip(b"\0").decode("utf-8", "backslashreplace") for raw in texts
+        )
+        release = f"{version >> 16}.{version >> 8 & 0xFF}.{version & 0xFF}"
+        return {"model": model, "bus": bus, "driver": f"{driver} {release}"}
+
+    def _agree(self) -> None:
+        """Set format and rate; a driver sets the nearest that it can, which is an error here."""
         # The format, with every row.
         rows, columns = self.stream.rows, self.shape[1]
         line = _BYTES * columns
         wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
-        argument = bytearray(FORMAT.pack(CAPTURE, *wanted, 0))
-        self._kernel.ask(file, S_FMT, argument)
-        agreed = FORMAT.unpack(argument)[1:7]
+        agreed = self._ask(S_FMT, FORMAT, _CAPTURE, *wanted, 0)[1:7]
         if agreed != wanted:
             raise ValueError(
                 f"Invalid format of '{self.path}': {agreed} (columns, rows, code, field, bytes of "
@@ -192,61 +212,41 @@ class Capture(Closing):
             )
         # The rate.
         rate = self.frame_rate
-        argument = bytearray(PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(1000 * rate), 0, 0))
-        self._kernel.ask(file, S_PARM, argument)
-        numerator, denominator = PARAMETERS.unpack(argument)[3:5]
+        period = 1000, round(1000 * rate)
+        numerator, denominator = self._ask(S_PARM, PARAMETERS, _CAPTURE, 0, 0, *period, 0, 0)[3:5]
         if numerator == 0 or abs(denominator / numerator - rate) > _RATE_TOLERANCE * rate:
-            raise ValueError(
-                f"Invalid frame period {numerator}/{denominator} s of '{self.path}'. "
-                f"Must be 1/{rate} s."
-            )
-        return identity
+            period_text = f"Invalid frame period {numerator}/{denominator} s of '{self.path}'"
+            raise ValueError(f"{period_text}. Must be 1/{rate} s.")
 
-    def _map_buffers(self, file: int) -> None:
-        request = bytearray(REQUEST.pack(BUFFERS, CAPTURE, MMAP))
-        self._kernel.ask(file, REQBUFS, request)
-        for index in range(REQUEST.unpack(request)[0]):
-            buffer = _buffer(index)
-            self._kernel.ask(file, QUERYBUF, buffer)
-            offset, length = BUFFER.unpack(buffer)[9:11]
-            self._maps.append(self._kernel.map(file, length, offset))
-            self._kernel.ask(file, QBUF, buffer)
-
-    def _taken(self, file: int, buffer: bytearray) -> bool:
-        """Take the buffer of a frame; False if it was announced but is missing."""
+    def _give_back(self, index: int) -> None:
         try:
-            self._kernel.ask(file, DQBUF, buffer)
-        except BlockingIOError:
-            return False
-        except OSError as error:
-            if error.errno in _GONE:
-                text = f"No more frames from '{self.path}': {error.strerror}."
-                raise SourceLostError(text) from error
-            raise
-        return True
-
-    def _give_back(self, file: int, buffer: bytearray) -> None:
-        try:
-            self._kernel.ask(file, QBUF, buffer)
+            self._ask(QBUF, BUFFER, *_buffer(index))
         except OSError as error:
             if error.errno not in _GONE:  # else the next `read` reports the loss
                 raise
 
-    def _frame(self, buffer: bytearray, host_time: float) -> Frame:
+    def _frame(self, buffer: tuple[int, ...], host_time: float) -> Frame:
         """Copy a frame out of its buffer and translate the kernel's flags."""
-        index, _, used, state, _, seconds, micros, sequence, *_ = BUFFER.unpack(buffer)
+        index, _, used, state, _, seconds, micros, sequence, *_ = buffer
+        # The image, with zeros in place of missing bytes.
         image = np.zeros((self.stream.rows, self.shape[1]), dtype="<u2")
         size = min(used, image.nbytes)
         image.reshape(-1).view(np.uint8)[:size] = np.frombuffer(self._maps[index], np.uint8, size)
-        flags = FrameFlag.DRIVER_ERROR if state & _ERROR else GOOD
-        flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else GOOD
-        flags |= FrameFlag.FOREIGN_CLOCK if state & _CLOCK_MASK != _MONOTONIC else GOOD
+        # The state of the frame and of its stamp.
+        flags = FrameFlag.DRIVER_ERROR if state & _ERROR else camera.GOOD
+        flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else camera.GOOD
+        flags |= FrameFlag.FOREIGN_CLOCK if state & _CLOCK_MASK != _MONOTONIC else camera.GOOD
+        # Image and telemetry apart.
         counts, rows, metadata = image.astype(np.uint16, copy=False), None, None
         if self.telemetry_rows:
             counts, rows = counts[: self.shape[0]], counts[self.shape[0] :]
-            metadata = self._decode(rows) if self._decode and not flags & DAMAGED else None
-        stamp = seconds + _MICRO * micros
-        return Frame(counts, stamp, host_time, sequence, flags, rows, metadata)
+            metadata = self._decode(rows) if self._decode and not flags & camera.DAMAGED else None
+        return Frame(counts, seconds + 1e-6 * micros, host_time, sequence, flags, rows, metadata)
+
+
+def _buffer(index: int) -> tuple[int, ...]:
+    """Argument for a buffer of this number, see `BUFFER`."""
+    return index, _CAPTURE, 0, 0, 0, 0, 0, 0, _MMAP, 0, 0
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
@@ -260,33 +260,4 @@ def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
     return Capture(node, stream, decode=decode)
 
 
-KIND: Final = CameraKind(open_url)  # of a session's ``kind: y16``
-
-
-def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:
-    """True if the node captures video (others of a camera give metadata), and its identity."""
-    capability = bytearray(CAPABILITY.size)
-    kernel.ask(file, QUERYCAP, capability)
-    *texts, version, _, node = CAPABILITY.unpack(capability)
-    driver, card, bus = (text.rstrip(b"\0").decode("utf-8", "backslashreplace") for text in texts)
-    release = f"{version >> 16}.{version >> 8 & 0xFF}.{version & 0xFF}"
-    identity = {"model": card, "bus": bus, "driver": f"{driver} {release}"}
-    return node & _CAPTURES == _CAPTURES, identity
-
-
-def _formats(file: int, kernel: Kernel) -> list[int]:
-    codes: list[int] = []
-    while True:
-        entry = bytearray(FORMAT_ENTRY.pack(len(codes), CAPTURE, 0, b"", 0))
-        try:
-            kernel.ask(file, ENUM_FMT, entry)
-        except OSError as error:
-            if error.errno == errno.EINVAL:  # the end of the list
-                return codes
-            raise
-        codes.append(FORMAT_ENTRY.unpack(entry)[4])
-
-
-def _buffer(index: int) -> bytearray:
-    """Argument for a buffer of this number."""
-    return bytearray(BUFFER.pack(index, CAPTURE, 0, 0, 0, 0, 0, 0, MMAP, 0, 0))
+KIND: Final = camera.CameraKind(open_url)  # of a session's ``kind: y16``

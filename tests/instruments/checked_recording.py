@@ -12,7 +12,7 @@ from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
 
 from dbthermal import store
 from dbthermal.instruments.camera import DAMAGED, UNTIMED, Counts, Frame, FrameFlag
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Reading, notes, record
 
 SHAPE, RATE, MILLI = (16, 24), 100.0, 1e-3

@@ -8,7 +8,7 @@ from faulty_devices import Fault, FaultyApt, FaultyBoson, FaultyTC08
 
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.clock import EmulatedClock
-from dbthermal.instruments.emulated.world import Line, World
+from dbthermal.instruments.emulated import Line, World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
@@ -93,5 +93,5 @@ class LoggerBench:
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""
-        self.driver.open().set_channels([1, 2])
+        self.driver.open().set_channels({1: "plate", 2: "room"})
         return self.driver

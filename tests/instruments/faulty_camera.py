@@ -15,8 +15,8 @@ from dbthermal.instruments.camera import (
     FrameSource,
     NoFrameError,
 )
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Camera, Session
 
 LIMITS = np.iinfo(np.uint16)

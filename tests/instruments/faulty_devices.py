@@ -15,10 +15,9 @@ from typing import Any
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.emulated.apt import Drive, EmulatedApt
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.tc08 import EmulatedTC08, Numbers
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
 
 
 @dataclass
@@ -76,7 +75,7 @@ class FaultyApt(EmulatedApt):
 
     def turn_to(self, position: int) -> None:
         """Begin a move to a place [count] without the driver."""
-        data = apt.Position(1, position).pack()
+        data = apt.pack(apt.Position(1, position))
         self.receive(apt.command(Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
 
     def obey(self, message: apt.Message) -> None:
@@ -90,10 +89,10 @@ class FaultyApt(EmulatedApt):
             faults.notice = ""
             self.reply(Id.HW_RICHRESPONSE, notice)
         if message.id == Id.MOT_SET_VELPARAMS and faults.weak != 1.0:
-            speeds = apt.VelocityParameters.parse(message)
-            weak = [round(faults.weak * v) for v in (speeds.acceleration, speeds.maximum)]
-            data = replace(speeds, acceleration=weak[0], maximum=weak[1]).pack()
-            message = replace(message, data=data)
+            speeds = apt.parse(apt.Speeds, message)
+            weak = [round(faults.weak * v) for v in (speeds.acceleration, speeds.velocity)]
+            data = apt.pack(speeds._replace(acceleration=weak[0], velocity=weak[1]))
+            message = message._replace(data=data)
         super().obey(message)
 
     def poll(self) -> list[bytes]:
@@ -127,7 +126,7 @@ class FaultyApt(EmulatedApt):
     def report(self, identifier: Id) -> None:
         """Report the end of a motion, in another form or not at all by a fault."""
         if self.faults.long_reports and identifier != Id.MOT_MOVE_HOMED:
-            self.reply(identifier, self.status().pack())
+            self.reply(identifier, apt.pack(self.status()))
         elif not self.faults.unreported:
             super().report(identifier)
 
@@ -151,7 +150,7 @@ class FaultyApt(EmulatedApt):
         """State with bits that stick."""
         status = super().status()
         stuck = [StatusBits[name] for name in self.faults.stuck.split("|") if name]
-        return replace(status, bits=status.bits | sum(stuck))
+        return status._replace(bits=status.bits | sum(stuck))
 
 
 def request(sequence: int, command: int, data: bytes = b"", *, status: int = fslp.REQUEST) -> bytes:

@@ -26,8 +26,8 @@ from dbthermal.instruments.boson import (
 )
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.clock import SYSTEM
+from dbthermal.instruments.emulated import FFC_DURATION, Line, World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.world import FFC_DURATION, Line, World
 from dbthermal.instruments.transport import TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
@@ -151,7 +151,12 @@ ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED 
         (SERIAL, MUTE, BosonTimeoutError, "No reply to 'serial number' within 1 s"),
         (SERIAL, ENDLESS, BosonReplyError, "within 65536 bytes"),
         (SERIAL, reply(1, FPA, b"\x01\x7c"), BosonReplyError, "Must be of command 0x00050002"),
-        (SERIAL, reply(1, SERIAL, b"\0\1"), BosonReplyError, "number of 2 bytes. Must have 4"),
+        (
+            SERIAL,
+            reply(1, SERIAL, b"\0\1"),
+            BosonReplyError,
+            "of 2 bytes to .* Must have 4",
+        ),
         (SERIAL, reply(1, SERIAL, status=0x283), BosonStatusError, "0x283, camera busy"),
         (SERIAL, reply(1, SERIAL, status=0x6A4), BosonStatusError, "0x6A4, flash"),
         (SERIAL, reply(1, SERIAL, status=0x999), BosonStatusError, "0x999, unknown"),

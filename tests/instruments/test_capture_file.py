@@ -192,8 +192,8 @@ def test_full_disk_leaves_what_was_written(tmp_path: Path, monkeypatch: pytest.M
 
 def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
     """Values that a field can hold."""
-    lowest = -(1 << 16 * field.words - 1) if field.signed else 0
-    every = st.integers(lowest, lowest + (1 << 16 * field.words) - 1)
+    limits = np.iinfo(field.dtype)
+    every = st.integers(int(limits.min), int(limits.max))
     return every.map(lambda number: number / field.steps + field.zero) if field.steps else every
 
 

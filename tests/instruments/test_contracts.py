@@ -151,14 +151,14 @@ def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
 def test_a_logger_reads_a_room(opened: Opened) -> None:
     """Cold junction and tip have temperatures that rooms have; a socket that is off has none."""
     logger: TC08 = opened.device
-    logger.set_channels([1])
+    logger.set_channels({1: "plate"})
     scan = logger.single()
     assert 273.0 < scan.temperature[0] < 320.0
     assert 200.0 < scan.temperature[1] < 400.0
     assert list(scan.flag[:3]) == [0, 0, Flag.MISSING]
     assert np.isnan(scan.temperature[2])
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
-        logger.set_channels([9])
+        logger.set_channels({9: "tip"})
 
 
 @opens(*VIDEOS)

@@ -9,13 +9,9 @@ from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 from dbthermal.instruments import boson
 from dbthermal.instruments.boson import Boson, Ir16Mode, Switch
 from dbthermal.instruments.camera import FfcMode, FfcStatus
-from dbthermal.instruments.devices import (
-    Devices,
-    ReadingError,
-    Thermocouples,
-    open_devices,
-)
+from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.filterwheel import NotHomedError
+from dbthermal.instruments.tc08 import ReadingError
 from dbthermal.instruments.transport import TransportError
 
 
@@ -54,7 +50,7 @@ def test_whole_rig_is_closed() -> None:
         with pytest.raises(ConnectionError, match="it is closed"):
             source.read()
     with pytest.raises(RuntimeError, match="closed"):
-        devices.thermocouples.logger.identity()
+        devices.thermocouples.identity()
 
 
 def test_readings_are_named(devices: Devices) -> None:
@@ -136,7 +132,7 @@ def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
 def test_one_scan_gives_all_channels_once() -> None:
     """One scan of the logger serves all channels, and each value is read once."""
     bench = LoggerBench()
-    thermocouples = Thermocouples(bench.ready(), {1: "plate", 2: "room"})
+    thermocouples = bench.ready()
 
     def read(channel: int, rise: float) -> float:
         """Reading of a channel [K] where the tips are warmer than at first by a rise [K]."""

@@ -10,9 +10,9 @@ from device_benches import Clock
 from faulty_camera import frames
 
 from dbthermal.instruments import telemetry
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated import camera as emulated
 from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
-from dbthermal.instruments.emulated.world import World
 
 SHAPE, RATE = (8, 80), 10.0
 

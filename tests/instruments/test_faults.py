@@ -21,7 +21,7 @@ from faulty_devices import Fault
 from dbthermal import store
 from dbthermal.instruments.boson import Boson, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
-from dbthermal.instruments.devices import Devices, Thermocouples
+from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.filterwheel import FilterWheel, NoReplyError
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
@@ -168,8 +168,7 @@ def read_beside_frames(device: Instrument) -> Read:
     session = two_bands(1.0, SHAPE, RATE)
     if isinstance(device, Boson):
         return Devices(session, {}, {"9.5": device}).readings()["fpa 9.5"].read
-    tips = Thermocouples(device, {1: "tip"})
-    return Devices(session, {}, thermocouples=tips).readings()["tip"].read
+    return Devices(session, {}, thermocouples=device).readings()["plate"].read
 
 
 @pytest.mark.parametrize("name", TROUBLES)

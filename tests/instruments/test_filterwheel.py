@@ -11,8 +11,8 @@ from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal.instruments.emulated.apt import EmulatedApt
-from dbthermal.instruments.emulated.world import Line, World
+from dbthermal.instruments.emulated import Line, World
+from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
@@ -161,7 +161,8 @@ def test_dialogue_of_a_move() -> None:
     ]
     with Dialogue([*PAIRS, *talk]) as dialogue:
         wheel = FilterWheel(dialogue, FILTERS)
-        assert wheel.connect().model == "BSC201"
+        wheel.connect()
+        assert wheel.identity()["model"] == "BSC201"
         wheel.move_to(2)
 
 
@@ -363,7 +364,7 @@ def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench.world.wheel_position == wheel.position() == 3
     with pytest.raises(StalledWheelError, match="did not start"):
         wheel.move_to(6)
-    monkeypatch.setattr("dbthermal.instruments.filterwheel.REPLY_TIMEOUT", 1.5)
+    monkeypatch.setattr("dbthermal.instruments._controller.REPLY_TIMEOUT", 1.5)
     patient.homed().move_to(6)
     assert patient.world.wheel_position == 6
 

@@ -14,8 +14,8 @@ from contextlib import contextmanager
 import pytest
 from device_benches import FILTERS, WheelBench
 
+from dbthermal.instruments.emulated import Line, World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.world import Line, World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 
 RACK, CHANNEL = {"dest": 0x11}, {"dest": 0x21, "chan_ident": 1}

@@ -27,7 +27,7 @@ from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
 
 QUICKLY = ("window: 3", "window: 0.02")

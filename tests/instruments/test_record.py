@@ -14,7 +14,7 @@ from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
 
 from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, FrameSource
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, notes, open_capture, record
 from dbthermal.instruments.session import Camera, Session
 

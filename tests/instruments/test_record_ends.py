@@ -16,7 +16,7 @@ from test_signals import LIMIT, written
 from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag
 from dbthermal.instruments.clock import EmulatedClock
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Preview, notes, open_capture, record
 
 

@@ -17,7 +17,7 @@ import pytest
 from faulty_camera import two_bands, two_cameras
 
 from dbthermal.instruments.clock import SYSTEM
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import record
 
 SHAPE, RATE, MINUTE = (512, 640), 60.0, 60.0

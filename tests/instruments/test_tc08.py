@@ -54,7 +54,7 @@ def test_unit_is_opened_and_closed(rig: LoggerBench) -> None:
     assert (info["is_simulated"], info["calibration_date"]) == (True, "01Jan00")
     with pytest.raises(RuntimeError, match="open already"):
         rig.driver.open()
-    for channels in ([0], [9], []):
+    for channels in ({0: "a"}, {9: "a"}, {}):
         with pytest.raises(ValueError, match=r"channel \d\. Must lie in|Must be one at"):
             rig.driver.set_channels(channels)
     with pytest.raises(RuntimeError, match="Must be set by set_channels first"):
@@ -175,10 +175,10 @@ def test_types_of_a_real_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv(tc08.ENVIRONMENT, compiled(tmp_path, STUB))
     with TC08.from_url("tc08:") as driver:
         assert not driver.is_simulated
-        driver.set_channels([2, 8])
+        driver.set_channels({2: "plate", 8: "room"})
         info, scan = driver.identity(), driver.single()
         with pytest.raises(TC08Error, match="set channel 1 to 'T': error 16"):
-            driver.set_channels([1])
+            driver.set_channels({1: "plate"})
     assert (info["serial_number"], info["calibration_date"]) == ("STUB/00/123", "01Jan2000")
     assert (info["driver"], info["variant"]) == ("2.0.17.1441", "8")
     assert (scan.temperature[0], scan.temperature[2]) == (290.0, 292.0)

@@ -13,7 +13,7 @@ from dbthermal.instruments import v4l2
 from dbthermal.instruments.camera import FrameFlag, Stream
 from dbthermal.instruments.clock import Task
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.world import FFC_DURATION
+from dbthermal.instruments.emulated import FFC_DURATION
 from dbthermal.instruments.protocols import record_scene
 from dbthermal.instruments.recording import Limits, Preview, notes, open_capture
 from dbthermal.instruments.session import Session

@@ -9,7 +9,7 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import simulation, store
 from dbthermal.emissivity import embedded_table
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from reproduction.experiments import emulated_rig
 from reproduction.experiments.emulated_bench import Bench
 

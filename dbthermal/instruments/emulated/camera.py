@@ -14,6 +14,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -25,17 +26,9 @@ from dbthermal import simulation
 from dbthermal.bands import FILTERS
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import boson, telemetry
-from dbthermal.instruments.camera import (
-    FRAME_TIMEOUT,
-    GOOD,
-    Counts,
-    FfcMode,
-    FfcStatus,
-    Frame,
-    NoFrameError,
-    SourceLostError,
-)
-from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, Device, Line, World
+from dbthermal.instruments import camera as interface
+from dbthermal.instruments.camera import Counts, FfcMode, FfcStatus, Frame
+from dbthermal.instruments.emulated import SERIAL_NUMBERS, Device, Line, World
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 
@@ -53,8 +46,7 @@ corrections that it starts by itself [s]."""
 
 # Statuses of `boson.STATUSES` with which it refuses.
 _STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
-# Number of the states of each setting, which are numbered from 0.
-_CHOICES = {setting.set_command: len(setting.kind.__members__) for setting in boson.SETTINGS}
+_CHOICES = {setting.set_command: [*setting.kind.__members__.values()] for setting in boson.SETTINGS}
 
 
 @dataclass
@@ -95,7 +87,7 @@ class EmulatedCamera(Closing):
         """Give no more frames; a second call does nothing."""
         self._open = False
 
-    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+    def read(self, timeout: float = interface.FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame; see `camera.FrameSource.read`."""
         if self._start is None:
             self._start = self.world.time + self._state.phase / self.frame_rate
@@ -104,12 +96,16 @@ class EmulatedCamera(Closing):
         wait = due - self.world.time
         if wait > timeout:
             self.clock.sleep(timeout)
-            raise NoFrameError(f"No frame from emulated camera '{self.name}' in {timeout} s.")
+            raise interface.NoFrameError(
+                f"No frame from emulated camera '{self.name}' in {timeout} s."
+            )
         if wait > 0:
             self.clock.sleep(wait)
         if not (self._open and self._state.plugged):
             state = "it is unplugged" if self._open else "it is closed"
-            raise SourceLostError(f"No more frames from emulated camera '{self.name}': {state}.")
+            raise interface.SourceLostError(
+                f"No more frames from emulated camera '{self.name}': {state}."
+            )
         number, self._number = self._number, self._number + 1
         return self.frame(number, due)
 
@@ -125,12 +121,25 @@ class EmulatedCamera(Closing):
             if due >= max(self._state.ffc_until, 0.0) + MODELS[self.kind][1]:
                 self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
+        # The image, unless the shutter is closed.
         if not frozen:
             self._last = self.image(due)
-        rows = self._telemetry(due) if self.telemetry_rows else None
-        metadata = None if rows is None else telemetry.metadata(rows)
+        # The telemetry.
+        rows = metadata = None
+        if self.telemetry_rows:
+            values = {
+                "camera_serial": self._state.serial_number,
+                "frame_rate": round(self.frame_rate),
+                "frame_counter": self._state.frame_count,
+                "last_ffc_frame": self._state.last_ffc_frame,
+                "fpa_temperature": self._state.fpa_temperature,
+                "last_ffc_temperature": self._state.last_ffc_temperature,
+                "uptime": due,
+            }
+            rows = telemetry.encode(values, self.shape[1], self.telemetry_rows)
+            metadata = telemetry.metadata(rows)
         stamp, now = self.world.epoch + due, self.world.clock()
-        return Frame(self._last.copy(), stamp, now, number, GOOD, rows, metadata)
+        return Frame(self._last.copy(), stamp, now, number, interface.GOOD, rows, metadata)
 
     def image(self, time: float) -> Counts:
         """Counts through the filter in the beam at a time since the world began [s]."""
@@ -147,19 +156,6 @@ class EmulatedCamera(Closing):
             )
         return image
 
-    def _telemetry(self, time: float) -> Counts:
-        state = self._state
-        values = {
-            "camera_serial": state.serial_number,
-            "frame_rate": round(self.frame_rate),
-            "frame_counter": state.frame_count,
-            "last_ffc_frame": state.last_ffc_frame,
-            "fpa_temperature": state.fpa_temperature,
-            "last_ffc_temperature": state.last_ffc_temperature,
-            "uptime": time,
-        }
-        return telemetry.encode(values, self.shape[1], self.telemetry_rows)
-
 
 def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
@@ -168,7 +164,6 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
     """
-    # Bands with a filter that is known.
     names = dict.fromkeys((*session.bands, *session.filters.values()))
     bands = tuple(name for name in names if name in FILTERS)
     if not bands:
@@ -178,19 +173,18 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
     response = rig.response()
 
-    # A picture of the blackbody in each band.
-    def of_band(number: int, band: str) -> Picture:
-        curve, pattern = responses.curve(response, band), detector.sel(band=band)
-        noise = float(response["noise"].sel(band=band))
-        rng = np.random.default_rng([0, number])
+    curves = {band: responses.curve(response, band) for band in bands}
+    generators = {band: np.random.default_rng([0, number]) for number, band in enumerate(bands)}
+    patterns = {band: detector.sel(band=band) for band in bands}
+    deviations = {band: float(response["noise"].sel(band=band)) for band in bands}
 
-        def picture(_: float) -> Counts:
-            level = float(curve.counts(np.array(world.blackbody_temperature)))
-            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), pattern)
+    def picture(band: str, _: float) -> Counts:
+        """Picture of the blackbody in a band, at any time of the scene."""
+        level = float(curves[band].counts(np.array(world.blackbody_temperature)))
+        noise = generators[band].normal(0.0, deviations[band], session.shape)
+        return simulation.digitise(level + noise, patterns[band])
 
-        return picture
-
-    return {band: of_band(number, band) for number, band in enumerate(bands)}
+    return {band: partial(picture, band) for band in bands}
 
 
 class EmulatedBoson(Device):
@@ -202,9 +196,7 @@ class EmulatedBoson(Device):
         # At power-on, by the identifier that sets them; not those of a real camera.
         self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
         self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
-        self._world = world
-        self._name = name
-        self._decoder = fslp.Decoder()
+        self._world, self._name, self._decoder = world, name, fslp.Decoder()
 
     def is_plugged(self) -> bool:
         """False once the camera was pulled out."""
@@ -235,6 +227,7 @@ class EmulatedBoson(Device):
             return _STATUS, b""
         if command not in {boson.RUN_FFC, *self.settings, *readings}:
             return _UNKNOWN, b""
+        # The size of its data.
         size = 4 if command in self.settings else 0
         if len(data) != size:
             return (_FEW if len(data) < size else _MANY), b""
@@ -242,20 +235,17 @@ class EmulatedBoson(Device):
             self._world.start_ffc(self._name)
         elif command in self.settings:
             (value,) = struct.unpack(">i", data)
-            if value not in range(_CHOICES[command]):
+            if value not in _CHOICES[command]:
                 return _RANGE, b""
             self.settings[command] = value
         return 0, readings.get(command, b"")
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
-        # The state of the shutter.
-        camera, status = self.camera, FfcStatus.NONE_PERFORMED
+        camera = self.camera
+        status = FfcStatus.COMPLETE if camera.ffc_count else FfcStatus.NONE_PERFORMED
         if self._world.ffc_in_progress(self._name):
             status = FfcStatus.IN_PROGRESS
-        elif camera.ffc_count:
-            status = FfcStatus.COMPLETE
-        # What each command reads.
         values: dict[boson.Reading[Any], tuple[int | bytes, ...]] = {
             boson.SERIAL_NUMBER: (camera.serial_number,),
             boson.PART_NUMBER: (b"EMULATED-BOSON-640",),
@@ -266,8 +256,7 @@ class EmulatedBoson(Device):
             boson.FFC_STATUS: (status,),
             boson.LAST_FFC_FRAME: (camera.last_ffc_frame,),
         }
-        for setting in boson.SETTINGS:
-            values[setting.reading] = (self.settings[setting.set_command],)
+        values |= {key.reading: (self.settings[key.set_command],) for key in boson.SETTINGS}
         return {key.command: struct.pack(key.layout, *value) for key, value in values.items()}
 
 

@@ -1,12 +1,12 @@
 """Recorder of captures, and reader of recordings.
 
 `record` writes the frames of all cameras and the readings beside them; `open_capture` opens a
-recording as stage `capture`, `notes` its log, `overview` a folder of recordings, and `open_sweep`
-and `bench_series` those of a blackbody: a recording for each temperature and filter, which says
-which session it is of. See `dbthermal.instruments.protocols` for whole procedures.
+recording, `notes` its log, `overview` a folder of recordings, and `open_sweep` and `bench_series`
+those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,15 +18,8 @@ from dbthermal import schema, store
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
-from dbthermal.instruments.recording._recorder import (
-    Limits,
-    Preview,
-    Reading,
-    SignalExit,
-    Summary,
-    raised_signals,
-    record,
-)
+from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
+from dbthermal.instruments.recording._signals import SignalExit, raised_signals
 from dbthermal.instruments.session import BLACKBODY
 
 __all__ = [
@@ -182,10 +175,7 @@ def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
 
 
 def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
-    """Raise unless every recording of a folder has its frames in every band.
-
-    ValueError names each recording and band that did not go to its planned end, or has too few good
-    frames, with the good and the promised frames.
+    """ValueError with each recording and band that was cut short or has too few good frames.
 
     Parameters
     ----------
@@ -215,10 +205,9 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count]. The
-        bands are those of all filters, and that of the camera without filters, which is taken from
-        the recordings through the first filter. `temperature` is the mean of the blackbody's
-        readings during the recordings of a step [K].
+        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count],
+        with the band of the camera without filters from the recordings through the first filter.
+        `temperature` is the mean of the blackbody's readings during the recordings of a step [K].
 
     Raises
     ------
@@ -227,16 +216,12 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         fewer good frames in a band, or no reading of the blackbody, or those of a step differ by
         more than the session's stability.
     """
-    # The movie and the mean temperature of each step.
     steps, stability, shared = _sweep(folder, name)
-    temperatures, movies = [], []
-    for paths in steps:
-        temperatures.append(_agreed(paths, BLACKBODY, stability))
-        movies.append(_movie(paths, frames))
-    # In the order of the temperatures.
-    order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
-    axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
-    counts = xr.concat([movies[place] for place in order], "temperature")
+    movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]
+    movies.sort(key=itemgetter(0))
+    attrs = schema.COORDINATES["temperature"].attrs
+    axis = xr.Variable("temperature", [temperature for temperature, _ in movies], attrs)
+    counts = xr.concat([movie for _, movie in movies], "temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x")
     joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
     return schema.check(joined.assign_attrs(shared), "blackbody_movies")
@@ -268,7 +253,6 @@ def bench_series(
         (measurement), means of the readings during the recordings [K]. FileNotFoundError or
         ValueError as for `open_sweep`; or if a region has no pixel or a band no good frame.
     """
-    # Means of each step, by material.
     steps, stability, shared = _sweep(folder, name)
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in steps:
@@ -333,7 +317,6 @@ def mean_reading(path: str | Path, source: str) -> float:
 
 def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict[str, Any]]:
     """Recordings of each temperature, one for each filter, stability [K] and origin of a sweep."""
-    # The session, from the first recording that is of it.
     for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
         attrs = store.open_dataset(path).attrs
         session = attrs["provenance"]["parameters"]
@@ -391,10 +374,8 @@ def _movie(paths: list[Path], frames: int) -> xr.DataArray:
     for band, capture in _bands(paths):
         good = _good_frames(capture, band)
         if good.size < frames:
-            raise ValueError(
-                f"Invalid recording '{capture.attrs['path']}' with {good.size} good frames in band "
-                f"'{band}'. Must have {frames}."
-            )
+            text = f"with {good.size} good frames in band '{band}'. Must have {frames}"
+            raise ValueError(f"Invalid recording '{capture.attrs['path']}' {text}.")
         # Read in one piece, up to the last frame that is needed.
         counts = capture["counts"].sel(band=band).isel(time=slice(0, int(good[frames - 1]) + 1))
         films.append(counts.load().isel(time=good[:frames]).drop_vars("time").rename(time="frame"))

@@ -9,32 +9,17 @@ its contents in words, for a reader may have no more than the store.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from dbthermal import store
 from dbthermal.alignment import fill_times
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import (
-    DAMAGED,
-    FFC_READING,
-    GOOD,
-    UNTIMED,
-    Counts,
-    FfcStatus,
-    Frame,
-    FrameFlag,
-    FrameSource,
-    Metadata,
-    Shutter,
-    next_shutter,
-)
+from dbthermal.instruments import camera, telemetry
+from dbthermal.instruments.camera import FfcStatus, Frame, FrameFlag, FrameSource
 from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
 CHUNK: Final = 30  # frames of a chunk: half a second at 60 Hz, the most that a kill may cost
@@ -43,9 +28,7 @@ _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame's arriva
 _STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]
 _HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
 _RECORDER: Final = "recorder"  # source of notes on the recording itself
-_FILLS: Final = MappingProxyType(
-    {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
-)
+_FILLS: Final = {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
 
 
 class Note(IntEnum):
@@ -73,23 +56,14 @@ class Note(IntEnum):
     FOLDER_MOVED = 11, "NaN, the recording's folder was moved or renamed; it went on in it"
 
 
-def _of_frames(dtype: str, units: str, long_name: str) -> Variable:
-    return Variable(("band", "time"), dtype, units, long_name)
-
-
-def _of_log(dtype: str, long_name: str, units: str = "1") -> Variable:
-    return Variable(("log",), dtype, units, long_name)
-
-
-def _coded(variable: Variable, codes: type[FrameFlag] | type[Note]) -> Variable:
-    """Variable with CF attributes of its codes, and a sentence for each code."""
+def _coded(codes: type[FrameFlag] | type[Note]) -> dict[str, Any]:
+    """CF attributes of a variable of codes, and a sentence for each code."""
     sentences = {str(code.name).lower(): code.meaning for code in codes}
-    attrs = {
+    return {
         "flag_masks" if codes is FrameFlag else "flag_values": [int(code) for code in codes],
         "flag_meanings": " ".join(sentences),
         "comment": "; ".join(f"{name}: {text}" for name, text in sentences.items()),
     }
-    return replace(variable, more=attrs)
 
 
 ABOUT: Final = (
@@ -111,71 +85,63 @@ _LAYOUT: Final = (
     "16-bit words of a Boson; likely, not certain, are the words (of a longer number the high one "
     "first; value = number / steps + zero): "
     + ", ".join(
-        f"{name} {place.word} to {place.word + place.words - 1}"
-        + (f" (steps {place.steps}, zero {place.zero:g})" if place.steps else "")
-        for name, place in telemetry.FIELDS.items()
+        f"{name} {field.word} to {field.word + np.dtype(field.dtype).itemsize // 2 - 1}"
+        + (f" (steps {field.steps}, zero {field.zero:g})" if field.steps else "")
+        for name, field in telemetry.FIELDS.items()
     )
 )
 
-VARIABLES: Final = MappingProxyType(
-    {
-        "counts": STAGES["capture"]["counts"],
-        "exposure_time": EXPOSURE_TIME,
-        "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
-        "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
-        "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
-        "frame_flags": _coded(FRAME_FLAGS, FrameFlag),
-        "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
-        "log_kind": _coded(_of_log("int16", "kind of the note"), Note),
-        "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),
-        "log_value": _of_log("float64", "value by kind of the note; see attribute log_units"),
-    }
-)
+_FRAMES, _LOG = ("band", "time"), ("log",)
+VARIABLES: Final = {
+    "counts": STAGES["capture"]["counts"],
+    "exposure_time": EXPOSURE_TIME,
+    "device_time": Variable(_FRAMES, "float64", "s", "device's stamp of the frame, as it came"),
+    "host_time": Variable(_FRAMES, "float64", "s", "arrival at the host, since clock_origin"),
+    "sequence": Variable(_FRAMES, "int64", "1", "number of the frame by its driver"),
+    "frame_flags": replace(FRAME_FLAGS, more=_coded(FrameFlag)),
+    "log_time": Variable(_LOG, "float64", "s", "time of the note, since clock_origin"),
+    "log_kind": Variable(_LOG, "int16", "1", "kind of the note", _coded(Note)),
+    "log_source": Variable(
+        _LOG, "int16", "1", "source of the note: place in attribute log_sources"
+    ),
+    "log_value": Variable(
+        _LOG, "float64", "1", "value by kind of the note; see attribute log_units"
+    ),
+}
 """Variables of every recording; `ABOUT` explains them together."""
 
-TELEMETRY: Final = MappingProxyType(
-    {
-        "telemetry": Variable(
-            ("band", "time", "telemetry_row", "x"),
-            "uint16",
-            "1",
-            "telemetry rows as they came",
-            {"comment": _LAYOUT},
-        ),
-        "fpa_temperature": _of_frames("float32", "K", "temperature of the focal-plane array"),
-        "frame_counter": _of_frames("int64", "1", "camera's own number of the frame, or -1"),
-    }
-)
+_ROWS = ("band", "time", "telemetry_row", "x")
+TELEMETRY: Final = {
+    "telemetry": Variable(
+        _ROWS, "uint16", "1", "telemetry rows as they came", {"comment": _LAYOUT}
+    ),
+    "fpa_temperature": Variable(_FRAMES, "float32", "K", "temperature of the focal-plane array"),
+    "frame_counter": Variable(_FRAMES, "int64", "1", "camera's own number of the frame, or -1"),
+}
 """Variables of a recording of cameras that give telemetry. Where `frame_counter` leaps and
 `sequence` does not, frames were lost before the driver saw them; its usual step is not documented
 for all rates, so that the recorder draws no conclusion."""
 
 
-def _totals() -> dict[str, int]:
-    return dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
-
-
-@dataclass
 class _Band:
     """Recording state of one band."""
 
-    block: dict[str, npt.NDArray[Any]]
-    filled: int = 0
-    image: Counts | None = None
-    sequence: int | None = None
-    device_time: float = -math.inf
-    shutter: Shutter = field(default_factory=Shutter)
-    ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
-    totals: dict[str, int] = field(default_factory=_totals)
+    def __init__(self) -> None:
+        self.block: list[dict[str, Any]] = []  # frames that are not written yet
+        self.last: Frame | None = None
+        self.device_time = -math.inf  # latest valid stamp
+        self.shutter = camera.Shutter()
+        self.ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
+        self.totals = dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
 
 
 class CaptureFile:
     """A new recording at `path` that takes frames and notes in the order in which they come.
 
-    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], and
-    `chunk` is the number of frames that are written together. FileExistsError if `path` exists;
-    ValueError if the sources differ in shape or telemetry. After a failed write `broken` is True:
-    what was written before is valid, and nothing more may be written.
+    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], `chunk`
+    the number of frames that are written together. FileExistsError if `path` exists; ValueError if
+    the sources differ in shape or telemetry. After a failed write `broken` is True: what was
+    written before is valid, and nothing more may be written.
     """
 
     def __init__(
@@ -188,14 +154,12 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
-        # The variables, of one size.
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
             raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
         (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
-        # The state of the recording.
         self._origin, self._chunk = origin, chunk
         self._clock = next(iter(sources.values())).clock
         self._start: dict[str, Any] = {}  # attributes of `begin`
@@ -220,7 +184,7 @@ class CaptureFile:
             fills=_FILLS,
         )
         self._place = self.recording.place()
-        self._bands = {band: _Band(self._new_block()) for band in sources}
+        self._bands = {band: _Band() for band in sources}
 
     @property
     def totals(self) -> dict[str, dict[str, int]]:
@@ -240,11 +204,11 @@ class CaptureFile:
         # Flags, from the frame before and from the shutter.
         flags = frame.flags | self._compared(band, frame, refused)
         flags |= self._watch_shutter(band, frame, flags)
-        if flags & DAMAGED:
+        if flags & camera.DAMAGED:
             state.totals["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
         # Values of the frame, into the chunk.
-        timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
+        timed = not flags & (camera.UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,
             "exposure_time": frame.device_time - self._origin if timed else math.nan,
@@ -253,22 +217,21 @@ class CaptureFile:
             "sequence": frame.sequence,
             "frame_flags": int(flags),
         }
-        if frame.telemetry is not None:
-            decoded = frame.metadata or Metadata()
-            values["telemetry"] = frame.telemetry
+        if self._sizes["telemetry_row"]:  # zeros if a frame came without
+            decoded = frame.metadata or camera.Metadata()
+            rows = np.zeros((self._sizes["telemetry_row"], self._sizes["x"]), np.uint16)
+            values["telemetry"] = rows if frame.telemetry is None else frame.telemetry
             values["fpa_temperature"] = decoded.fpa_temperature
             values["frame_counter"] = decoded.frame_counter
-        for name, value in values.items():
-            state.block[name][state.filled] = value
-        state.filled += 1
+        state.block.append(values)
         state.totals["frames"] += 1
-        if state.filled == self._chunk:
+        if len(state.block) == self._chunk:
             self._write(band)
         return flags
 
     def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
         """Put a line into the log: a kind, a band or the name of a reading, time [s], value."""
-        band = source.removeprefix(FFC_READING)
+        band = source.removeprefix(camera.FFC_READING)
         if kind is Note.READING and source != band and band in self._bands:
             status = FfcStatus(int(value)) if value in set(FfcStatus) else None
             self._bands[band].ffc_status = time, status
@@ -296,9 +259,9 @@ class CaptureFile:
 
     def _compared(self, band: str, frame: Frame, refused: int) -> FrameFlag:
         """Flags from the frame before, with notes of the frames that are missing between them."""
-        state, flags = self._bands[band], GOOD
+        state, flags = self._bands[band], camera.GOOD
         self.refused(band, refused, frame.host_time)
-        step = 1 if state.sequence is None else frame.sequence - state.sequence
+        step = 1 if state.last is None else frame.sequence - state.last.sequence
         lost = step - 1 - refused
         if step < 1:
             flags |= FrameFlag.SEQUENCE_STANDS
@@ -306,10 +269,10 @@ class CaptureFile:
         elif lost > 0:
             state.totals["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
-        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
-        if state.image is not None and np.array_equal(frame.counts, state.image):
+        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else camera.GOOD
+        if state.last is not None and np.array_equal(frame.counts, state.last.counts):
             flags |= FrameFlag.IMAGE_REPEATED
-        state.sequence, state.image = frame.sequence, frame.counts
+        state.last = frame
         return flags | self._timed(state, frame)
 
     def _timed(self, state: _Band, frame: Frame) -> FrameFlag:
@@ -320,14 +283,14 @@ class CaptureFile:
         if not frame.device_time > state.device_time:  # NaN too
             return FrameFlag.TIME_STANDS
         state.device_time = frame.device_time
-        return GOOD
+        return camera.GOOD
 
     def _watch_shutter(self, band: str, frame: Frame, flags: FrameFlag) -> FrameFlag:
         """Flag of a closed shutter, from telemetry, serial line and image."""
         state = self._bands[band]
         read_at, status = state.ffc_status
         before = state.shutter
-        state.shutter = next_shutter(
+        state.shutter = camera.next_shutter(
             before,
             repeated=FrameFlag.IMAGE_REPEATED in flags,
             last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
@@ -339,15 +302,18 @@ class CaptureFile:
         renewed = state.shutter.last_ffc_frame
         if renewed is not None and before.last_ffc_frame not in {None, renewed}:
             self.note(Note.CORRECTION, band, frame.host_time, renewed)
-        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else GOOD
+        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else camera.GOOD
 
     def _write(self, band: str) -> None:
         state = self._bands[band]
-        if state.filled:
+        if state.block:
             self.broken = True
-            block = {name: values[: state.filled] for name, values in state.block.items()}
+            # The frames of the chunk, variable by variable.
+            columns = {name: [values[name] for values in state.block] for name in state.block[0]}
+            dtypes = {name: self._variables[name].dtype for name in columns}
+            block = {name: np.array(column, dtypes[name]) for name, column in columns.items()}
             self.recording.append(band, block)
-            state.filled = 0
+            state.block = []
         self._write_notes()
 
     def _write_notes(self) -> None:
@@ -364,11 +330,3 @@ class CaptureFile:
             self._notes = []
         self.recording.commit(totals=self.totals, **self._start)
         self.broken = False
-
-    def _new_block(self) -> dict[str, npt.NDArray[Any]]:
-        sizes = {**self._sizes, "time": self._chunk}
-        return {
-            name: np.zeros([sizes[dim] for dim in variable.dims[1:]], variable.dtype)
-            for name, variable in self._variables.items()
-            if variable.dims[0] == "band"
-        }

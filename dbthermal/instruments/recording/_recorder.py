@@ -1,10 +1,10 @@
 """The recorder: the frames of all cameras and the readings beside them, into one capture file.
 
-A thread for each camera fetches its frames, a further thread reads the instruments, so that none
-waits for another: a camera that corrects its offsets answers late, and that costs no frame. A queue
-of bounded length leads to the thread that writes. If the disk is too slow the queue fills, frames
-are refused, and the log has their number and time. The caller's thread shows the preview; whatever
-ends that, the frames that came before are written.
+A thread for each camera fetches its frames, a further thread reads the instruments: a camera that
+corrects its offsets answers late, and that costs no frame. A queue of bounded length leads to the
+thread that writes. If the disk is too slow the queue fills, frames are refused, and the log has
+their number and time. The caller's thread shows the preview; whatever ends that, the frames that
+came before are written.
 """
 
 import errno
@@ -12,25 +12,19 @@ import math
 import os
 import queue
 import shutil
-import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final
+from typing import Final
 
 from dbthermal import store
-from dbthermal.instruments.camera import (
-    Frame,
-    FrameFlag,
-    FrameSource,
-    NoFrameError,
-    SourceLostError,
-)
+from dbthermal.instruments import camera
 from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
+from dbthermal.instruments.recording._signals import SignalExit, raised_signals
 from dbthermal.instruments.session import Session
 
 Identities = Mapping[str, Mapping[str, str | bool]]
@@ -40,8 +34,6 @@ _SHOW_POLL: Final = 0.01  # least wait between two looks for a preview [s]
 _WRITE_POLL: Final = 0.05  # how long the writer waits for a frame [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
 _BYTES: Final = 2  # of a pixel
-_STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
-_ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,7 @@ class Preview:
     """
 
     time: float
-    frames: Mapping[str, Frame]
+    frames: Mapping[str, camera.Frame]
     totals: Totals
     readings: Mapping[str, float]
     units: Mapping[str, str] = field(default_factory=dict)
@@ -122,59 +114,9 @@ class Summary:
     totals: Totals
 
 
-class SignalExit(SystemExit):
-    """End of the program by a signal, with the exit status of a shell: 128 and its number.
-
-    Parameters
-    ----------
-    number : int
-        Of the signal.
-    """
-
-    def __init__(self, number: int) -> None:
-        super().__init__(_STATUS + number)
-        self.status, self.name = _STATUS + number, signal.Signals(number).name
-
-
-@contextmanager
-def raised_signals() -> Iterator[None]:
-    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
-
-    A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
-    first signal is raised, those after it are ignored: what is being closed must be left to end. A
-    signal that the program handles by itself or ignores, as under ``nohup``, stays so.
-    """
-    previous: dict[int, Any] = {}
-    raised: list[int] = []
-    late: list[int] = []  # came while the handlers were put back
-    closing = False
-
-    def end(number: int, _: FrameType | None) -> None:
-        if closing:
-            late.append(number)
-        elif not raised:
-            raised.append(number)
-            raise SignalExit(number)
-
-    try:
-        # Only signals that would end the program, and only in the main thread, which gets them.
-        if threading.current_thread() is threading.main_thread():
-            for number in _ENDING:
-                if signal.getsignal(number) is signal.SIG_DFL:
-                    previous[number] = signal.signal(number, end)
-        yield
-    finally:
-        closing = True
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        if not raised:
-            for number in late:
-                signal.raise_signal(number)
-
-
 def record(
     session: Session,
-    sources: Mapping[str, FrameSource],
+    sources: Mapping[str, camera.FrameSource],
     path: str | Path,
     *,
     readings: Mapping[str, Reading] | None = None,
@@ -185,9 +127,9 @@ def record(
 ) -> Summary:
     """Record until the end of the session's duration, a stop, or the loss of the last camera.
 
-    Frames that a driver buffered before the start, by their stamps, are not recorded: they show
-    another filter, or another scene. Two seconds after the start such a stamp counts as wrong. If
-    the folder, or one above it, is renamed or moved on its disk, the recording goes on in it.
+    Frames that a driver buffered before the start, by their stamps, are not recorded. Two seconds
+    after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
+    moved on its disk, the recording goes on in it.
 
     Parameters
     ----------
@@ -201,11 +143,6 @@ def record(
         `Limits`; a function called now and then with a `Preview` in the caller's thread, which may
         take its time; and an event whose setting ends the recording.
 
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames; also in the store.
-
     Raises
     ------
     FileExistsError, ValueError
@@ -218,16 +155,11 @@ def record(
         the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
-    _check(session, sources)
-    clock = next(iter(sources.values())).clock
+    clock = _check(session, sources)
     with raised_signals(), clock.joined():
-        # The file.
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-        start = clock()  # to make the file may have taken a while
-        file.begin(start, _utc(clock))
-        # The threads: the writer starts the rest, this one shows the preview.
-        end, stop = start + session.duration, stop or threading.Event()
-        run = _Run(file, sources, readings, limits, clock, start, end, stop)
+        # The writer starts the other threads, this one shows the preview.
+        run = _Run(file, sources, readings, limits, session.duration, stop or threading.Event())
         # No daemon: it ends its work whatever becomes of this thread.
         writer = Task(clock, "writer", run.write, daemon=False)
         try:
@@ -246,28 +178,25 @@ def record(
     return Summary(file.recording.place(), run.ended, file.totals)
 
 
-def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
-    """Raise unless the sources are those of the session, on one clock."""
+def _check(session: Session, sources: Mapping[str, camera.FrameSource]) -> Clock:
+    """Clock of the sources; ValueError unless they are those of the session."""
     if tuple(sources) != session.bands:
-        raise ValueError(
-            f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
-        )
+        rule = f"Must be the bands {list(session.bands)}"
+        raise ValueError(f"Invalid sources {list(sources)}. {rule}.")
     clock = next(iter(sources.values())).clock
     for band, source in sources.items():
         if source.clock is not clock:
             raise ValueError(f"Invalid clock of band '{band}'. Must be that of the other sources.")
-        for name, value, expected in (
-            ("is_simulated", source.is_simulated, session.simulated),
-            ("shape", source.shape, session.shape),
-        ):
-            if value != expected:
+        for name, expected in (("is_simulated", session.simulated), ("shape", session.shape)):
+            if (value := getattr(source, name)) != expected:
                 rule = f"Must be {expected}, as the session says"
                 raise ValueError(f"Invalid source of band '{band}': {name} is {value}. {rule}.")
+    return clock
 
 
 def _new_file(
     session: Session,
-    sources: Mapping[str, FrameSource],
+    sources: Mapping[str, camera.FrameSource],
     readings: Mapping[str, Reading],
     identities: Identities,
     path: Path,
@@ -275,10 +204,10 @@ def _new_file(
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
     # Room on the disk.
-    folder = path.absolute().parent
-    folder.mkdir(parents=True, exist_ok=True)
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
     frames = sum(session.duration * source.frame_rate for source in sources.values())
-    _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
+    size = int(_BYTES * math.prod(session.shape) * frames)
+    _check_space(path.absolute().parent, limits.reserve + size)
     clock = next(iter(sources.values())).clock
     # What the recording says of its devices.
     devices = {band: source.identity for band, source in sources.items()}
@@ -294,98 +223,100 @@ def _new_file(
         "provenance": store.provenance(asdict(session)),
     }
     units = {name: reading.units for name, reading in readings.items()}
-    return CaptureFile(
-        path, sources, readings=units, origin=clock(), attrs=attrs, chunk=limits.chunk
-    )
+    origin, chunk = clock(), limits.chunk
+    return CaptureFile(path, sources, readings=units, origin=origin, attrs=attrs, chunk=chunk)
 
 
 def _utc(clock: Clock) -> str:
     return clock.utc().isoformat(timespec="milliseconds")
 
 
-@dataclass(eq=False)
 class _Run:
     """A recording: the threads that fetch, read and write, and their shared state."""
 
-    file: CaptureFile
-    sources: Mapping[str, FrameSource]
-    readings: Mapping[str, Reading]
-    limits: Limits
-    clock: Clock
-    start: float
-    end: float
-    stop: threading.Event
-
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        file: CaptureFile,
+        sources: Mapping[str, camera.FrameSource],
+        readings: Mapping[str, Reading],
+        limits: Limits,
+        duration: float,
+        stop: threading.Event,
+    ) -> None:
+        self.file, self.readings, self.limits, self.stop = file, readings, limits, stop
+        self.clock = next(iter(sources.values())).clock
+        self.start = self.clock()  # to make the file may have taken a while
+        self.end = self.start + duration
+        file.begin(self.start, _utc(self.clock))
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
         # For the preview, after each frame is written: totals, last frames, last readings.
         self.totals: Totals = {}
-        self.last_frames: dict[str, Frame] = {}
+        self.last_frames: dict[str, camera.Frame] = {}
         self.last_readings: dict[str, float] = {}
-        # (band, frame, number refused before it); at most `limits.queue` frames of each band.
-        self._frames: queue.SimpleQueue[tuple[str, Frame, int]] = queue.SimpleQueue()
-        self._room = {band: threading.Semaphore(self.limits.queue) for band in self.sources}
-        self._notes: queue.SimpleQueue[tuple[Note, str, float, float]] = queue.SimpleQueue()
-        self._lost_sources: list[str] = []
+        # Work for the writer: notes, and at most `limits.queue` frames of each band.
+        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._room = {band: threading.Semaphore(limits.queue) for band in sources}
+        self._lost_sources, self._written = list[str](), 0  # frames
         self._refused_last: dict[str, int] = {}
         self._fetching = [
-            Task(self.clock, band, self.fetch, band, source)
-            for band, source in self.sources.items()
+            Task(self.clock, band, self._guarded, partial(self._fetch, band, source))
+            for band, source in sources.items()
         ]
-        self._reading = Task(self.clock, "readings", self.read)
+        reading = Task(self.clock, "readings", self._guarded, self._read)
+        self._threads = [*self._fetching, reading]
 
-    def is_going(self) -> bool:
+    def _is_going(self) -> bool:
         """True until the end of the duration, a stop or an error."""
         return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
 
-    def fetch(self, band: str, source: FrameSource) -> None:
-        """Put the frames of a source into the queue, until the end.
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do a thread's work; an error ends the recording, and is raised in the caller's thread."""
+        try:
+            work()
+        except BaseException as error:  # noqa: BLE001
+            self.errors.append(error)
+            self.over.set()
+
+    def _put_note(self, kind: Note, source: str, value: float = math.nan) -> None:
+        self._work.put(partial(self._note, kind, source, self.clock(), value))
+
+    def _fetch(self, band: str, source: camera.FrameSource) -> None:
+        """Queue the frames of a source for the writer, until the end.
 
         Without room a frame is refused; the next accepted one carries the number of refused ones.
         """
         refused = 0
         try:
-            while self.is_going():
-                # The next frame.
+            while self._is_going():
                 try:
                     frame = source.read(self.limits.silence)
-                except NoFrameError:
-                    self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
+                except camera.NoFrameError:
+                    self._put_note(Note.NO_FRAME, band, self.limits.silence)
                     continue
-                # Into the queue, if there is room.
                 if self.clock.has_room(self._room[band]):
-                    self._frames.put((band, frame, refused))
+                    self._work.put(partial(self._frame, band, frame, refused))
                     refused = 0
                 else:
                     refused += 1
-        except SourceLostError:
+        except camera.SourceLostError:
             self._lost_sources.append(band)
-            self._notes.put((Note.SOURCE_LOST, band, self.clock(), math.nan))
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            self._fail(error)
+            self._put_note(Note.SOURCE_LOST, band)
         finally:
             self._refused_last[band] = refused
 
-    def read(self) -> None:
+    def _read(self) -> None:
         """Read the instruments in turn, until the end."""
-        try:
-            while self.readings and self.is_going():
-                for name, reading in self.readings.items():
-                    try:
-                        value, kind = float(reading.read()), Note.READING
-                    except (OSError, RuntimeError, ValueError):
-                        value, kind = math.nan, Note.READING_FAILED
-                    self._notes.put((kind, name, self.clock(), value))
-                remaining = max(0.0, self.end - self.clock())
-                self.clock.wait(self.over, min(self.limits.reading_period, remaining))
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
-
-    def _fail(self, error: BaseException) -> None:
-        self.errors.append(error)
-        self.over.set()
+        while self.readings and self._is_going():
+            for name, reading in self.readings.items():
+                try:
+                    value, kind = float(reading.read()), Note.READING
+                except (OSError, RuntimeError, ValueError):
+                    value, kind = math.nan, Note.READING_FAILED
+                self._put_note(kind, name, value)
+            remaining = max(0.0, self.end - self.clock())
+            self.clock.wait(self.over, min(self.limits.reading_period, remaining))
 
     def show(self, preview: Callable[[Preview], None] | None) -> None:
         """Call the preview at its period, until the last frame is written."""
@@ -393,7 +324,7 @@ class _Run:
         period = _SHOW_POLL  # until there is something to show
         # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.
         while not self.clock.wait(self.done, period):
-            if preview and self.last_frames and self.is_going():
+            if preview and self.last_frames and self._is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
                 time, totals = self.clock() - self.start, self.totals
                 frames, readings = dict(self.last_frames), dict(self.last_readings)
@@ -404,64 +335,51 @@ class _Run:
 
         Errors go to `errors`. After an error of writing itself the file stays as it is on the disk.
         """
-        threads = (*self._fetching, self._reading)
-        try:
-            for thread in threads:
-                thread.start()
-            self._write_frames()
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
+        self._guarded(self._write)
         self.over.set()
-        for thread in threads:
-            self._join(thread)
-        try:
-            if not self.file.broken:
-                self._finish()
-        except BaseException as error:  # noqa: BLE001 - as above
-            self._fail(error)
-        finally:
-            self.done.set()
+        for thread in self._threads:
+            # A thread that hangs in its device must not keep what was recorded.
+            if thread.ident and not self.clock.wait(thread.ended, self.limits.patience):
+                late = f"within {self.limits.patience} s after the end. Must keep its time limits."
+                message = f"No answer of the device of '{thread.name}' {late}"
+                self.errors.append(TimeoutError(message))
+        if not self.file.broken:
+            self._guarded(self._finish)
+        self.done.set()
 
-    def _write_frames(self) -> None:
-        number = 0
-        while self.is_going() and not all(task.ended.is_set() for task in self._fetching):
-            self._take_notes()
-            try:
-                band, frame, refused = self.clock.get(self._frames, _WRITE_POLL)
-            except queue.Empty:
-                continue
-            self._take(band, frame, refused)
-            self._room[band].release()
-            number += 1
-            if number % self.limits.chunk == 0:
-                _check_space(self.file.recording.root, self.limits.reserve)
+    def _write(self) -> None:
+        for thread in self._threads:
+            thread.start()
+        while self._is_going() and not all(task.ended.is_set() for task in self._fetching):
+            with suppress(queue.Empty):
+                self.clock.get(self._work, _WRITE_POLL)()
 
     def _finish(self) -> None:
-        """Write what is left in the queues, and close the file."""
-        while not self._frames.empty():
-            self._take(*self._frames.get_nowait())
-        self._take_notes()
+        """Write what is left in the queue, and close the file."""
+        while not self._work.empty():
+            self._work.get_nowait()()
         for band, number in self._refused_last.items():
             self.file.refused(band, number, self.clock())
         self.ended = self._reason()
         self.file.close(complete=self.ended in {"duration", "stopped"}, ended=self.ended)
 
-    def _take(self, band: str, frame: Frame, refused: int) -> None:
+    def _frame(self, band: str, frame: camera.Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
-        has_device_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
+        has_device_clock = camera.FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
         early = frame.device_time < self.start and frame.host_time < self.start + _HELD
-        if band not in self.last_frames and early and not has_device_clock:
-            return
-        flags = self.file.frame(band, frame, refused)
-        self.last_frames[band] = replace(frame, flags=flags)
-        self.totals = self.file.totals
+        if band in self.last_frames or not early or has_device_clock:
+            flags = self.file.frame(band, frame, refused)
+            self.last_frames[band] = replace(frame, flags=flags)
+            self.totals = self.file.totals
+        self._room[band].release()
+        self._written += 1
+        if self._written % self.limits.chunk == 0 and self._is_going():
+            _check_space(self.file.recording.root, self.limits.reserve)
 
-    def _take_notes(self) -> None:
-        while not self._notes.empty():
-            kind, source, time, value = self._notes.get_nowait()
-            self.file.note(kind, source, time, value)
-            if kind in {Note.READING, Note.READING_FAILED}:
-                self.last_readings[source] = value
+    def _note(self, kind: Note, source: str, time: float, value: float) -> None:
+        self.file.note(kind, source, time, value)
+        if kind in {Note.READING, Note.READING_FAILED}:
+            self.last_readings[source] = value
 
     def _reason(self) -> str:
         """Reason for the end of the recording, in one or two words."""
@@ -474,14 +392,6 @@ class _Run:
         if len(self.last_frames) < len(self._room):
             return "no frames"
         return "stopped" if self.stop.is_set() else "duration"
-
-    def _join(self, thread: Task) -> None:
-        """Wait for a thread; if it hangs in its device it must not keep what was recorded."""
-        if thread.ident is None:
-            return
-        if not self.clock.wait(thread.ended, self.limits.patience):
-            late = f"within {self.limits.patience} s after the end. Must keep its time limits."
-            self.errors.append(TimeoutError(f"No answer of the device of '{thread.name}' {late}"))
 
 
 def _check_space(path: Path, least: int) -> None:

@@ -6,7 +6,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.session import Session
 
 

@@ -17,7 +17,7 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated import World
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
 from reproduction.twins.rays import Camera

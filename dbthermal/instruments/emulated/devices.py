@@ -1,42 +1,44 @@
-"""Emulated filter wheel FW103 on an emulated APT controller; no hardware is involved.
+"""Emulated filter wheel FW103 on an emulated APT controller, and an emulated TC-08.
 
-It answers below the real driver, byte for byte, with the quirks that users report of real ones:
+The controller answers below the real driver, byte for byte, with the quirks that users report:
 speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly,
 reports of moves at any time, another model than on the label. Its counter of commanded steps agrees
 with the wheel only once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
 AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
+
+The TC-08 has the functions of the vendor's library, and none of its code: it writes into the
+caller's ctypes buffers. Signatures, error numbers and NaN for channels that are off are those of
+the header ``usbtc08.h``. The conversion time is from datalogd's documentation, and likely, not
+certain.
 """
 
 import math
+from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.emulated.world import Device, Line, World
+from dbthermal.instruments.clock import Clock
+from dbthermal.instruments.emulated import ROOM, Device, Line, World
+from dbthermal.instruments.filterwheel import BSC10X, BSC20X
+from dbthermal.instruments.tc08 import CHANNELS, KELVIN
+
+Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
 SERIAL_NUMBER: Final = 40_000_000
-NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
+NOTES: Final = b"emulated, not hardware"  # in its `Info`
 SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
+CONVERSION: Final = 0.1  # conversion time of one channel of the TC-08 [s]
+RANGE: Final = (3.15, 673.15)  # of its thermocouples of type T [K]
 WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
 
 
-class Model(NamedTuple):
-    """Counts of a turn, device units of 1 count/s and of 1 count/s^2; a rack has bays."""
-
-    turn: int
-    velocity: float
-    acceleration: float
-    is_rack: bool
-
-
-_RACK = Model(409_600, 53.68, 53.68 * 204.94e-6, is_rack=True)
-_UNIT = Model(25_600, 1.0, 1.0, is_rack=False)
 MODELS: Final = MappingProxyType(
-    {"BSC201": _RACK, "BSC203": _RACK, "SCC201": _RACK, "BSC101": _UNIT, "KDC101": _UNIT}
+    {"BSC201": BSC20X, "BSC203": BSC20X, "SCC201": BSC20X, "BSC101": BSC10X, "KDC101": BSC10X}
 )
-"""Controllers by the name they give (KDC101 drives no wheel), with numbers of their own."""
+"""Controllers by the name they give (KDC101 drives no wheel); those of many counts are racks."""
 
 
 @dataclass(frozen=True)
@@ -90,18 +92,16 @@ class EmulatedApt(Device):
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
         super().__init__()
-        self.info = apt.Info(serial_number, model, "1.0.0", NOTES)
-        self.model = MODELS[model]
-        self.unit = apt.RACK if self.model.is_rack else apt.UNIT
-        self.address = apt.BAY_1 if self.model.is_rack else apt.UNIT
+        self.info = apt.Info(serial_number, model.encode(), notes=NOTES)
+        self.model, is_rack = MODELS[model], MODELS[model] is BSC20X
+        self.unit, self.address = (apt.RACK, apt.BAY_1) if is_rack else (apt.UNIT, apt.UNIT)
         self.world = world
         self.position, self.enabled, self.homed = 0, False, False
         slot = 1 if world.wheel_position is None else world.wheel_position
         self._slot_offset = slot_offset
         self.wheel = ((slot - 1) / 6 + slot_offset / 360.0) * self.model.turn
         self._drive: Drive | None = None
-        self._speeds = apt.VelocityParameters(1, 0, 0, 0)
-        self._home = apt.HomeParameters(1, 2, 1, 0, 0)
+        self._speeds, self._home = apt.Speeds(1, 0, 0, 0), apt.Home(1, 2, 1, 0, 0)
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
 
     def receive(self, data: bytes) -> None:
@@ -126,22 +126,22 @@ class EmulatedApt(Device):
         """Carry out a message; an unknown one is ignored."""
         match message.id:
             case Id.HW_REQ_INFO:
-                self.reply(Id.HW_GET_INFO, self.info.pack(), source=message.destination)
+                self.reply(Id.HW_GET_INFO, apt.pack(self.info), source=message.destination)
             case Id.MOD_SET_CHANENABLESTATE:
                 self.enabled = message.param2 == apt.YES
             case Id.MOD_REQ_CHANENABLESTATE:
                 state = apt.YES if self.enabled else apt.NO
                 self.reply(Id.MOD_GET_CHANENABLESTATE, param1=1, param2=state)
             case Id.MOT_SET_VELPARAMS:
-                self._speeds = apt.VelocityParameters.parse(message)
+                self._speeds = apt.parse(apt.Speeds, message)
             case Id.MOT_REQ_VELPARAMS:
-                self.reply(Id.MOT_GET_VELPARAMS, self._speeds.pack())
+                self.reply(Id.MOT_GET_VELPARAMS, apt.pack(self._speeds))
             case Id.MOT_SET_HOMEPARAMS:
-                self._home = apt.HomeParameters.parse(message)
+                self._home = apt.parse(apt.Home, message)
             case Id.MOT_REQ_HOMEPARAMS:
-                self.reply(Id.MOT_GET_HOMEPARAMS, self._home.pack())
+                self.reply(Id.MOT_GET_HOMEPARAMS, apt.pack(self._home))
             case Id.MOT_REQ_STATUSUPDATE:
-                self.reply(Id.MOT_GET_STATUSUPDATE, self.status().pack())
+                self.reply(Id.MOT_GET_STATUSUPDATE, apt.pack(self.status()))
             case _:
                 self._move(message)
 
@@ -153,8 +153,8 @@ class EmulatedApt(Device):
             way = -self.wheel % self.model.turn if forward else -(self.wheel % self.model.turn)
             self.start(way + self._home.offset, self._home.velocity, homing=True)
         elif message.id == Id.MOT_MOVE_ABSOLUTE and message.data:
-            target = apt.Position.parse(message).position
-            self.start(target - self.position, self._speeds.maximum)
+            target = apt.parse(apt.Position, message).position
+            self.start(target - self.position, self._speeds.velocity)
         elif message.id == Id.MOT_MOVE_STOP:  # at once, ramps are left out
             self._drive = None
             self.report(Id.MOT_MOVE_STOPPED)
@@ -192,19 +192,20 @@ class EmulatedApt(Device):
         *,
         param1: int = 0,
         param2: int = 0,
-        source: int | None = None,
+        source: int = 0,
     ) -> None:
-        """Send a message."""
-        address = self.address if source is None else source
+        """Send a message; its source is the motor's address by default."""
+        address = source or self.address
         message = apt.Message(identifier, param1, param2, apt.HOST, address, data)
         self._replies.append(apt.encode(message))
 
     def status(self) -> apt.Status:
         """State of the motor, as the controller reports it."""
+        # The state at rest, and of a motion.
         bits = StatusBits.CONNECTED
         bits |= StatusBits.ENABLED if self.enabled else 0
         bits |= StatusBits.HOMED if self.homed else 0
-        bits |= StatusBits.JOGGING_FORWARD if self.info.model == "SCC201" else 0  # it sticks
+        bits |= StatusBits.JOGGING_FORWARD if self.info.model == b"SCC201" else 0  # it sticks
         if self._drive is not None:
             forward = self._drive.distance > 0
             bits |= StatusBits.MOVING_FORWARD if forward else StatusBits.MOVING_REVERSE
@@ -220,10 +221,105 @@ class EmulatedApt(Device):
             if now >= drive.start + drive.duration:
                 self._drive = None
                 self.finish(drive)
-        sixths = (self.wheel / self.model.turn - self._slot_offset / 360.0) * 6
-        nearest = round(sixths)
-        rests = self._drive is None and abs(sixths - nearest) * 60.0 <= WINDOW
-        self.world.wheel_position = nearest % 6 + 1 if rests else None
+        # The slot that is in the beam of a wheel at rest.
+        slot = self.model.position(self.wheel, self._slot_offset, WINDOW)
+        self.world.wheel_position = slot if self._drive is None else None
+
+
+_HANDLE = 1
+
+
+class EmulatedTC08:
+    """The library and one unit, with type-T thermocouples whatever letter they are set to.
+
+    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; a reading is
+    converted on its `clock`. As in the vendor's library, functions return 0 if they fail.
+    """
+
+    is_simulated: Final = True
+
+    def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
+        self._temperature, self.clock = temperature, clock
+        self._is_open, self._error = False, 0
+        self._kinds: dict[int, str] = {}
+
+    def usb_tc08_open_unit_async(self) -> int:
+        """Begin to open the unit."""
+        return 1
+
+    def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
+        """Progress of opening: 0 pending, 1 complete (handle 0 if no unit is free), -1 failed."""
+        handle[0], percent[0] = 0 if self._is_open else _HANDLE, 100
+        self._is_open = True
+        return 1
+
+    def usb_tc08_close_unit(self, handle: int) -> int:
+        """Close the unit."""
+        if not self._accepts(handle):
+            return 0
+        self._is_open, self._kinds = False, {}
+        return 1
+
+    def usb_tc08_get_last_error(self, handle: int) -> int:
+        """Error of the last function that failed, -1 if the handle is not open."""
+        return self._error if handle in {0, _HANDLE} else -1
+
+    def usb_tc08_get_unit_info(self, handle: int, info: Numbers) -> int:
+        """Write the identity, which says that it is emulated."""
+        if not self._accepts(handle):
+            return 0
+        if info[0].size != 40:
+            return self._fail(3)
+        info[0].driver, info[0].serial = b"emulated", b"EMULATED"
+        info[0].hardware, info[0].variant, info[0].calibration_date = 1, 8, b"01Jan00"
+        return 1
+
+    def usb_tc08_set_channel(self, handle: int, channel: int, kind: int) -> int:
+        """Set a channel to a letter; C is for channel 0 alone, a space switches it off."""
+        if not self._accepts(handle):
+            return 0
+        letters = "C " if channel == 0 else "BEJKNRST "
+        if channel not in range(CHANNELS) or chr(kind) not in letters:
+            return self._fail(3)
+        self._kinds.pop(channel, None)
+        if chr(kind) != " ":
+            self._kinds[channel] = chr(kind)
+        return 1
+
+    def usb_tc08_get_single(
+        self, handle: int, values: Numbers, overflow: Numbers, units: int
+    ) -> int:
+        """Convert all channels once [K], NaN for those that are off."""
+        if not self._accepts(handle):
+            return 0
+        if units != KELVIN or not self._kinds:
+            return self._fail(2 if units == KELVIN else 3)
+        self.clock.sleep(CONVERSION * len(self._kinds))
+        readings = [self.convert(channel) for channel in range(CHANNELS)]
+        values[:] = [value for value, _ in readings]
+        overflow[0] = sum(beyond << channel for channel, (_, beyond) in enumerate(readings))
+        return 1
+
+    def convert(self, channel: int) -> tuple[float, bool]:
+        """Temperature of a channel as the library reports it [K], and whether it overflowed."""
+        if channel not in self._kinds:
+            return math.nan, False
+        if channel == 0:
+            return ROOM, False
+        tip = self._temperature(channel)
+        return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
+
+    def _accepts(self, handle: int) -> bool:
+        """True if the unit is open, and the handle is that of the unit."""
+        accepted = self._is_open and handle == _HANDLE
+        if not accepted:
+            self._error = 3
+        return accepted
+
+    def _fail(self, error: int) -> int:
+        """Note an error, and return the 0 of a failed function."""
+        self._error = error
+        return 0
 
 
 def start(_: str, world: World | None) -> Line:
