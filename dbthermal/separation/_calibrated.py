@@ -59,14 +59,14 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     level = np.zeros(e.shape[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
-        found = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
-        solved = np.isfinite(found.signal)
-        signal, left = found.signal, found.white
+        solution = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
+        solved = np.isfinite(solution.signal)
+        signal, left = solution.signal, solution.white
         if settings.smooth and len(signal) > 1:
             signal, left = windows.smooth(signal, left, solved, tile.time)
-        left = left + found.shared
+        left = left + solution.shared
         values = list[Array]()
-        for mean, variance in ((signal, left), (found.background, found.background_variance)):
+        for mean, variance in ((signal, left), (solution.background, solution.background_variance)):
             values += frames.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
     solved &= np.all(np.isfinite(values), axis=0)
@@ -86,8 +86,8 @@ def _gray(emissivity: Array, covariance: Array) -> Mask:
     """
     dark = 1.0 - emissivity
     ratio = dark / dark[0]
-    own = np.einsum("bbp->bp", covariance)
-    variance = own + ratio**2 * own[0] - 2.0 * ratio * covariance[0]
+    squares = np.einsum("bbp->bp", covariance)
+    variance = squares + ratio**2 * squares[0] - 2.0 * ratio * covariance[0]
     std = np.sqrt(np.maximum(variance, 0.0)) / dark[0]
     least = np.maximum(_LEAST_DIFFERENCE / dark[0], _GRAY_SIGMAS * std)
     return np.asarray(np.all(np.abs(ratio - 1.0) <= least, axis=0))

@@ -281,16 +281,16 @@ def _noise(
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
     factor, decided = _noise_factor(capture), response.attrs.get("noise_source")
     if "noise" in response:
-        known = np.asarray(responses.noise(response, names) / slopes)
+        stated_noise = np.asarray(responses.noise(response, names) / slopes)
         if decided == "capture":
-            return response, np.asarray(known * factor)
+            return response, np.asarray(stated_noise * factor)
         pixels = 0 if decided else min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"])
         counts = samples.some_pixels(capture["counts"], max(samples.PIXELS, pixels))
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
         rounding = samples.rounding_std(counts) / slopes
-        wide = np.sqrt(12.0) * rounding > known
-        stated = np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * factor)
+        wide = np.sqrt(12.0) * rounding > stated_noise
+        stated = np.asarray(np.hypot(stated_noise, np.where(wide, rounding, 0.0)) * factor)
         signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
         larger = np.nan * stated if decided else samples.larger_noise(signals, stated)
         if np.isnan(larger).all():
@@ -304,8 +304,8 @@ def _noise(
         doubt = "is the response of another integration time, or are two bands exchanged?"
         response = warned(response, f"The noise of the capture, which is used, is {said}: {doubt}")
     else:
-        parts, frames = quality.sample(capture, _NOISE_PIXELS)
-        linear = [one.linearise(part) for one, part in zip(curves, parts, strict=True)]
+        subsample, frames = quality.sample(capture, _NOISE_PIXELS)
+        linear = [curve.linearise(band) for curve, band in zip(curves, subsample, strict=True)]
         noise = noises.estimate_bands(linear, capture["time"].values[frames])
     used = "band", noise / factor * slopes, schema.NOISE.attrs
     return response.sel(band=names).assign(noise=used).assign_attrs(noise_source="capture"), noise
@@ -396,8 +396,8 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: 
     if array.dims not in allowed:
         raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
     array = laid_on(array, corrected, name, "the capture")
-    for one in second:  # the same bands
-        exchanged = array.rename({"band": one, one: "band"})
+    for dim in second:  # the same bands
+        exchanged = array.rename({"band": dim, dim: "band"})
         array = laid_on(exchanged, corrected, name, "the capture")
     leading = array.shape[: 1 + len(second)]
     values = array.values.astype(np.float64).reshape(

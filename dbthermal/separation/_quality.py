@@ -29,8 +29,8 @@ _UNUSABLE: Final = np.uint32(
 
 def status_bits(conditions: Mapping[Status, Mask]) -> Bits:
     """Combine conditions (pixel), each of a bit of the status, into the status (pixel)."""
-    parts = [holds * np.uint32(bit) for bit, holds in conditions.items()]
-    return np.asarray(np.bitwise_or.reduce(parts), dtype=np.uint32)
+    bits = [holds * np.uint32(bit) for bit, holds in conditions.items()]
+    return np.asarray(np.bitwise_or.reduce(bits), dtype=np.uint32)
 
 
 def unusable(status: Bits) -> Mask:
@@ -38,9 +38,9 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
+def grains(capture: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
     """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
-    flat = samples.some_pixels(part["counts"])
+    flat = samples.some_pixels(capture["counts"])
     limits = np.broadcast_to(noise, len(flat)).tolist()
     bands = zip(flat, limits, strict=True)
     return [samples.grain(band, np.isfinite(band), limit) for band, limit in bands]
@@ -49,7 +49,7 @@ def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grai
 def read(
     window: xr.Dataset,
     fewest: int = 1,
-    known: list[samples.Grain] | None = None,
+    larger_grains: list[samples.Grain] | None = None,
     most_missing: float = MOST_MISSING,
 ) -> tuple[Array, Mask, Bits]:
     """Read the samples of a part of the capture, and judge its pixels.
@@ -69,11 +69,11 @@ def read(
     if "mask" in window:
         valid &= window["mask"].broadcast_like(window["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
-    known = grains(window) if known is None else known
-    bands = zip(counts, known, ends, strict=True)
+    levels = grains(window) if larger_grains is None else larger_grains
+    bands = zip(counts, levels, ends, strict=True)
     saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
-    frozen, copied = _frozen(same, valid, [it.chance for it in known])
+    frozen, copied = _frozen(same, valid, [it.chance for it in levels])
     valid &= ~copied[:, np.newaxis]
     counts = _kept(counts, valid).astype(np.float64)
     frames = samples.counted(valid)

@@ -66,8 +66,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
         label = f"'{name}' of the result"
         schema.check_variable(result[name], schema.STAGES["separated"][name], label)
     if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
-        found = f"Invalid emissivities of the result, {usual:.3g} in the median"
-        raise ValueError(f"{found}. Must be shares of one, not per cent.")
+        message = f"Invalid emissivities of the result, {usual:.3g} in the median"
+        raise ValueError(f"{message}. Must be shares of one, not per cent.")
     first = apparent.isel(band=0, drop=True)
     first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]

@@ -196,14 +196,14 @@ def _separate_capture(
     digest = _digest([content, response, plan.method, plan.options])
     made = json.loads(json.dumps({**(provenance or store.provenance({})), "run": digest}))
     # Leave a result of the same run; go on with its parts.
-    parts = Path(f"{target}.parts")
+    folder = Path(f"{target}.parts")
     if target.exists() and store.open_dataset(target).attrs.get("provenance") == made:
-        shutil.rmtree(parts, ignore_errors=True)  # of a run that was killed at its very end
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed at its very end
         return
     plan = replace(plan, response=response, height=height, provenance=made)
-    _begin(parts, {"height": height, **made})
+    _begin(folder, {"height": height, **made})
     end = capture.sizes["y"]
-    paths = {top: parts / f"{top:06d}.zarr" for top in range(0, end, height)}
+    paths = {top: folder / f"{top:06d}.zarr" for top in range(0, end, height)}
     # Separate the blocks that are missing, those of one reading together.
     with ThreadPoolExecutor(threads) as pool:
         missing = list[Future[None]]()
@@ -225,7 +225,7 @@ def _separate_capture(
             for job in missing:
                 job.cancel()
     store.join_parts(paths.values(), target)
-    shutil.rmtree(parts)
+    shutil.rmtree(folder)
 
 
 def _separate_rows(
@@ -304,22 +304,22 @@ def _share(
     return threads, height, read(height)[0]
 
 
-def _begin(parts: Path, plan: Mapping[str, Any]) -> None:
+def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
     """Make the folder of the parts, or find it as the same run left it."""
-    file, content = parts / "plan.json", json.dumps(plan, indent=2, sort_keys=True)
-    parts.mkdir(parents=True, exist_ok=True)
+    file, content = folder / "plan.json", json.dumps(plan, indent=2, sort_keys=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if not file.exists():
-        if foreign := [it.name for it in parts.iterdir() if not it.name.startswith(".plan-")]:
+        if foreign := [it.name for it in folder.iterdir() if not it.name.startswith(".plan-")]:
             raise ValueError(
-                f"Foreign folder '{parts}', with '{foreign[0]}'. Must be of a run, for it is "
+                f"Foreign folder '{folder}', with '{foreign[0]}'. Must be of a run, for it is "
                 "deleted at the end, or none."
             )
-        draft = parts / f".plan-{os.getpid()}"
+        draft = folder / f".plan-{os.getpid()}"
         draft.write_text(content)
         draft.replace(file)
     elif file.read_text() != content:
         raise ValueError(
-            f"Invalid folder '{parts}': of a run of another capture, response, version, memory or "
+            f"Invalid folder '{folder}': of a run of another capture, response, version, memory or "
             "options. Must be deleted, or the run be started as it was."
         )
 
@@ -331,12 +331,12 @@ def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor
     films = [name for name, variable in capture.variables.items() if "y" in variable.dims]
     constant, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
     heights = capture["counts"].chunksizes.get("y") or [read] * math.ceil(capture.sizes["y"] / read)
-    parts = [
+    blocks = [
         every.isel(y=slice(end - rows, end))
         for end, rows in zip(accumulate(heights), heights, strict=True)
     ]
     in_memory = all(array.variable._in_memory for array in capture.values())
-    digests = map(_row_digests, parts) if in_memory else executor.map(_row_digests, parts)
+    digests = map(_row_digests, blocks) if in_memory else executor.map(_row_digests, blocks)
     return [_digest(constant), "".join(digests)]
 
 

@@ -206,19 +206,27 @@ def separated(
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
     """
-    Separate checked inputs; and the surveys of each pixel alone, of cameras at one place.
+    Separate checked inputs; and the surveys per pixel, of cameras at one place.
 
-    To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
-    What is told of the materials may `regroup` them.
+    To pool pixels before displaced cameras, the result per pixel (`alone`) is needed; made if not
+    passed. The materials may be regrouped by their ratios (`regroup`).
     """
+    # Make the result, whose values are written tile by tile.
     variables, capture = schema.STAGES["separated"], inputs.capture
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     if inputs.method.pools:
         variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
-    result = _allocate(capture, variables)
-    # Cameras apart, and materials, take passes that are not known beforehand.
+    sizes = {**capture.sizes, "other_band": capture.sizes["band"]}
+    result = separated_dataset(
+        capture,
+        {
+            name: empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
+            for name, variable in variables.items()
+        },
+    )
+    # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
@@ -248,6 +256,7 @@ def separated(
             surveys = separate_pixels(inputs, None)
     if inputs.method.pools:
         _withhold(result)
+    # Say what was used: noise, method, settings, warnings.
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     notes = [np.atleast_1d(attrs.get("warnings", [])) for attrs in sources]
@@ -314,8 +323,6 @@ def get_method(name: str | Method) -> Method:
 
     Examples
     --------
-    >>> get_method("calibrated").knows_emissivity
-    True
     >>> get_method("subspace").settings(background_drift=1.0)  # K
     SubspaceSettings(background_drift=1.0, device=None)
     """
@@ -358,20 +365,19 @@ def _separate(
     return size
 
 
-def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
-    """Make an empty result of some variables with the coordinates of a capture."""
-    sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
-    kept = {name: value for name, value in corrected.attrs.items() if name in tiles.KEPT_ATTRS}
-    arrays = {}
-    for name, variable in variables.items():
-        attrs = schema.status_attrs() if name == "status" else variable.attrs
-        array = empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
-        arrays[name] = xr.DataArray(array, dims=variable.dims, attrs={**attrs, **kept})
+def separated_dataset(capture: xr.Dataset, arrays: Mapping[str, npt.NDArray[Any]]) -> xr.Dataset:
+    """Stage `separated` of `schema` of some arrays, with the coordinates of a capture."""
+    stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+    kept = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
+    variables = {}
+    for name, array in arrays.items():
+        attrs = schema.status_attrs() if name == "status" else stage[name].attrs
+        variables[name] = (stage[name].dims, array, {**attrs, **kept})
     names = ("band", "time", "y", "x")
-    coordinates = {name: corrected[name] for name in names if name in corrected.coords}
-    if any("other_band" in variable.dims for variable in variables.values()):
-        coordinates["other_band"] = corrected["band"].rename(band="other_band")
-    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
+    coordinates = {name: capture[name] for name in names if name in capture.coords}
+    if _COVARIANCE in arrays:
+        coordinates["other_band"] = capture["band"].rename(band="other_band")
+    return xr.Dataset(variables, coordinates, kept)
 
 
 @np.errstate(over="ignore")  # a deviation beyond single precision is infinite

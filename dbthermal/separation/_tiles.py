@@ -76,20 +76,20 @@ class Pixels:
             arrays[name] = function(value) if isinstance(value, np.ndarray) else within
         return replace(self, **arrays)
 
-    def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
-        """Replace the selected pixels by those of a part, in order, in place."""
+    def replace_pixels(self, selected: Mask | Whole, record: Self) -> None:
+        """Replace the selected pixels by those of a record, in order, in place."""
         for field in fields(self):
-            value, values = getattr(self, field.name), getattr(part, field.name)
+            value, values = getattr(self, field.name), getattr(record, field.name)
             if isinstance(value, Pixels):
                 value.replace_pixels(selected, values)
             elif value is not None:
                 value[..., selected] = values
 
-    def join(self, others: Sequence[Self]) -> Self:
+    def join(self, records: Sequence[Self]) -> Self:
         """Return the record with the pixels of others after its own."""
         joined: dict[str, Any] = {}
         for field in fields(self):
-            values = [getattr(record, field.name) for record in (self, *others)]
+            values = [getattr(record, field.name) for record in (self, *records)]
             joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
         return replace(self, **joined)
 
@@ -241,18 +241,18 @@ class Estimate(Pixels):
         covariance = self.emissivity_covariance
         if covariance is not None:
             covariance = np.where(no_emissivity, np.nan, covariance)
-        parts: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             name + ending: np.where(where, np.nan, getattr(self, name + ending))
             for name, where in undefined.items()
             for ending in ("", "_std")
         }
-        return replace(self, emissivity_covariance=covariance, **parts)
+        return replace(self, emissivity_covariance=covariance, **arrays)
 
-    def replace_scatter(self, order: int, selected: Mask, part: "Estimate") -> None:
-        """Replace a scatter of the survey by the first one of a part (pixel), in place."""
-        if self.survey is not None and part.survey is not None:
-            self.survey.scatter[order][..., selected] = part.survey.scatter[0]
-            self.survey.frames[order][selected] = part.survey.frames[0]
+    def replace_scatter(self, order: int, selected: Mask, estimate: "Estimate") -> None:
+        """Replace a scatter of the survey by the first of another estimate, in place."""
+        if self.survey is not None and estimate.survey is not None:
+            self.survey.scatter[order][..., selected] = estimate.survey.scatter[0]
+            self.survey.frames[order][selected] = estimate.survey.frames[0]
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
@@ -337,14 +337,14 @@ def _wanted(
     """Yield windows, which of their pixels are wanted, of the image (pixel), and their numbers."""
     for window in every:
         places = numbers(window, width)
-        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        if places[some].size:
-            yield window, some, places[some]
+        selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        if places[selected].size:
+            yield window, selected, places[selected]
 
 
-def _picked(view: xr.Dataset, some: Whole) -> xr.Dataset:
+def _picked(view: xr.Dataset, selected: Whole) -> xr.Dataset:
     """Some pixels of a part of a capture, as one row."""
-    places = np.divmod(some[np.newaxis], view.sizes["x"])
+    places = np.divmod(selected[np.newaxis], view.sizes["x"])
     rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
     return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
 
@@ -372,29 +372,29 @@ def cut(
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
-    for window, some, places in _wanted(windows(rows, width, size), width, wanted):
+    for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
         gain = np.ones((2, places.size))
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
             view = loaded.isel(y=local, x=window[1])
-            if not isinstance(some, slice):
-                view = _picked(view, some)
+            if not isinstance(selected, slice):
+                view = _picked(view, selected)
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
         else:
             counts, usable, valid, status, gain = displaced.paired(
-                load, displacement, window[0], source, some, method.minimum_frames
+                load, displacement, window[0], source, selected, method.minimum_frames
             )
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        tile = _tile(inputs, counts, time, window, segment, some)
+        tile = _tile(inputs, counts, time, window, segment, selected)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(window[0], some)
+            tile.signals[1:] -= inputs.difference(window[0], selected)
         sections = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
@@ -415,18 +415,20 @@ def _tile(
     time: Array,
     window: Window,
     segment: Whole | None,
-    some: slice | Whole,
+    selected: slice | Whole,
 ) -> Tile:
     """Tile of counts (band, time, pixel) [count], the quietest band first, of some of a window."""
     bands = inputs.bands
     curves = tuple(inputs.curves[band] for band in bands)
     emissivity, covariance = (
-        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)[..., some]
-        for known in (inputs.emissivity, inputs.emissivity_covariance)
+        None
+        if values is None
+        else values[(..., *window)].reshape(*values.shape[:-2], -1)[..., selected]
+        for values in (inputs.emissivity, inputs.emissivity_covariance)
     )
     if emissivity is not None and covariance is not None:
         emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
-    height = window[0].stop - window[0].start if isinstance(some, slice) else 1
+    height = window[0].stop - window[0].start if isinstance(selected, slice) else 1
     # The linearised signals (see `response`), less the reference temperature.
     signals = counts if bands == sorted(bands) else counts[bands]
     for signal, curve in zip(signals, curves, strict=True):

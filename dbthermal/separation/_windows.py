@@ -38,7 +38,7 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     Returns the curves and the variances that are left.
     """
     position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
-    rows = [np.ascontiguousarray(part.T) for part in (values, variance, valid)]
+    rows = [np.ascontiguousarray(array.T) for array in (values, variance, valid)]
     halves = [1]
     while halves[-1] < time.size:
         halves.append(max(halves[-1] + 1, int(halves[-1] * _GROWTH)))

@@ -138,18 +138,18 @@ def _noise_weights(scale: Scale, weights: Weights) -> tuple[Array, Array]:
     Jensen: the square of a mean lies below a mean of squares that touches it here.
     """
     variance = np.array(scale.sigma) ** 2
-    each = weights.noise if weights.noise > 0 else _NO_NOISE
-    return each / variance, weights.noise_mean / variance
+    single = weights.noise if weights.noise > 0 else _NO_NOISE
+    return single / variance, weights.noise_mean / variance
 
 
 @compiled
 def _huber_force(
-    part: float, scale: Scale, weights: Weights, band: int, share: float
+    departure: float, scale: Scale, weights: Weights, band: int, share: float
 ) -> tuple[float, float]:
     """Curvature of a band, beyond the threshold a share of a parabola's, and gradient."""
-    threshold, size = weights.huber_threshold * scale.sigma[band], abs(part)
+    threshold, size = weights.huber_threshold * scale.sigma[band], abs(departure)
     parabola = 0.5 * weights.huber / scale.deviation[band] / max(size, threshold)
-    return (parabola if size <= threshold else share * parabola), parabola * part
+    return (parabola if size <= threshold else share * parabola), parabola * departure
 
 
 @compiled
@@ -187,19 +187,19 @@ def system(
         h1, pull1 = _huber_force(first, scale, weights, 0, share)
         h2, pull2 = _huber_force(second, scale, weights, 1, share)
         pull1, pull2 = own1 - pull1 + k2 * error, own2 - pull2 - error
-        a, c, one, two, inverse = _block(q[0] + h1, q[1] + h2, w, k2)
+        a, c, n11, n22, inverse = _block(q[0] + h1, q[1] + h2, w, k2)
         # What is left of the quadratic form: with K = N - diag(q), diag(q) N^-1 K in x and y,
         # written so that nothing cancels where both ratios are alike.
-        apart = w * q[0] * q[1] * (k1 - k2)
-        own = q[0] * h1 * two + k1**2 * q[1] * h2 * one
+        coupling = w * q[0] * q[1] * (k1 - k2)
+        diagonal = q[0] * h1 * n22 + k1**2 * q[1] * h2 * n11
         shared = w * (k2**2 * q[0] * h2 + k1**2 * q[1] * h1)
-        form[t, 0] = (own + shared + apart * (k1 - k2)) * inverse
-        form[t, 1] = (k1 * q[1] * (h2 * one + w * h1) + apart) * inverse
-        form[t, 2] = (w * (k1 * q[1] * h1 - k2 * q[0] * h2) + apart) * inverse
-        form[t, 3] = q[1] * (h2 * one + w * a) * inverse
+        form[t, 0] = (diagonal + shared + coupling * (k1 - k2)) * inverse
+        form[t, 1] = (k1 * q[1] * (h2 * n11 + w * h1) + coupling) * inverse
+        form[t, 2] = (w * (k1 * q[1] * h1 - k2 * q[0] * h2) + coupling) * inverse
+        form[t, 3] = q[1] * (h2 * n11 + w * a) * inverse
         form[t, 4], form[t, 5] = q[1] * a * w * inverse, a * c * w * inverse
-        n1 = (two * pull1 + w * k2 * pull2) * inverse
-        n2 = (w * k2 * pull1 + one * pull2) * inverse
+        n1 = (n22 * pull1 + w * k2 * pull2) * inverse
+        n2 = (w * k2 * pull1 + n11 * pull2) * inverse
         force_y = own2 - q[1] * n2
         forces[t, 0], forces[t, 1] = own1 - q[0] * n1 + k1 * force_y, force_y
         forces[t, 2] = error - w * (k2 * n1 - n2)
@@ -215,11 +215,11 @@ def noise_step(blocks: Array, moves: Array, rest: Array, scale: Scale, weights: 
     (_, k2), q, step = _ratios(rest), square + mean, moves.copy()
     w = weights.reconstruction * scale.share / scale.sigma[1] ** 2
     for t in range(len(blocks)):
-        _, _, one, two, inverse = _block(blocks[t, 2], blocks[t, 3], w, k2)
+        _, _, n11, n22, inverse = _block(blocks[t, 2], blocks[t, 3], w, k2)
         x, y, error = moves[0, t], moves[1, t], w * moves[2, t]
         first, second = q[0] * x + k2 * error - blocks[t, 0], q[1] * y - error - blocks[t, 1]
-        step[1, t] = (two * first + w * k2 * second) * inverse - x
-        step[2, t] = (w * k2 * first + one * second) * inverse - y
+        step[1, t] = (n22 * first + w * k2 * second) * inverse - x
+        step[2, t] = (w * k2 * first + n11 * second) * inverse - y
     return step
 
 
@@ -253,8 +253,8 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
     for t in range(2, rows - 2):
         # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
         center = (1.0, 5.0, 6.0)[min(t - 2, rows - 3 - t, 2)]
-        beside = -2.0 if t in (3, rows - 3) else -4.0
-        near = stiffness * (beside - below[t - 1])
+        neighbour = -2.0 if t in (3, rows - 3) else -4.0
+        near = stiffness * (neighbour - below[t - 1])
         below[t], further[t] = near / pivot[t - 1], stiffness / pivot[t - 2]
         pivot[t] = diagonal[t - 2] + center * stiffness - below[t] * near - further[t] * stiffness
         for side in range(sides.shape[1]):
@@ -272,25 +272,25 @@ def _emissivity(
     rest: Array, border: Array, forces: Array, damping: float, weights: Weights
 ) -> tuple[float, float]:
     """New emissivities: damped, of limited change, inside (0, 1)."""
-    # The offset is eliminated: a system A in the two ratios.
-    a1 = border[1, 1] - border[0, 1] ** 2 / border[0, 0]
-    a12 = border[1, 2] - border[0, 1] * border[0, 2] / border[0, 0]
-    a2 = border[2, 2] - border[0, 2] ** 2 / border[0, 0]
-    f1 = forces[1] - border[0, 1] * forces[0] / border[0, 0]
-    f2 = forces[2] - border[0, 2] * forces[0] / border[0, 0]
+    # The offset is eliminated: a symmetric system A da = f in the two ratios.
+    pull = border[0, 1:] / border[0, 0]
+    f1, f2 = forces[1] - pull[0] * forces[0], forces[2] - pull[1] * forces[0]
+    a11 = border[1, 1] - pull[0] * border[0, 1]
+    a12 = border[1, 2] - pull[0] * border[0, 2]
+    a22 = border[2, 2] - pull[1] * border[0, 2]
     # With J = d(k_1, k_2) / d(e_1, e_2): (J^T A J + damping) de = J^T f
-    _, one, other = rest
-    j11, j12 = -other / one**2, 1.0 / one
-    j21, j22 = (1.0 - other) / (1.0 - one) ** 2, -1.0 / (1.0 - one)
-    a = a1 * j11**2 + 2.0 * a12 * j11 * j21 + a2 * j21**2 + damping
-    b = a1 * j11 * j12 + a12 * (j11 * j22 + j12 * j21) + a2 * j21 * j22
-    c = a1 * j12**2 + 2.0 * a12 * j12 * j22 + a2 * j22**2 + damping
+    _, e1, e2 = rest
+    j11, j12 = -e2 / e1**2, 1.0 / e1
+    j21, j22 = (1.0 - e2) / (1.0 - e1) ** 2, -1.0 / (1.0 - e1)
+    a = a11 * j11**2 + 2.0 * a12 * j11 * j21 + a22 * j21**2 + damping
+    b = a11 * j11 * j12 + a12 * (j11 * j22 + j12 * j21) + a22 * j21 * j22
+    c = a11 * j12**2 + 2.0 * a12 * j12 * j22 + a22 * j22**2 + damping
     push1, push2 = j11 * f1 + j21 * f2, j12 * f1 + j22 * f2
     determinant = a * c - b * b
-    first, second = (c * push1 - b * push2) / determinant, (a * push2 - b * push1) / determinant
-    share = min(weights.largest_step / max(abs(first), abs(second)), 1.0)
+    step1, step2 = (c * push1 - b * push2) / determinant, (a * push2 - b * push1) / determinant
+    share = min(weights.largest_step / max(abs(step1), abs(step2)), 1.0)
     low, high = weights.margin, 1.0 - weights.margin
-    return min(max(one + share * first, low), high), min(max(other + share * second, low), high)
+    return min(max(e1 + share * step1, low), high), min(max(e2 + share * step2, low), high)
 
 
 @compiled
@@ -337,8 +337,8 @@ def _propose(
                 border[i, j] -= sides[t, i + 1] * solved[t, j + 1]
     push[1] -= stiff * k1 * square
     border[1, 1] += stiff * square
-    one, other = _emissivity(rest, border, push, damping * frames, weights)
-    new = np.array([rest[0], one, other])
+    e1, e2 = _emissivity(rest, border, push, damping * frames, weights)
+    new = np.array([rest[0], e1, e2])
     # Back substitution: the ratios as they became, then the offset, the smooth signal, the noise.
     after1, after2 = _ratios(new)
     move1, move2 = after1 - k1, after2 - k2
@@ -371,11 +371,11 @@ def descend(
     damping, share, stalled = _FIRST_DAMPING, _SHARE[1], 0
     loss = losses(films, rest, signals, scale, weights).sum()
     for _ in range(steps):
-        new, other = _propose(films, rest, signals, scale, weights, damping, share)
-        proposed = losses(new, other, signals, scale, weights).sum()
+        new, ratios = _propose(films, rest, signals, scale, weights, damping, share)
+        proposed = losses(new, ratios, signals, scale, weights).sum()
         before, better = loss, proposed <= loss  # false where it is NaN
         if better:
-            films, rest, loss = new, other, proposed
+            films, rest, loss = new, ratios, proposed
         stalled = stalled + 1 if before - loss <= weights.tolerance * before else 0
         damping = min(max(damping * (_EASIER if better else _HARDER), _DAMPING[0]), _DAMPING[1])
         share = min(max(share * (_LESS if better else _MORE), _SHARE[0]), _SHARE[1])

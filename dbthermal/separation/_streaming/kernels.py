@@ -79,8 +79,8 @@ def _single(record: Any) -> Any:
     """Record of numbers, and of tuples of them, in single precision."""
     if not isinstance(record, tuple):
         return np.float32(record) if isinstance(record, float) else record
-    parts = [_single(part) for part in record]
-    return type(record)(*parts) if hasattr(record, "_fields") else tuple(parts)
+    numbers = [_single(number) for number in record]
+    return type(record)(*numbers) if hasattr(record, "_fields") else tuple(numbers)
 
 
 def fit(means: Array, centre: int, latency: int, interval: float, frames: Array) -> Fit:
@@ -96,12 +96,12 @@ def fit(means: Array, centre: int, latency: int, interval: float, frames: Array)
     weights = np.zeros((len(WINDOWS), 2, times.size))
     ends = np.empty((len(WINDOWS), 2), np.intp)
     for weight, end, (before, after, degree) in zip(weights, ends, WINDOWS, strict=True):
-        inside = joined & (steps >= -max(1, int(before * latency)))
-        inside &= steps <= max(1, int(after * latency))
-        order = min(int(degree) + 1, int(np.count_nonzero(inside)))
-        powers = (times[inside, np.newaxis] - times[centre]) ** np.arange(order)
-        weight[:order, inside] = np.linalg.pinv(powers)[:2]
-        end[:] = np.flatnonzero(inside)[[0, -1]] + (0, 1)
+        selected = joined & (steps >= -max(1, int(before * latency)))
+        selected &= steps <= max(1, int(after * latency))
+        order = min(int(degree) + 1, int(np.count_nonzero(selected)))
+        powers = (times[selected, np.newaxis] - times[centre]) ** np.arange(order)
+        weight[:order, selected] = np.linalg.pinv(powers)[:2]
+        end[:] = np.flatnonzero(selected)[[0, -1]] + (0, 1)
     variance = (weights[:, 0] ** 2).sum(axis=1) / frames.size
     return Fit(weights, ends, variance, frames - times[centre])
 
