@@ -38,8 +38,7 @@ class CalibratedSettings:
     Attributes
     ----------
     smooth : bool
-        Smooth the object temperature over as many frames as its own curve allows; if not, each
-        frame stands alone.
+        Smooth the object over as many frames as its curve allows; if not, each frame stands alone.
     """
 
     smooth: bool = True
@@ -57,6 +56,7 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     if covariance is None:
         covariance = np.zeros((len(e), *e.shape))
     level = np.zeros(e.shape[1])
+    # Solve every frame, and smooth the object.
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
         solution = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
@@ -69,6 +69,7 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
         for mean, variance in ((signal, left), (solution.background, solution.background_variance)):
             values += frames.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
+    # Flag gray pixels, and those without a solution.
     solved &= np.all(np.isfinite(values), axis=0)
     values = [np.where(solved, value, np.nan) for value in values]
     lost = ~np.all(solved, axis=0) & ~gray

@@ -54,20 +54,14 @@ class Method:
         Name in errors and in the attribute `method` of a result.
     minimum_frames : int
         Shortest capture.
-    knows_emissivity : bool
-        The method needs known emissivities, and does not estimate them.
-    whole_image : bool
-        The method looks at a pixel's neighbours: a tile is the whole image.
-    every_frame : bool
-        The method does not solve a pixel that lacks a frame of the others.
-    even_times : bool
-        The method refuses frames at uneven times, by name.
-    pools : bool
-        An estimate holds a `Survey`, and a covariance of the emissivities.
+    knows_emissivity, any_bands, pools : bool
+        It needs known emissivities, and estimates none; takes more than two bands; its estimates
+        hold a `Survey`, and a covariance of the emissivities.
+    whole_image, every_frame, even_times : bool
+        A tile is the whole image; a pixel that lacks a frame of the others is not solved; uneven
+        times are refused.
     check_clock : callable, optional
         Refuses times that are not of exposure.
-    any_bands : bool
-        The method takes more than two bands.
     compiled : bool
         The method is compiled, a pixel at a time.
     not_estimated : tuple of str
@@ -280,6 +274,7 @@ def _noise(
     """Noise (band) [K], and the response with it, for all parts; `noise_source` says of which."""
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
     factor, decided = _noise_factor(capture), response.attrs.get("noise_source")
+    # With a stated noise: that, unless the capture proves more.
     if "noise" in response:
         stated_noise = np.asarray(responses.noise(response, names) / slopes)
         if decided == "capture":
@@ -303,7 +298,7 @@ def _noise(
         )
         doubt = "is the response of another integration time, or are two bands exchanged?"
         response = warned(response, f"The noise of the capture, which is used, is {said}: {doubt}")
-    else:
+    else:  # estimate it from the capture
         subsample, frames = quality.sample(capture, _NOISE_PIXELS)
         linear = [curve.linearise(band) for curve, band in zip(curves, subsample, strict=True)]
         noise = noises.estimate_bands(linear, capture["time"].values[frames])

@@ -113,10 +113,9 @@ def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mas
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     """Bridge short gaps of single pixels by a line in all bands.
 
-    A line between the same two frames in all bands holds the same mixture of object and
-    background. Bridged are gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture,
-    in pixels that lack few, where most others that have samples at all have one. Returns the
-    counts, and the samples that are valid or bridged.
+    The same two frames in all bands hold the same mixture of object and background. Bridged are
+    gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture, in pixels with few gaps,
+    in frames that most pixels have. Returns the counts, and the samples that are valid or bridged.
     """
     if valid.all():
         return counts, valid
@@ -126,12 +125,14 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)
     if not np.any(gap):
         return counts, valid
+    # Nearest valid frames before and after each gap.
     frame, pixel = np.nonzero(gap)
     selected, place = np.unique(pixel, return_inverse=True)
     places = np.arange(len(valid))[:, np.newaxis]
     before = np.maximum.accumulate(np.where(valid[:, selected], places, -len(valid)))[frame, place]
     after = np.where(valid[::-1, selected], places, -len(valid))
     after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
+    # A line between them, if they are near.
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
     frame, pixel, first, last = (band[short] for band in (frame, pixel, before, after))
@@ -198,8 +199,7 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
 
 
 def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
-    """
-    Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
+    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
 
     Of the samples that repeat the one before, by band.
     """

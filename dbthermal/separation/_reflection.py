@@ -11,9 +11,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
 
     .. math:: (1 - e_1) (y - \bar y)
 
-    with the mean over time, in the linear response of small changes. Where the object is constant,
-    and no background was completed, all that changes is reflected: the apparent temperature less
-    its mean.
+    with the mean over time, in the linear response of small changes. Of a constant object without
+    a completed background it is the change of the apparent temperature.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
 """Tiles of a capture: the inputs of each, cut out of the capture, and the estimate that it yields.
 
-A capture is read in blocks of rows and separated a few hundred pixels at a time: the memory beyond
-the result stays small, a lazy capture is never read whole, and a tile fits in the processor's
-cache. A tile's bands are in the order of their noise, the quietest first: the regression for the
-emissivity needs a quiet ordinate.
+A capture is read in blocks of rows and separated a few hundred pixels at a time, so that a tile
+fits in the processor's cache. A tile's bands are in the order of their noise, the quietest first:
+the regression for the emissivity needs a quiet ordinate.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -38,21 +37,14 @@ PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
 SAMPLES: Final = 2**19
-"""Samples of a band in a tile, at most: a long capture has tiles of fewer pixels, or its arrays
-outgrow the cache that the cores share, which takes 1.3 times as long at 30,000 frames."""
+"""Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long."""
 
-# Times as many pixels in a tile whose steps are compiled, which keep to the cache by themselves, or
-# on a device: the pixels that need more are then enough together.
-_COMPILED: Final = 8
-# Samples of a band that are read together where pixels are then sorted by their noise: of few rows,
-# those around them, which they are made of, would be most of what is read.
+_COMPILED: Final = 8  # times as many pixels in a tile of a compiled method, or on a device
+# Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
-# Resampled samples whose noise differs by less are separated together [1].
-_NOISE_STEP: Final = 0.05
-# A temperature leaves the calibrated range if it is so many standard deviations outside.
-RANGE_SIGMAS: Final = 5.0
-# A temperature [K], emissivity [1] or deviation beyond is no result.
-USELESS: Final = 1e6
+_NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
+RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
+USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
 """Variables that a method without standard deviations never estimates."""
@@ -258,9 +250,8 @@ class Estimate(Pixels):
         """
         Flag temperatures outside the calibrated range of a response, and values without a number.
 
-        Samples without a temperature, or with a useless standard deviation, become NaN; variables
-        that the method has `not_estimated` may be NaN without a flag. A quantity that is NaN in all
-        samples of a pixel with another status bit needs no further bit.
+        Samples without a useful standard deviation become NaN. No bit is set for variables that are
+        `not_estimated`, or NaN in all samples of a pixel with another bit.
         """
         values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
@@ -352,7 +343,7 @@ def _picked(view: xr.Dataset, selected: Whole) -> xr.Dataset:
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
-    """Read a block of rows and cut it into tiles; with the material of each pixel of the image.
+    """Read rows and cut them into tiles, with the material of each pixel of the image.
 
     Of all pixels, or of those of the image that are `wanted` (pixel).
     """
@@ -372,6 +363,7 @@ def cut(
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
+    # Read each window, judge its samples, and group its pixels by their valid frames.
     for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
         gain = np.ones((2, places.size))
         if displacement is None:
@@ -451,10 +443,9 @@ def _tile(
 def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
-    """
-    Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
+    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
 
-    The residual pattern, as independent from pixel to pixel, is lessened as the noise is.
+    A residual pattern is independent from pixel to pixel, and is scaled like the noise.
     """
     order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):

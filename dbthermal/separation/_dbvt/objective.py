@@ -1,10 +1,10 @@
 r"""The paper's objective: five losses of one pixel's smooth signal, noise and emissivities.
 
-Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, algorithm 1, with its slips put right:
-the reconstruction starts from the second band's smooth signal (the paper prints the first's), the
-mean of the noise enters by its square (the paper prints a signed mean, which has no lower bound),
-and a signal is never divided by less than its noise. Signals are linearised, so that both slopes
-a_m are 1. Sums over time are means, so that no weight depends on the number of frames.
+Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, algorithm 1, with three slips put right:
+the reconstruction starts from the second band's smooth signal (printed: the first's), the mean of
+the noise enters by its square (printed: signed, without a lower bound), and a signal is divided by
+no less than its noise. Signals are linearised, so that both slopes a_m are 1. Sums over time are
+means, so that no weight depends on the number of frames.
 
 With the emission and the reflection ratio :math:`k_1 = e_2 / e_1, k_2 = (1-e_2) / (1-e_1)`:
 
@@ -74,10 +74,7 @@ def _ratios(rest: Array) -> tuple[float, float]:
 
 @compiled
 def deviation(signal: Array, noise: Array, sigma: float, floor: float) -> float:
-    """Standard deviation over time [K] of the corrected signal of a band, at least the noise.
-
-    The mean drops out of a comparison.
-    """
+    """Standard deviation over time [K] of the corrected signal of a band, at least the noise."""
     mean, square = (signal - noise).mean(), 0.0
     for t in range(signal.size):
         square += (signal[t] - noise[t] - mean) ** 2
@@ -133,10 +130,7 @@ def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Wei
 
 @compiled
 def _noise_weights(scale: Scale, weights: Weights) -> tuple[Array, Array]:
-    """Curvatures (band) of the noise's square, and of its mean: a majorant of the mean's square.
-
-    Jensen: the square of a mean lies below a mean of squares that touches it here.
-    """
+    """Curvatures (band) of the noise's square and of its mean's, which by Jensen is a majorant."""
     variance = np.array(scale.sigma) ** 2
     single = weights.noise if weights.noise > 0 else _NO_NOISE
     return single / variance, weights.noise_mean / variance
@@ -250,7 +244,7 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
     rows = diagonal.size + 4
     solved, pivot = np.zeros((rows, sides.shape[1])), np.full(rows, np.inf)
     below, further = np.zeros(rows), np.zeros(rows)
-    for t in range(2, rows - 2):
+    for t in range(2, rows - 2):  # forward: the factors
         # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
         center = (1.0, 5.0, 6.0)[min(t - 2, rows - 3 - t, 2)]
         neighbour = -2.0 if t in (3, rows - 3) else -4.0
@@ -260,7 +254,7 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
         for side in range(sides.shape[1]):
             before = below[t] * solved[t - 1, side] + further[t] * solved[t - 2, side]
             solved[t, side] = sides[t - 2, side] - before
-    for t in range(rows - 3, 1, -1):
+    for t in range(rows - 3, 1, -1):  # and backward
         for side in range(sides.shape[1]):
             after = below[t + 1] * solved[t + 1, side] + further[t + 2] * solved[t + 2, side]
             solved[t, side] = solved[t, side] / pivot[t] - after
@@ -364,10 +358,7 @@ def descend(
     steps: int,
     patience: int,
 ) -> tuple[Array, Array, float, bool]:
-    """Unknowns and objective of a pixel after some steps, each taken where it lowers the objective.
-
-    They end when so many in a row did not lower it by more than the tolerance: true, if they did.
-    """
+    """Unknowns and objective of a pixel after Newton's steps; true if it stopped improving."""
     damping, share, stalled = _FIRST_DAMPING, _SHARE[1], 0
     loss = losses(films, rest, signals, scale, weights).sum()
     for _ in range(steps):

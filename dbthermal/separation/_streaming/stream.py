@@ -193,8 +193,8 @@ class Stream:
             When the frame was exposed, or each of the frames (time) [s].
         frames : ndarray
             Corrected counts (band, y, x) or (band, time, y, x) [count], the bands as in the
-            template, NaN for no sample. A frame is lost if a band of it has no number, or repeats
-            the frame before.
+            template, NaN for no sample. A frame without a number in a band, or that repeats the one
+            before, is lost.
         segment : int
             Number of shutter events before the frames.
 
