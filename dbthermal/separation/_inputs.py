@@ -89,7 +89,6 @@ class Inputs:
 
     response: xr.Dataset  # with the noise that is used, for the whole capture and all its parts
     response_kind: str  # "exact" or "linear"
-    name: str  # of the method
     method: Method
     settings: Any  # of the type that the method has, or None
     seed: int  # of random starts
@@ -144,7 +143,6 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     corrected: xr.Dataset,
     response: xr.Dataset,
     method: Method,
-    name: str,
     *,
     settings: Any = None,
     seed: int = 0,
@@ -157,7 +155,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     response_kind: str = "exact",
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
-    settings = _checked_settings(method, name, settings)
+    name, settings = method.name, _checked_settings(method, settings)
     schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
@@ -189,7 +187,6 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     return Inputs(
         response=response,
         response_kind=response_kind,
-        name=name,
         method=method,
         settings=settings,
         seed=seed,
@@ -201,11 +198,11 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         emissivity=value,
         emissivity_covariance=covariance,
         labels=None if pool is None else numbered(corrected, pool),
-        displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
+        displacement=_displacement(corrected, reflection_shift, method, order[0]),
     )
 
 
-def _checked_settings(method: Method, name: str, settings: Any) -> Any:
+def _checked_settings(method: Method, settings: Any) -> Any:
     """Return the settings of a method, its defaults for None; None for a method without any."""
     kind = method.settings
     if settings is None:
@@ -213,7 +210,8 @@ def _checked_settings(method: Method, name: str, settings: Any) -> Any:
     if kind is None or type(settings) is not kind:
         rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
         raise TypeError(
-            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
+            f"Invalid settings of type {type(settings).__name__} for method '{method.name}'. "
+            f"Must {rule}."
         )
     return settings
 
@@ -402,14 +400,15 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: 
 
 
 def _displacement(
-    corrected: xr.Dataset, shift: xr.Dataset | None, method: Method, name: str, reference: int
+    corrected: xr.Dataset, shift: xr.Dataset | None, method: Method, reference: int
 ) -> Displacement | None:
     """Displacement of the second camera's reflections, for a method that tells them apart."""
     if shift is None:
         return None
     if method.whole_image or "background_temperature" in method.not_estimated:
         raise ValueError(
-            f"Invalid reflection_shift for method '{name}', which separates no reflection. Omit it."
+            f"Invalid reflection_shift for method '{method.name}', which separates no reflection. "
+            "Omit it."
         )
     return displaced.check(shift, corrected, reference)
 

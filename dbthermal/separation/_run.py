@@ -187,7 +187,7 @@ def _separate_capture(
     # Check the inputs, and recognise the capture.
     capture = store.open_dataset(source) if isinstance(source, Path) else source
     method = get_method(plan.method)
-    checked = _inputs.check(capture, plan.response, method, plan.method, **plan.options)
+    checked = _inputs.check(capture, plan.response, method, **plan.options)
     settings = plan.options["settings"]
     threads, height, read = _share(capture, memory, executor, method, settings)
     with ThreadPoolExecutor(threads) as pool:

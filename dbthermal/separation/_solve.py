@@ -175,12 +175,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     """
     require_workers(workers)
     require_seed(seed)
-    record = get_method(method)
     inputs = check(
         corrected,
         response,
-        record,
-        record.name,
+        get_method(method),
         settings=settings,
         seed=seed,
         emissivity=emissivity,
@@ -210,26 +208,18 @@ def separated(
     passed. The materials may be regrouped by their ratios (`regroup`).
     """
     # Make the result, whose values are written tile by tile.
-    variables, capture = schema.STAGES["separated"], inputs.capture
+    capture, names = inputs.capture, [*schema.STAGES["separated"]]
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
-    if inputs.method.pools:
-        variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
-    sizes = {**capture.sizes, "other_band": capture.sizes["band"]}
-    result = separated_dataset(
-        capture,
-        {
-            name: empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
-            for name, variable in variables.items()
-        },
-    )
+    names += [_COVARIANCE] if inputs.method.pools else []
+    result = separated_dataset(capture, dict.fromkeys(names))
     # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
-        tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
+        tqdm(total=total, unit="pixel", desc=inputs.method.name, disable=not progress) as bar,
     ):
 
         def separate_pixels(
@@ -264,7 +254,7 @@ def separated(
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
     ratios = () if inputs.method.pools else ("reflection_ratio", "reflection_ratio_std")
     result = result.assign_attrs(
-        method=inputs.name,
+        method=inputs.method.name,
         pooled=int(pooled),
         response_kind=inputs.response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
@@ -363,14 +353,20 @@ def _separate(
     return size
 
 
-def separated_dataset(capture: xr.Dataset, arrays: Mapping[str, npt.NDArray[Any]]) -> xr.Dataset:
-    """Stage `separated` of `schema` of some arrays, with the coordinates of a capture."""
+def separated_dataset(
+    capture: xr.Dataset, arrays: Mapping[str, npt.NDArray[Any] | None]
+) -> xr.Dataset:
+    """Stage `separated` of `schema` of some arrays, None for empty ones, on a capture's grid."""
     stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+    sizes = {**capture.sizes, "other_band": capture.sizes["band"]}
     kept = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
     variables = {}
     for name, array in arrays.items():
-        attrs = schema.status_attrs() if name == "status" else stage[name].attrs
-        variables[name] = (stage[name].dims, array, {**attrs, **kept})
+        dims, attrs = stage[name].dims, stage[name].attrs
+        if array is None:
+            array = empty(tuple(sizes[dim] for dim in dims), stage[name].dtype)
+        attrs = schema.status_attrs() if name == "status" else attrs
+        variables[name] = (dims, array, {**attrs, **kept})
     names = ("band", "time", "y", "x")
     coordinates = {name: capture[name] for name in names if name in capture.coords}
     if _COVARIANCE in arrays:

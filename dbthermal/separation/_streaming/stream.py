@@ -127,8 +127,8 @@ class Stream:
             _numbers.real_number(f"{name} [s]", value, _SECONDS)
         require_workers(workers)
         options: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
-        options |= {"reflection_shift": reflection_shift, "name": "stream"}
-        options["method"] = replace(METHOD, minimum_frames=1, any_bands=False)
+        options["reflection_shift"] = reflection_shift
+        options["method"] = replace(METHOD, name="stream", minimum_frames=1, any_bands=False)
         inputs = _inputs.check(template, response, **options)
         if inputs.settings.device is not None:
             raise ValueError(f"Invalid device '{inputs.settings.device}' of a stream. Omit it.")
