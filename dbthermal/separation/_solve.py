@@ -362,11 +362,11 @@ def separated_dataset(
     kept = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
     variables = {}
     for name, array in arrays.items():
-        dims, attrs = stage[name].dims, stage[name].attrs
-        if array is None:
-            array = empty(tuple(sizes[dim] for dim in dims), stage[name].dtype)
-        attrs = schema.status_attrs() if name == "status" else attrs
-        variables[name] = (dims, array, {**attrs, **kept})
+        dims = stage[name].dims
+        attrs = schema.status_attrs() if name == "status" else stage[name].attrs
+        shape = tuple(sizes[dim] for dim in dims)
+        values = empty(shape, stage[name].dtype) if array is None else array
+        variables[name] = (dims, values, {**attrs, **kept})
     names = ("band", "time", "y", "x")
     coordinates = {name: capture[name] for name in names if name in capture.coords}
     if _COVARIANCE in arrays:
