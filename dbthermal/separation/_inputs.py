@@ -392,11 +392,9 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: 
     for dim in second:  # the same bands
         exchanged = array.rename({"band": dim, dim: "band"})
         array = laid_on(exchanged, corrected, name, "the capture")
-    leading = array.shape[: 1 + len(second)]
-    values = array.values.astype(np.float64).reshape(
-        *leading, *array.shape[len(leading) :] or (1, 1)
-    )
-    return np.broadcast_to(values, (*leading, corrected.sizes["y"], corrected.sizes["x"]))
+    values = array.values.astype(np.float64)
+    values = values if "y" in array.dims else values[..., np.newaxis, np.newaxis]
+    return np.broadcast_to(values, (*values.shape[:-2], *(corrected.sizes[dim] for dim in "yx")))
 
 
 def _displacement(

@@ -85,7 +85,7 @@ class Search:
         signals = np.tile(tile.signals, settings.starts)
         rise = emissivity[1] / emissivity[0] * (smooth - smooth[0])
         offset = np.mean(signals[1] - rise, axis=0) * (not settings.smooth_from_zero)
-        self.rest = np.stack([offset, *emissivity], axis=1)
+        self.scalars = np.stack([offset, *emissivity], axis=1)
         self.signals = np.moveaxis(signals, -1, 0).copy()
         self.films = np.zeros((columns, 3, frames))
         self.films[:, 0] = smooth.T
@@ -118,7 +118,7 @@ class Search:
     def _descend(self, column: int, progress: float) -> tuple[float, bool]:
         """Minimise the objective of a column, with the reconstruction's weight of that progress."""
         settings, sigma, last = self.settings, self.tile.noise, progress == 1.0
-        images, films, rest = self.signals[column], self.films[column], self.rest[column]
+        images, films, scalars = self.signals[column], self.films[column], self.scalars[column]
         deviation = [
             objective.deviation(*band, settings.deviation_floor)
             for band in zip(images, films[1:], sigma, strict=True)
@@ -128,8 +128,8 @@ class Search:
         scale = objective.Scale(sigma, tuple(deviation), first ** (1.0 - progress))
         steps = settings.steps if last else settings.stage_steps
         patience = settings.patience if last else steps + 1
-        minimum = objective.descend(films, rest, images, scale, self.weights, steps, patience)
-        self.films[column], self.rest[column], loss, converged = minimum
+        minimum = objective.descend(films, scalars, images, scale, self.weights, steps, patience)
+        self.films[column], self.scalars[column], loss, converged = minimum
         return loss, converged
 
     def _nonlinearity(self) -> Array:
@@ -139,7 +139,7 @@ class Search:
 
         Zero where a temperature leaves the range of the response, and for a linear one.
         """
-        tile, (_, e1, e2) = self.tile, self.rest.T[..., np.newaxis]
+        tile, (_, e1, e2) = self.tile, self.scalars.T[..., np.newaxis]
         first, second = np.moveaxis(self.signals - self.films[:, 1:], 1, 0)
         in_range, departures = np.ones(len(first), dtype=bool), []
         # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
@@ -164,7 +164,7 @@ def _report(
     tile: Tile, search: Search, kept: npt.NDArray[np.intp], lost: Mask, unfinished: Mask
 ) -> Estimate:
     """Temperatures at the emissivities of the kept columns, by the calibrated closed form."""
-    emissivity, signals = search.rest[kept, 1:].T, tile.signals
+    emissivity, signals = search.scalars[kept, 1:].T, tile.signals
     if search.settings.temperatures_from == "corrected":
         signals = signals - np.moveaxis(search.films[kept, 1:], 0, -1)
     solution = calibrated.separate(

@@ -25,8 +25,8 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 1981, doi:10.1002/0471725250) is added, as much as it takes to lower the objective.
 
 All is compiled, a pixel at a time. Its unknowns are `films`, the smooth signal of the first band
-and the noise of both (3, time) [K], and `rest`: the first value of the second band's smooth signal
-[K] and both emissivities [1].
+and the noise of both (3, time) [K], and `scalars`: the first value of the second band's smooth
+signal [K] and both emissivities [1].
 """
 
 from typing import Final, NamedTuple
@@ -68,8 +68,8 @@ class Scale(NamedTuple):
 
 
 @compiled
-def _ratios(rest: Array) -> tuple[float, float]:
-    return rest[2] / rest[1], (1.0 - rest[2]) / (1.0 - rest[1])
+def _ratios(scalars: Array) -> tuple[float, float]:
+    return scalars[2] / scalars[1], (1.0 - scalars[2]) / (1.0 - scalars[1])
 
 
 @compiled
@@ -82,11 +82,11 @@ def deviation(signal: Array, noise: Array, sigma: float, floor: float) -> float:
 
 
 @compiled
-def departures(films: Array, rest: Array, signals: Array, t: int) -> tuple[float, float, float]:
+def departures(films: Array, scalars: Array, signals: Array, t: int) -> tuple[float, float, float]:
     """Departures p_m from the smooth signals, and error r of the reconstruction, in a frame [K]."""
-    emission, reflection = _ratios(rest)
+    emission, reflection = _ratios(scalars)
     first = signals[0, t] - films[1, t] - films[0, t]
-    second = signals[1, t] - films[2, t] - rest[0] - emission * (films[0, t] - films[0, 0])
+    second = signals[1, t] - films[2, t] - scalars[0] - emission * (films[0, t] - films[0, 0])
     return first, second, second - reflection * first
 
 
@@ -98,9 +98,9 @@ def huber(value: float, threshold: float) -> float:
 
 
 @compiled
-def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Weights) -> Array:
+def losses(films: Array, scalars: Array, signals: Array, scale: Scale, weights: Weights) -> Array:
     """Weighted losses (5,) [1] in the order of the weights; their sum is the objective."""
-    emission, _ = _ratios(rest)
+    emission, _ = _ratios(scalars)
     sums, mean, frames = np.zeros(5), np.zeros(2), films.shape[1]
     sigma, deviation = scale.sigma, scale.deviation
     limit = (
@@ -108,7 +108,7 @@ def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Wei
         weights.huber_threshold * sigma[1] / deviation[1],
     )
     for t in range(frames):
-        first, second, error = departures(films, rest, signals, t)
+        first, second, error = departures(films, scalars, signals, t)
         if t > 1:
             sums[0] += (films[0, t] - 2.0 * films[0, t - 1] + films[0, t - 2]) ** 2
         sums[1] += huber(first / deviation[0], limit[0]) + huber(second / deviation[1], limit[1])
@@ -156,7 +156,7 @@ def _block(a: float, c: float, weight: float, reflection: float) -> tuple[float,
 
 @compiled
 def system(
-    films: Array, rest: Array, signals: Array, scale: Scale, weights: Weights, share: float
+    films: Array, scalars: Array, signals: Array, scale: Scale, weights: Weights, share: float
 ) -> tuple[Array, Array, Array]:
     r"""Newton's equations of each frame, the noise eliminated, in the changes of three forms.
 
@@ -169,13 +169,13 @@ def system(
     y and with z, then yy, yz, zz; the forces (time, 3) of the smooth signal, y and z; and for
     `noise_step` (time, 5) pull and q + h of both bands, and p_1.
     """
-    (k1, k2), frames = _ratios(rest), films.shape[1]
+    (k1, k2), frames = _ratios(scalars), films.shape[1]
     form, forces, blocks = np.empty((frames, 6)), np.empty((frames, 3)), np.empty((frames, 5))
     w = weights.reconstruction * scale.share / scale.sigma[1] ** 2
     square, mean = _noise_weights(scale, weights)
     q, level1, level2 = square + mean, mean[0] * films[1].mean(), mean[1] * films[2].mean()
     for t in range(frames):
-        first, second, error = departures(films, rest, signals, t)
+        first, second, error = departures(films, scalars, signals, t)
         error *= w
         own1, own2 = square[0] * films[1, t] + level1, square[1] * films[2, t] + level2
         h1, pull1 = _huber_force(first, scale, weights, 0, share)
@@ -203,10 +203,12 @@ def system(
 
 
 @compiled
-def noise_step(blocks: Array, moves: Array, rest: Array, scale: Scale, weights: Weights) -> Array:
+def noise_step(
+    blocks: Array, moves: Array, scalars: Array, scale: Scale, weights: Weights
+) -> Array:
     """Steps of smooth signal and noise (3, time), of the forms x, y and z (3, time)."""
     square, mean = _noise_weights(scale, weights)
-    (_, k2), q, step = _ratios(rest), square + mean, moves.copy()
+    (_, k2), q, step = _ratios(scalars), square + mean, moves.copy()
     w = weights.reconstruction * scale.share / scale.sigma[1] ** 2
     for t in range(len(blocks)):
         _, _, n11, n22, inverse = _block(blocks[t, 2], blocks[t, 3], w, k2)
@@ -263,7 +265,7 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
 
 @compiled
 def _emissivity(
-    rest: Array, border: Array, forces: Array, damping: float, weights: Weights
+    scalars: Array, border: Array, forces: Array, damping: float, weights: Weights
 ) -> tuple[float, float]:
     """New emissivities: damped, of limited change, inside (0, 1)."""
     # The offset is eliminated: a symmetric system A da = f in the two ratios.
@@ -273,7 +275,7 @@ def _emissivity(
     a12 = border[1, 2] - pull[0] * border[0, 2]
     a22 = border[2, 2] - pull[1] * border[0, 2]
     # With J = d(k_1, k_2) / d(e_1, e_2): (J^T A J + damping) de = J^T f
-    _, e1, e2 = rest
+    _, e1, e2 = scalars
     j11, j12 = -e2 / e1**2, 1.0 / e1
     j21, j22 = (1.0 - e2) / (1.0 - e1) ** 2, -1.0 / (1.0 - e1)
     a = a11 * j11**2 + 2.0 * a12 * j11 * j21 + a22 * j21**2 + damping
@@ -290,7 +292,7 @@ def _emissivity(
 @compiled
 def _propose(
     films: Array,
-    rest: Array,
+    scalars: Array,
     signals: Array,
     scale: Scale,
     weights: Weights,
@@ -298,8 +300,8 @@ def _propose(
     share: float,
 ) -> tuple[Array, Array]:
     """Unknowns after a Newton step: noise, then smooth signal, then border are eliminated."""
-    form, forces, blocks = system(films, rest, signals, scale, weights, share)
-    frames, (k1, k2) = films.shape[1], _ratios(rest)
+    form, forces, blocks = system(films, scalars, signals, scale, weights, share)
+    frames, (k1, k2) = films.shape[1], _ratios(scalars)
     # The smoothness loss is stiff (1 + k_1^2) |D s|^2 / 2, in the smooth signal s and in k_1.
     stiff = weights.smoothness / weights.curvature**2
     bend, square = bending(films[0])
@@ -331,8 +333,8 @@ def _propose(
                 border[i, j] -= sides[t, i + 1] * solved[t, j + 1]
     push[1] -= stiff * k1 * square
     border[1, 1] += stiff * square
-    e1, e2 = _emissivity(rest, border, push, damping * frames, weights)
-    new = np.array([rest[0], e1, e2])
+    e1, e2 = _emissivity(scalars, border, push, damping * frames, weights)
+    new = np.array([scalars[0], e1, e2])
     # Back substitution: the ratios as they became, then the offset, the smooth signal, the noise.
     after1, after2 = _ratios(new)
     move1, move2 = after1 - k1, after2 - k2
@@ -345,13 +347,13 @@ def _propose(
         step[2, t] = blocks[t, 4] * move2
     # The border's offset is that of the line between the smooth signals: back to the first frame.
     new[0] += offset - k1 * films[0, 0] + after1 * (films[0, 0] + step[0, 0])
-    return films + noise_step(blocks, step, rest, scale, weights), new
+    return films + noise_step(blocks, step, scalars, scale, weights), new
 
 
 @compiled
 def descend(
     films: Array,
-    rest: Array,
+    scalars: Array,
     signals: Array,
     scale: Scale,
     weights: Weights,
@@ -360,16 +362,16 @@ def descend(
 ) -> tuple[Array, Array, float, bool]:
     """Unknowns and objective of a pixel after Newton's steps; true if it stopped improving."""
     damping, share, stalled = _FIRST_DAMPING, _SHARE[1], 0
-    loss = losses(films, rest, signals, scale, weights).sum()
+    loss = losses(films, scalars, signals, scale, weights).sum()
     for _ in range(steps):
-        new, ratios = _propose(films, rest, signals, scale, weights, damping, share)
+        new, ratios = _propose(films, scalars, signals, scale, weights, damping, share)
         proposed = losses(new, ratios, signals, scale, weights).sum()
         before, better = loss, proposed <= loss  # false where it is NaN
         if better:
-            films, rest, loss = new, ratios, proposed
+            films, scalars, loss = new, ratios, proposed
         stalled = stalled + 1 if before - loss <= weights.tolerance * before else 0
         damping = min(max(damping * (_EASIER if better else _HARDER), _DAMPING[0]), _DAMPING[1])
         share = min(max(share * (_LESS if better else _MORE), _SHARE[0]), _SHARE[1])
         if stalled >= patience:
             break
-    return films, rest, loss, stalled >= patience and np.isfinite(loss)
+    return films, scalars, loss, stalled >= patience and np.isfinite(loss)
