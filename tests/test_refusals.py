@@ -32,6 +32,7 @@ from dbthermal import (
 from dbthermal import emissivity as emissivities
 from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
+from reproduction import figures as drawn
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -294,7 +295,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "time y x",
     ),
     "truth_and_estimate": (
-        lambda it: figures.truth_and_estimate(it, RESULT, (1, 1)),
+        lambda it: drawn.truth_and_estimate(it, RESULT, (1, 1)),
         SCENE,
         "y x",
     ),
@@ -303,7 +304,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "separated_film emission": (lambda it: film(emission=it), OBJECT, "time y x"),
     "separated_film change": (lambda it: film(change=it), CHANGE, "time y x"),
     "emissivity_by_contact": (
-        lambda it: figures.emissivity_by_contact(CONTACT, it),
+        lambda it: drawn.emissivity_by_contact(CONTACT, it),
         CONTACT["emissivity"],
         "material band",
     ),

@@ -8,12 +8,7 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 """
 
 from dbthermal.figures import drawing
-from dbthermal.figures._calibration import (
-    emissivity_bars,
-    emissivity_by_contact,
-    gain_offset_maps,
-    response_fit,
-)
+from dbthermal.figures._calibration import gain_offset_maps, response_fit
 from dbthermal.figures._limits import plan
 from dbthermal.figures._live import LiveFigure, Panel
 from dbthermal.figures._scenes import (
@@ -23,7 +18,6 @@ from dbthermal.figures._scenes import (
     separated_film,
     separated_frames,
     separated_temperatures,
-    truth_and_estimate,
 )
 from dbthermal.figures._status import REASONS, first_reason, status
 
@@ -33,8 +27,6 @@ __all__ = [
     "LiveFigure",
     "Panel",
     "drawing",
-    "emissivity_bars",
-    "emissivity_by_contact",
     "film",
     "first_reason",
     "gain_offset_maps",
@@ -45,6 +37,5 @@ __all__ = [
     "separated_frames",
     "separated_temperatures",
     "status",
-    "truth_and_estimate",
 ]
 __dir__ = __all__.copy

@@ -38,8 +38,7 @@ class CalibratedSettings:
     Attributes
     ----------
     smooth : bool
-        Smooth the object temperature over as many frames as its own curve allows; if not, each
-        frame stands alone.
+        Smooth the object over as many frames as its curve allows; if not, each frame stands alone.
     """
 
     smooth: bool = True
@@ -57,18 +56,20 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     if covariance is None:
         covariance = np.zeros((len(e), *e.shape))
     level = np.zeros(e.shape[1])
+    # Solve every frame, and smooth the object.
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
-        found = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
-        solved = np.isfinite(found.signal)
-        signal, left = found.signal, found.white
+        solution = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
+        solved = np.isfinite(solution.signal)
+        signal, left = solution.signal, solution.white
         if settings.smooth and len(signal) > 1:
             signal, left = windows.smooth(signal, left, solved, tile.time)
-        left = left + found.shared
+        left = left + solution.shared
         values = list[Array]()
-        for mean, variance in ((signal, left), (found.background, found.background_variance)):
+        for mean, variance in ((signal, left), (solution.background, solution.background_variance)):
             values += frames.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
+    # Flag gray pixels, and those without a solution.
     solved &= np.all(np.isfinite(values), axis=0)
     values = [np.where(solved, value, np.nan) for value in values]
     lost = ~np.all(solved, axis=0) & ~gray
@@ -86,8 +87,8 @@ def _gray(emissivity: Array, covariance: Array) -> Mask:
     """
     dark = 1.0 - emissivity
     ratio = dark / dark[0]
-    own = np.einsum("bbp->bp", covariance)
-    variance = own + ratio**2 * own[0] - 2.0 * ratio * covariance[0]
+    squares = np.einsum("bbp->bp", covariance)
+    variance = squares + ratio**2 * squares[0] - 2.0 * ratio * covariance[0]
     std = np.sqrt(np.maximum(variance, 0.0)) / dark[0]
     least = np.maximum(_LEAST_DIFFERENCE / dark[0], _GRAY_SIGMAS * std)
     return np.asarray(np.all(np.abs(ratio - 1.0) <= least, axis=0))

@@ -26,16 +26,16 @@ _STEPS, _CONVERGED = 8, 1e-2
 @kernels.compiled
 def null_weights(ratio: Array, noise: Array, weights: Array) -> float:
     """Weights w of eq. 5, in place, and their noise variance; as `reflection_ratio` has them."""
-    product, length, rest = 0.0, 0.0, 0.0
+    product, length, square = 0.0, 0.0, 0.0
     for m in range(noise.size):
         product += ratio[m] / noise[m] ** 2
         length += (ratio[m] / noise[m]) ** 2
     for m in range(noise.size):
         weights[m] = (1.0 - product / length * ratio[m]) / noise[m]
-        rest += weights[m] ** 2
+        square += weights[m] ** 2
     for m in range(noise.size):
-        weights[m] /= rest * noise[m]
-    return 1.0 / rest
+        weights[m] /= square * noise[m]
+    return 1.0 / square
 
 
 @kernels.compiled
@@ -131,7 +131,7 @@ def response_tables(tile: Tile) -> tuple[kernels.Table, ...]:
 @compiled
 def other_band(
     first: kernels.Table,
-    other: kernels.Table,
+    second: kernels.Table,
     signal: Array,
     value: Array,
     slope: Array,
@@ -143,7 +143,7 @@ def other_band(
     kernels.blackbody(first, place, value, rate)
     for t in range(signal.size):  # Newton's step
         place[t] += (signal[t] - value[t]) / rate[t]
-    kernels.blackbody(other, place, value, slope)
+    kernels.blackbody(second, place, value, slope)
     for t in range(signal.size):
         slope[t] /= rate[t]
 
@@ -172,7 +172,7 @@ class _Work(NamedTuple):
 def _solve(
     tables: tuple[kernels.Table, ...],
     signals: Array,
-    known: Array,
+    parameters: Array,
     levels: Array,
     covariance: Array,
     shares: Array,
@@ -197,15 +197,15 @@ def _solve(
                 seen = work.background if shares[0, m] > 0 else work.room
                 kernels.blackbody(tables[m], work.object, work.emitted[m], work.slope[m])
                 kernels.blackbody(tables[m], seen, work.behind[m], work.rate[m])
-            if _step(signals[p], known[p], shares[0], levels[p], work, result[:2, p]):
+            if _step(signals[p], parameters[p], shares[0], levels[p], work, result[:2, p]):
                 break
         at_room = kernels.exact(tables[0], room)[1]
-        _propagate(known[p], shares, at_room, covariance[p], work, result[2:, p])
+        _propagate(parameters[p], shares, at_room, covariance[p], work, result[2:, p])
 
 
 @compiled
 def _step(
-    signal: Array, known: Array, share: Array, level: Array, work: _Work, result: Array
+    signal: Array, parameters: Array, share: Array, level: Array, work: _Work, result: Array
 ) -> bool:
     """Newton's step of a pixel, in place; whether it was a short one in all frames."""
     ss, sr, rr, to_s, to_r = work.ss, work.sr, work.rr, work.to_s, work.to_r
@@ -213,7 +213,11 @@ def _step(
         ss[t], sr[t], rr[t] = 0.0, 0.0, 1.0 / level[1]
         to_s[t], to_r[t] = 0.0, (level[0] - work.behind[0, t]) / level[1]
     for m in range(share.size):
-        e, weight, dark = known[0, m], 1.0 / known[1, m], (1.0 - known[0, m]) * share[m]
+        e, weight, dark = (
+            parameters[0, m],
+            1.0 / parameters[1, m],
+            (1.0 - parameters[0, m]) * share[m],
+        )
         for t in range(ss.size):
             by_s = e * work.slope[m, t] / work.slope[0, t]
             by_r = dark * work.rate[m, t] / work.rate[0, t]
@@ -240,7 +244,7 @@ def _step(
 
 @compiled
 def _propagate(
-    known: Array, shares: Array, at_room: float, covariance: Array, work: _Work, result: Array
+    parameters: Array, shares: Array, at_room: float, covariance: Array, work: _Work, result: Array
 ) -> None:
     """Variances of a pixel, see `Frames` (3, time), in place."""
     ss, sr, rr, to_s, to_r = work.ss, work.sr, work.rr, work.to_s, work.to_r
@@ -249,7 +253,7 @@ def _propagate(
         white[t], offset[t] = 0.0, 0.0
         work.of_s[bands, t], work.of_r[bands, t] = 0.0, 1.0
     for m in range(bands):
-        e, variance, share = known[0, m], known[1, m], shares[0, m]
+        e, variance, share = parameters[0, m], parameters[1, m], shares[0, m]
         for t in range(ss.size):
             by_s = e * work.slope[m, t] / work.slope[0, t]
             by_level = (1.0 - e) * work.rate[m, t] / (work.rate[0, t] if share > 0.0 else at_room)
@@ -324,8 +328,8 @@ def background(
 def temperatures(tile: Tile, signal: Array, variance: Array) -> tuple[Array, Array]:
     """Temperatures (time, pixel) [K] of first-band signals, and their standard deviations."""
     result = np.empty((2, *signal.T.shape))
-    parts = (np.ascontiguousarray(part.T) for part in (signal, variance))
-    _temperatures(response_tables(tile)[0], *parts, result)
+    curves = (np.ascontiguousarray(curve.T) for curve in (signal, variance))
+    _temperatures(response_tables(tile)[0], *curves, result)
     return result[0].T, result[1].T
 
 

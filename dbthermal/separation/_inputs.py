@@ -54,20 +54,14 @@ class Method:
         Name in errors and in the attribute `method` of a result.
     minimum_frames : int
         Shortest capture.
-    knows_emissivity : bool
-        The method needs known emissivities, and does not estimate them.
-    whole_image : bool
-        The method looks at a pixel's neighbours: a tile is the whole image.
-    every_frame : bool
-        The method does not solve a pixel that lacks a frame of the others.
-    even_times : bool
-        The method refuses frames at uneven times, by name.
-    pools : bool
-        An estimate holds a `Survey`, and a covariance of the emissivities.
+    knows_emissivity, any_bands, pools : bool
+        It needs known emissivities, and estimates none; takes more than two bands; its estimates
+        hold a `Survey`, and a covariance of the emissivities.
+    whole_image, every_frame, even_times : bool
+        A tile is the whole image; a pixel that lacks a frame of the others is not solved; uneven
+        times are refused.
     check_clock : callable, optional
         Refuses times that are not of exposure.
-    any_bands : bool
-        The method takes more than two bands.
     compiled : bool
         The method is compiled, a pixel at a time.
     not_estimated : tuple of str
@@ -95,7 +89,6 @@ class Inputs:
 
     response: xr.Dataset  # with the noise that is used, for the whole capture and all its parts
     response_kind: str  # "exact" or "linear"
-    name: str  # of the method
     method: Method
     settings: Any  # of the type that the method has, or None
     seed: int  # of random starts
@@ -150,7 +143,6 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     corrected: xr.Dataset,
     response: xr.Dataset,
     method: Method,
-    name: str,
     *,
     settings: Any = None,
     seed: int = 0,
@@ -163,7 +155,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     response_kind: str = "exact",
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
-    settings = _checked_settings(method, name, settings)
+    name, settings = method.name, _checked_settings(method, settings)
     schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
@@ -195,7 +187,6 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     return Inputs(
         response=response,
         response_kind=response_kind,
-        name=name,
         method=method,
         settings=settings,
         seed=seed,
@@ -207,11 +198,11 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         emissivity=value,
         emissivity_covariance=covariance,
         labels=None if pool is None else numbered(corrected, pool),
-        displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
+        displacement=_displacement(corrected, reflection_shift, method, order[0]),
     )
 
 
-def _checked_settings(method: Method, name: str, settings: Any) -> Any:
+def _checked_settings(method: Method, settings: Any) -> Any:
     """Return the settings of a method, its defaults for None; None for a method without any."""
     kind = method.settings
     if settings is None:
@@ -219,7 +210,8 @@ def _checked_settings(method: Method, name: str, settings: Any) -> Any:
     if kind is None or type(settings) is not kind:
         rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
         raise TypeError(
-            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
+            f"Invalid settings of type {type(settings).__name__} for method '{method.name}'. "
+            f"Must {rule}."
         )
     return settings
 
@@ -280,17 +272,18 @@ def _noise(
     """Noise (band) [K], and the response with it, for all parts; `noise_source` says of which."""
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
     factor, decided = _noise_factor(capture), response.attrs.get("noise_source")
+    # With a stated noise: that, unless the capture proves more.
     if "noise" in response:
-        known = np.asarray(responses.noise(response, names) / slopes)
+        stated_noise = np.asarray(responses.noise(response, names) / slopes)
         if decided == "capture":
-            return response, np.asarray(known * factor)
+            return response, np.asarray(stated_noise * factor)
         pixels = 0 if decided else min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"])
         counts = samples.some_pixels(capture["counts"], max(samples.PIXELS, pixels))
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
         rounding = samples.rounding_std(counts) / slopes
-        wide = np.sqrt(12.0) * rounding > known
-        stated = np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * factor)
+        wide = np.sqrt(12.0) * rounding > stated_noise
+        stated = np.asarray(np.hypot(stated_noise, np.where(wide, rounding, 0.0)) * factor)
         signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
         larger = np.nan * stated if decided else samples.larger_noise(signals, stated)
         if np.isnan(larger).all():
@@ -303,9 +296,9 @@ def _noise(
         )
         doubt = "is the response of another integration time, or are two bands exchanged?"
         response = warned(response, f"The noise of the capture, which is used, is {said}: {doubt}")
-    else:
-        parts, frames = quality.sample(capture, _NOISE_PIXELS)
-        linear = [one.linearise(part) for one, part in zip(curves, parts, strict=True)]
+    else:  # estimate it from the capture
+        subsample, frames = quality.sample(capture, _NOISE_PIXELS)
+        linear = [curve.linearise(band) for curve, band in zip(curves, subsample, strict=True)]
         noise = noises.estimate_bands(linear, capture["time"].values[frames])
     used = "band", noise / factor * slopes, schema.NOISE.attrs
     return response.sel(band=names).assign(noise=used).assign_attrs(noise_source="capture"), noise
@@ -396,25 +389,24 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: 
     if array.dims not in allowed:
         raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
     array = laid_on(array, corrected, name, "the capture")
-    for one in second:  # the same bands
-        exchanged = array.rename({"band": one, one: "band"})
+    for dim in second:  # the same bands
+        exchanged = array.rename({"band": dim, dim: "band"})
         array = laid_on(exchanged, corrected, name, "the capture")
-    leading = array.shape[: 1 + len(second)]
-    values = array.values.astype(np.float64).reshape(
-        *leading, *array.shape[len(leading) :] or (1, 1)
-    )
-    return np.broadcast_to(values, (*leading, corrected.sizes["y"], corrected.sizes["x"]))
+    values = array.values.astype(np.float64)
+    values = values if "y" in array.dims else values[..., np.newaxis, np.newaxis]
+    return np.broadcast_to(values, (*values.shape[:-2], *(corrected.sizes[dim] for dim in "yx")))
 
 
 def _displacement(
-    corrected: xr.Dataset, shift: xr.Dataset | None, method: Method, name: str, reference: int
+    corrected: xr.Dataset, shift: xr.Dataset | None, method: Method, reference: int
 ) -> Displacement | None:
     """Displacement of the second camera's reflections, for a method that tells them apart."""
     if shift is None:
         return None
     if method.whole_image or "background_temperature" in method.not_estimated:
         raise ValueError(
-            f"Invalid reflection_shift for method '{name}', which separates no reflection. Omit it."
+            f"Invalid reflection_shift for method '{method.name}', which separates no reflection. "
+            "Omit it."
         )
     return displaced.check(shift, corrected, reference)
 

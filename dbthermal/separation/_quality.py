@@ -29,8 +29,8 @@ _UNUSABLE: Final = np.uint32(
 
 def status_bits(conditions: Mapping[Status, Mask]) -> Bits:
     """Combine conditions (pixel), each of a bit of the status, into the status (pixel)."""
-    parts = [holds * np.uint32(bit) for bit, holds in conditions.items()]
-    return np.asarray(np.bitwise_or.reduce(parts), dtype=np.uint32)
+    bits = [holds * np.uint32(bit) for bit, holds in conditions.items()]
+    return np.asarray(np.bitwise_or.reduce(bits), dtype=np.uint32)
 
 
 def unusable(status: Bits) -> Mask:
@@ -38,9 +38,9 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
+def grains(capture: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
     """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
-    flat = samples.some_pixels(part["counts"])
+    flat = samples.some_pixels(capture["counts"])
     limits = np.broadcast_to(noise, len(flat)).tolist()
     bands = zip(flat, limits, strict=True)
     return [samples.grain(band, np.isfinite(band), limit) for band, limit in bands]
@@ -49,7 +49,7 @@ def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grai
 def read(
     window: xr.Dataset,
     fewest: int = 1,
-    known: list[samples.Grain] | None = None,
+    larger_grains: list[samples.Grain] | None = None,
     most_missing: float = MOST_MISSING,
 ) -> tuple[Array, Mask, Bits]:
     """Read the samples of a part of the capture, and judge its pixels.
@@ -69,11 +69,11 @@ def read(
     if "mask" in window:
         valid &= window["mask"].broadcast_like(window["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
-    known = grains(window) if known is None else known
-    bands = zip(counts, known, ends, strict=True)
+    levels = grains(window) if larger_grains is None else larger_grains
+    bands = zip(counts, levels, ends, strict=True)
     saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
-    frozen, copied = _frozen(same, valid, [it.chance for it in known])
+    frozen, copied = _frozen(same, valid, [it.chance for it in levels])
     valid &= ~copied[:, np.newaxis]
     counts = _kept(counts, valid).astype(np.float64)
     frames = samples.counted(valid)
@@ -113,10 +113,9 @@ def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mas
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     """Bridge short gaps of single pixels by a line in all bands.
 
-    A line between the same two frames in all bands holds the same mixture of object and
-    background. Bridged are gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture,
-    in pixels that lack few, where most others that have samples at all have one. Returns the
-    counts, and the samples that are valid or bridged.
+    The same two frames in all bands hold the same mixture of object and background. Bridged are
+    gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture, in pixels with few gaps,
+    in frames that most pixels have. Returns the counts, and the samples that are valid or bridged.
     """
     if valid.all():
         return counts, valid
@@ -126,12 +125,14 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)
     if not np.any(gap):
         return counts, valid
+    # Nearest valid frames before and after each gap.
     frame, pixel = np.nonzero(gap)
     selected, place = np.unique(pixel, return_inverse=True)
     places = np.arange(len(valid))[:, np.newaxis]
     before = np.maximum.accumulate(np.where(valid[:, selected], places, -len(valid)))[frame, place]
     after = np.where(valid[::-1, selected], places, -len(valid))
     after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
+    # A line between them, if they are near.
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
     frame, pixel, first, last = (band[short] for band in (frame, pixel, before, after))
@@ -198,8 +199,7 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
 
 
 def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
-    """
-    Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
+    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
 
     Of the samples that repeat the one before, by band.
     """

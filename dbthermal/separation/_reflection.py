@@ -11,9 +11,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
 
     .. math:: (1 - e_1) (y - \bar y)
 
-    with the mean over time, in the linear response of small changes. Where the object is constant,
-    and no background was completed, all that changes is reflected: the apparent temperature less
-    its mean.
+    with the mean over time, in the linear response of small changes. Of a constant object without
+    a completed background it is the change of the apparent temperature.
 
     Parameters
     ----------
@@ -66,8 +65,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
         label = f"'{name}' of the result"
         schema.check_variable(result[name], schema.STAGES["separated"][name], label)
     if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
-        found = f"Invalid emissivities of the result, {usual:.3g} in the median"
-        raise ValueError(f"{found}. Must be shares of one, not per cent.")
+        message = f"Invalid emissivities of the result, {usual:.3g} in the median"
+        raise ValueError(f"{message}. Must be shares of one, not per cent.")
     first = apparent.isel(band=0, drop=True)
     first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]

@@ -111,7 +111,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     schema.band_positions(corrected, [], "the corrected")
     stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     require_workers(workers)
-    inputs = check(corrected, response, get_method("subspace"), "subspace", settings=settings)
+    inputs = check(corrected, response, get_method("subspace"), settings=settings)
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
     alone = None if alone is None else _checked(alone, corrected, inputs)

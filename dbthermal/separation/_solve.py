@@ -71,18 +71,17 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     corrected : Dataset
         `counts` (band, time, y, x) [count], `time` [s], and optionally `status` (y, x) and
         `segment` (time), from `correction.correct_capture`. `pattern_std` (band) [count], an error
-        of each pixel that is constant in time, widens the bars of "subspace". Samples that are NaN
-        are left out, and frames that repeat the one before in a band. May be lazy: it is read a few
-        rows at a time. "subspace" and "calibrated" take two bands or more, and the former at least
-        32 frames; the other methods two bands.
+        of each pixel that is constant in time, widens the bars of "subspace". Samples that are NaN,
+        and repeated frames, are left out. A lazy one is read a few rows at a time. "subspace" and
+        "calibrated" take two bands or more, the former 32 frames or more; other methods two bands.
     response : Dataset
-        From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
-        where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture,
-        unless the capture proves 1.4 times as much or more: then the capture's, with a warning.
-        Without `noise` it is estimated from the capture. Attribute `noise_source` says which.
+        From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used, times
+        the `noise_factor` (band) of the capture, unless the capture proves 1.4 times as much: then
+        the capture's, with a warning. Without `noise` it is estimated from the capture. Attribute
+        `noise_source` says which.
     method : {"subspace", "calibrated", "dbvt", "apparent"} or Method
         This project's separator; known emissivities; the paper's optimiser; the camera's reading;
-        or the record of a method that is not of this package, which all the checks here hold for.
+        or the record of an outside method.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
         "apparent" has none.
@@ -95,9 +94,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
-        Materials (y, x), integer, as from `materials`: the pixels of one label share their
-        emissivities, or a polynomial of the place and a spread about it where they differ, which
-        makes all of them more certain; a negative one shares nothing. For "subspace" only.
+        Materials (y, x), integer, as from `materials`: the pixels of a label share their
+        emissivities, or a polynomial of the place and a variance about it; those of a negative
+        label share nothing. For "subspace" only.
     reflection_shift : Dataset, optional
         From `alignment.reflection_shift`, for two cameras side by side: the reflection that all
         other bands, of the second camera, show at a pixel p is the one that the quietest band shows
@@ -120,7 +119,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         quietest band (attribute `reference_band`), each with `_std`; of "subspace" also
         `emissivity_covariance` (band, other_band, y, x) [1]; `status` (y, x), bits of
         `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says why, at
-        samples that are invalid or masked, and where a method never estimates them (attribute
+        invalid or masked samples, and where a method never estimates them (attribute
         `not_estimated`); where the status is 0, all others are finite.
 
     Raises
@@ -136,14 +135,13 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
 
     Notes
     -----
-    Two errors of "subspace" carry no flag, for nothing in the bands shows them: an exchange of
-    object and background, but for emissivities below a half, which are flagged as a suspicion; and
-    a background that drifts along with the object's curve. The temperature holds then, and the
-    emissivity's deviation carries the drift that `SubspaceSettings.background_drift` states.
+    Two errors of "subspace" cannot be seen in the bands and carry no flag: an exchange of object
+    and background with emissivities above a half, and a background that drifts along with the
+    object's curve. With a drift the temperature holds, and the emissivity's deviation includes
+    `SubspaceSettings.background_drift`.
 
-    A `segment` is used by "subspace" alone, and for the object alone: the step that a shutter
-    event leaves stays in the background, and in the emissivity's deviation. A step of the object
-    during a shutter event is not detected.
+    Only "subspace" uses a `segment`, and only for the object: the step of a shutter event stays in
+    the background. A step of the object during a shutter event is not detected.
 
     With a `reflection_shift` d the other bands are resampled at the place p of each pixel r,
     p + d(p) = r, and the object of two places enters the bands,
@@ -151,10 +149,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
               I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
 
-    Each pixel is solved as if x(p) were x(r). What all reflect, along functions of time and blurred
-    alike, then gives ratios as certain as neighbours agree on them; with these all pixels together
-    are solved for the object, and each once more with what follows for x(p). A pixel of which the
-    second camera does not see the reflection has the bit `no_reflection_pair`.
+    Each pixel is solved as if x(p) were x(r). The reflections, along functions of time and blurred
+    alike, give ratios as certain as neighbours agree on them; with these the object is solved for
+    all pixels together, and each pixel once more with the resulting x(p). A pixel whose reflection
+    the second camera does not see has the bit `no_reflection_pair`.
 
     References
     ----------
@@ -177,12 +175,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     """
     require_workers(workers)
     require_seed(seed)
-    record = get_method(method)
     inputs = check(
         corrected,
         response,
-        record,
-        record.name,
+        get_method(method),
         settings=settings,
         seed=seed,
         emissivity=emissivity,
@@ -206,24 +202,24 @@ def separated(
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
     """
-    Separate checked inputs; and the surveys of each pixel alone, of cameras at one place.
+    Separate checked inputs; and the surveys per pixel, of cameras at one place.
 
-    To pool cameras side by side a result of each pixel `alone` is needed; made if not at hand.
-    What is told of the materials may `regroup` them.
+    To pool pixels before displaced cameras, the result per pixel (`alone`) is needed; made if not
+    passed. The materials may be regrouped by their ratios (`regroup`).
     """
-    variables, capture = schema.STAGES["separated"], inputs.capture
+    # Make the result, whose values are written tile by tile.
+    capture, names = inputs.capture, [*schema.STAGES["separated"]]
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
-    if inputs.method.pools:
-        variables = {**variables, _COVARIANCE: schema.OPTIONAL["separated"][_COVARIANCE]}
-    result = _allocate(capture, variables)
-    # Cameras apart, and materials, take passes that are not known beforehand.
+    names += [_COVARIANCE] if inputs.method.pools else []
+    result = separated_dataset(capture, dict.fromkeys(names))
+    # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
-        tqdm(total=total, unit="pixel", desc=inputs.name, disable=not progress) as bar,
+        tqdm(total=total, unit="pixel", desc=inputs.method.name, disable=not progress) as bar,
     ):
 
         def separate_pixels(
@@ -248,6 +244,7 @@ def separated(
             surveys = separate_pixels(inputs, None)
     if inputs.method.pools:
         _withhold(result)
+    # Say what was used: noise, method, settings, warnings.
     sources = inputs.response.attrs, capture.attrs
     held = sources[0] | sources[1]
     notes = [np.atleast_1d(attrs.get("warnings", [])) for attrs in sources]
@@ -257,7 +254,7 @@ def separated(
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
     ratios = () if inputs.method.pools else ("reflection_ratio", "reflection_ratio_std")
     result = result.assign_attrs(
-        method=inputs.name,
+        method=inputs.method.name,
         pooled=int(pooled),
         response_kind=inputs.response_kind,
         **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
@@ -314,8 +311,6 @@ def get_method(name: str | Method) -> Method:
 
     Examples
     --------
-    >>> get_method("calibrated").knows_emissivity
-    True
     >>> get_method("subspace").settings(background_drift=1.0)  # K
     SubspaceSettings(background_drift=1.0, device=None)
     """
@@ -358,20 +353,25 @@ def _separate(
     return size
 
 
-def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
-    """Make an empty result of some variables with the coordinates of a capture."""
-    sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
-    kept = {name: value for name, value in corrected.attrs.items() if name in tiles.KEPT_ATTRS}
-    arrays = {}
-    for name, variable in variables.items():
-        attrs = schema.status_attrs() if name == "status" else variable.attrs
-        array = empty(tuple(sizes[dim] for dim in variable.dims), variable.dtype)
-        arrays[name] = xr.DataArray(array, dims=variable.dims, attrs={**attrs, **kept})
+def separated_dataset(
+    capture: xr.Dataset, arrays: Mapping[str, npt.NDArray[Any] | None]
+) -> xr.Dataset:
+    """Stage `separated` of `schema` of some arrays, None for empty ones, on a capture's grid."""
+    stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+    sizes = {**capture.sizes, "other_band": capture.sizes["band"]}
+    kept = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
+    variables = {}
+    for name, array in arrays.items():
+        dims = stage[name].dims
+        attrs = schema.status_attrs() if name == "status" else stage[name].attrs
+        shape = tuple(sizes[dim] for dim in dims)
+        values = empty(shape, stage[name].dtype) if array is None else array
+        variables[name] = (dims, values, {**attrs, **kept})
     names = ("band", "time", "y", "x")
-    coordinates = {name: corrected[name] for name in names if name in corrected.coords}
-    if any("other_band" in variable.dims for variable in variables.values()):
-        coordinates["other_band"] = corrected["band"].rename(band="other_band")
-    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
+    coordinates = {name: capture[name] for name in names if name in capture.coords}
+    if _COVARIANCE in arrays:
+        coordinates["other_band"] = capture["band"].rename(band="other_band")
+    return xr.Dataset(variables, coordinates, kept)
 
 
 @np.errstate(over="ignore")  # a deviation beyond single precision is infinite

@@ -1,9 +1,8 @@
 """Tiles of a capture: the inputs of each, cut out of the capture, and the estimate that it yields.
 
-A capture is read in blocks of rows and separated a few hundred pixels at a time: the memory beyond
-the result stays small, a lazy capture is never read whole, and a tile fits in the processor's
-cache. A tile's bands are in the order of their noise, the quietest first: the regression for the
-emissivity needs a quiet ordinate.
+A capture is read in blocks of rows and separated a few hundred pixels at a time, so that a tile
+fits in the processor's cache. A tile's bands are in the order of their noise, the quietest first:
+the regression for the emissivity needs a quiet ordinate.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -38,21 +37,14 @@ PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
 SAMPLES: Final = 2**19
-"""Samples of a band in a tile, at most: a long capture has tiles of fewer pixels, or its arrays
-outgrow the cache that the cores share, which takes 1.3 times as long at 30,000 frames."""
+"""Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long."""
 
-# Times as many pixels in a tile whose steps are compiled, which keep to the cache by themselves, or
-# on a device: the pixels that need more are then enough together.
-_COMPILED: Final = 8
-# Samples of a band that are read together where pixels are then sorted by their noise: of few rows,
-# those around them, which they are made of, would be most of what is read.
+_COMPILED: Final = 8  # times as many pixels in a tile of a compiled method, or on a device
+# Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
-# Resampled samples whose noise differs by less are separated together [1].
-_NOISE_STEP: Final = 0.05
-# A temperature leaves the calibrated range if it is so many standard deviations outside.
-RANGE_SIGMAS: Final = 5.0
-# A temperature [K], emissivity [1] or deviation beyond is no result.
-USELESS: Final = 1e6
+_NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
+RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
+USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
 """Variables that a method without standard deviations never estimates."""
@@ -76,20 +68,20 @@ class Pixels:
             arrays[name] = function(value) if isinstance(value, np.ndarray) else within
         return replace(self, **arrays)
 
-    def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
-        """Replace the selected pixels by those of a part, in order, in place."""
+    def replace_pixels(self, selected: Mask | Whole, record: Self) -> None:
+        """Replace the selected pixels by those of a record, in order, in place."""
         for field in fields(self):
-            value, values = getattr(self, field.name), getattr(part, field.name)
+            value, values = getattr(self, field.name), getattr(record, field.name)
             if isinstance(value, Pixels):
                 value.replace_pixels(selected, values)
             elif value is not None:
                 value[..., selected] = values
 
-    def join(self, others: Sequence[Self]) -> Self:
+    def join(self, records: Sequence[Self]) -> Self:
         """Return the record with the pixels of others after its own."""
         joined: dict[str, Any] = {}
         for field in fields(self):
-            values = [getattr(record, field.name) for record in (self, *others)]
+            values = [getattr(record, field.name) for record in (self, *records)]
             joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
         return replace(self, **joined)
 
@@ -241,26 +233,25 @@ class Estimate(Pixels):
         covariance = self.emissivity_covariance
         if covariance is not None:
             covariance = np.where(no_emissivity, np.nan, covariance)
-        parts: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             name + ending: np.where(where, np.nan, getattr(self, name + ending))
             for name, where in undefined.items()
             for ending in ("", "_std")
         }
-        return replace(self, emissivity_covariance=covariance, **parts)
+        return replace(self, emissivity_covariance=covariance, **arrays)
 
-    def replace_scatter(self, order: int, selected: Mask, part: "Estimate") -> None:
-        """Replace a scatter of the survey by the first one of a part (pixel), in place."""
-        if self.survey is not None and part.survey is not None:
-            self.survey.scatter[order][..., selected] = part.survey.scatter[0]
-            self.survey.frames[order][selected] = part.survey.frames[0]
+    def replace_scatter(self, order: int, selected: Mask, estimate: "Estimate") -> None:
+        """Replace a scatter of the survey by the first of another estimate, in place."""
+        if self.survey is not None and estimate.survey is not None:
+            self.survey.scatter[order][..., selected] = estimate.survey.scatter[0]
+            self.survey.frames[order][selected] = estimate.survey.frames[0]
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
         Flag temperatures outside the calibrated range of a response, and values without a number.
 
-        Samples without a temperature, or with a useless standard deviation, become NaN; variables
-        that the method has `not_estimated` may be NaN without a flag. A quantity that is NaN in all
-        samples of a pixel with another status bit needs no further bit.
+        Samples without a useful standard deviation become NaN. No bit is set for variables that are
+        `not_estimated`, or NaN in all samples of a pixel with another bit.
         """
         values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
@@ -337,14 +328,14 @@ def _wanted(
     """Yield windows, which of their pixels are wanted, of the image (pixel), and their numbers."""
     for window in every:
         places = numbers(window, width)
-        some = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        if places[some].size:
-            yield window, some, places[some]
+        selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        if places[selected].size:
+            yield window, selected, places[selected]
 
 
-def _picked(view: xr.Dataset, some: Whole) -> xr.Dataset:
+def _picked(view: xr.Dataset, selected: Whole) -> xr.Dataset:
     """Some pixels of a part of a capture, as one row."""
-    places = np.divmod(some[np.newaxis], view.sizes["x"])
+    places = np.divmod(selected[np.newaxis], view.sizes["x"])
     rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
     return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
 
@@ -352,7 +343,7 @@ def _picked(view: xr.Dataset, some: Whole) -> xr.Dataset:
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
-    """Read a block of rows and cut it into tiles; with the material of each pixel of the image.
+    """Read rows and cut them into tiles, with the material of each pixel of the image.
 
     Of all pixels, or of those of the image that are `wanted` (pixel).
     """
@@ -372,29 +363,30 @@ def cut(
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
-    for window, some, places in _wanted(windows(rows, width, size), width, wanted):
+    # Read each window, judge its samples, and group its pixels by their valid frames.
+    for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
         gain = np.ones((2, places.size))
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
             view = loaded.isel(y=local, x=window[1])
-            if not isinstance(some, slice):
-                view = _picked(view, some)
+            if not isinstance(selected, slice):
+                view = _picked(view, selected)
             counts, valid, status = quality.read(view, method.minimum_frames, grains)
             counts, usable = quality.bridge(counts, valid, time)
         else:
             counts, usable, valid, status, gain = displaced.paired(
-                load, displacement, window[0], source, some, method.minimum_frames
+                load, displacement, window[0], source, selected, method.minimum_frames
             )
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        tile = _tile(inputs, counts, time, window, segment, some)
+        tile = _tile(inputs, counts, time, window, segment, selected)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(window[0], some)
+            tile.signals[1:] -= inputs.difference(window[0], selected)
         sections = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
@@ -415,18 +407,20 @@ def _tile(
     time: Array,
     window: Window,
     segment: Whole | None,
-    some: slice | Whole,
+    selected: slice | Whole,
 ) -> Tile:
     """Tile of counts (band, time, pixel) [count], the quietest band first, of some of a window."""
     bands = inputs.bands
     curves = tuple(inputs.curves[band] for band in bands)
     emissivity, covariance = (
-        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)[..., some]
-        for known in (inputs.emissivity, inputs.emissivity_covariance)
+        None
+        if values is None
+        else values[(..., *window)].reshape(*values.shape[:-2], -1)[..., selected]
+        for values in (inputs.emissivity, inputs.emissivity_covariance)
     )
     if emissivity is not None and covariance is not None:
         emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
-    height = window[0].stop - window[0].start if isinstance(some, slice) else 1
+    height = window[0].stop - window[0].start if isinstance(selected, slice) else 1
     # The linearised signals (see `response`), less the reference temperature.
     signals = counts if bands == sorted(bands) else counts[bands]
     for signal, curve in zip(signals, curves, strict=True):
@@ -449,10 +443,9 @@ def _tile(
 def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
-    """
-    Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
+    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
 
-    The residual pattern, as independent from pixel to pixel, is lessened as the noise is.
+    A residual pattern is independent from pixel to pixel, and is scaled like the noise.
     """
     order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):

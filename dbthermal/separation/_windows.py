@@ -38,7 +38,7 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     Returns the curves and the variances that are left.
     """
     position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
-    rows = [np.ascontiguousarray(part.T) for part in (values, variance, valid)]
+    rows = [np.ascontiguousarray(array.T) for array in (values, variance, valid)]
     halves = [1]
     while halves[-1] < time.size:
         halves.append(max(halves[-1] + 1, int(halves[-1] * _GROWTH)))
@@ -111,10 +111,9 @@ def _widen(
     left: Array,
     widest: Whole,
 ) -> bool:
-    """Intersect confidence intervals (time), in place, and take a window where they agree.
+    """Intersect confidence intervals (time), in place; take the window before where they agree.
 
-    Of the windows that estimated and of those before, which are taken if they have less noise.
-    Whether the intervals of a frame have a part in common.
+    A window is taken if it has less noise. Returns whether the intervals of a frame still overlap.
     """
     (wide, share), (lower, upper, agreeing), remaining = shares, bounds, 0.0
     for t in range(estimate.size):
@@ -155,8 +154,8 @@ def _sum_up(
 def _lay_windows(valid: Mask, position: Array, halves: Whole, windows: Array) -> None:
     """Weights of parabolas, or lines, at the centres of windows (half-width, 4, time), in place.
 
-    Of the sums of the values times powers of their positions, and the variance over the noise's;
-    Zero and infinite where the samples do not fix it.
+    Of the sums of values times powers of their positions, and the variance over the noise's; zero
+    and infinite where the samples do not determine them.
     """
     sums = np.zeros((position.size + 1, 5))
     for t in range(position.size):

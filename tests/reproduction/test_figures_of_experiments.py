@@ -17,6 +17,32 @@ def two(dim: str, **attrs: object) -> xr.DataArray:
     return array(dim, 2, **attrs).assign_coords({dim: ["a", "b"]})
 
 
+def separated(fill: float = 1.0) -> xr.Dataset:
+    """Temperatures of a scene with their deviations."""
+    names = ("object_temperature", "background_temperature")
+    movie = fill * array("time y x", 2, 5, 6)
+    parts = dict.fromkeys(names, movie) | {f"{name}_std": movie - 300 for name in names}
+    return xr.Dataset(parts)
+
+
+def draw_contact(**attrs: object) -> Figure:
+    """Draw the emissivities of two materials beside their truth."""
+    value = array("material band", 2, 2) - 300
+    measured = xr.Dataset({"emissivity": value, "emissivity_std": 0.01 * value}, attrs=attrs)
+    return figures.emissivity_by_contact(measured, value)
+
+
+def draw_bars(**attrs: object) -> Figure:
+    """Draw the band emissivities of two materials."""
+    table = {"emissivity": array("material band", 2, 2) - 300}
+    return figures.emissivity_bars(xr.Dataset(table, attrs=attrs))
+
+
+def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the truth of a pixel beside its estimate."""
+    return figures.truth_and_estimate(separated().assign_attrs(attrs), separated(fill), (1, 2))
+
+
 def draw_accuracy(**attrs: object) -> Figure:
     """Draw the errors of two cases."""
     errors = {"object_temperature_rmse": array("case", 2)}
@@ -153,10 +179,21 @@ def draw_offsets(**attrs: object) -> Figure:
 
 def test_nothing_but_nan() -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
-    for draw in (draw_compared, draw_condition, draw_pooled):
+    for draw in (draw_compared, draw_condition, draw_pooled, draw_truth):
         figure = draw(fill=np.nan)
         figure.draw_without_rendering()
         assert figure.axes
+
+
+def test_celsius_of_a_pixel() -> None:
+    """Kelvin go in, degrees Celsius are drawn; data in degrees Celsius are refused."""
+    scene = separated()
+    kelvin = scene["object_temperature"].isel(y=1, x=2)
+    for line in draw_truth().axes[0].lines:
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), kelvin - 273.15, rtol=0, atol=1e-9)
+    celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
+    with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
+        figures.truth_and_estimate(scene, celsius, (1, 2))
 
 
 def test_condition_numbers_of_pairs() -> None:
@@ -177,6 +214,9 @@ def test_errors_are_in_units_of_their_bound() -> None:
 
 DRAWN: dict[str, Callable[..., Figure]] = {
     "accuracy": draw_accuracy,
+    "emissivity_bars": draw_bars,
+    "emissivity_by_contact": draw_contact,
+    "truth_and_estimate": draw_truth,
     "error_bar_calibration": draw_scores,
     "compared_reflections": draw_compared,
     "condition_matrix": draw_condition,

@@ -29,7 +29,7 @@ _BITS: Final = {
     scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
 }
 _SPREAD: Final = (1e-3, 1e3)  # deviation of surroundings that are stated [K]
-_METHOD: Final = Method(posterior.moments, any_bands=True, pools=True)
+_METHOD: Final = Method(posterior.moments, name="complete", any_bands=True, pools=True)
 
 
 def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
@@ -156,7 +156,7 @@ def filled(
         "reflection_shift": context.reflection_shift,
     }
     kind = str(result.attrs.get("response_kind", "exact"))
-    inputs = check(corrected, response, _METHOD, "complete", response_kind=kind, **shared)
+    inputs = check(corrected, response, _METHOD, response_kind=kind, **shared)
     measured = result
     if context.materials is not None and not result.attrs.get("pooled"):
         measured = solve(corrected, response, **shared)

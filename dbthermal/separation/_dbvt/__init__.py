@@ -21,34 +21,28 @@ class DbvtSettings:
     Attributes
     ----------
     smoothness, huber, reconstruction, noise, noise_mean : float
-        Weights :math:`\gamma_1` to :math:`\gamma_5` [1]: of the squared second differences in units
-        of `curvature`; of the Huber loss over its threshold, so that its slope beyond is 1; of the
-        squared reconstruction error in units of the second band's noise; of the noise's square in
-        units of each band's own (with 0 the noise is held at zero); of the square of its mean.
+        Weights :math:`\gamma_1` to :math:`\gamma_5` [1] of the losses in `objective`: of the
+        curvature, of the Huber loss over its threshold, of the reconstruction error, of the noise
+        (with 0 it is held at zero), and of its mean.
     curvature : float
         Second derivative of a smooth signal that costs 1 [K/s^2].
     huber_threshold, deviation_floor : float
-        Where the Huber loss turns from square to linear, and least deviation by which a signal is
-        divided, in units of each band's noise [1].
-    stages, stage_steps : int
-        Stages of the homotopy, from a small share of the reconstruction's weight to all of it, and
-        steps in each but the last; with 1 stage all of it counts from the first step on.
-    first_share : float
-        Weight of the normalised reconstruction error in the first stage, as a fraction of
-        `reconstruction`; in the last it counts in units of the noise, not of the deviation [1].
-    steps : int
-        Most steps in the last stage.
-    tolerance, patience : float, int
-        A pixel is done when no step lowers its objective by more than this fraction [1], so many
-        times in a row.
+        Where the Huber loss turns linear, and the least deviation by which a signal is divided, in
+        units of each band's noise [1].
+    stages, stage_steps, first_share : int, int, float
+        Homotopy: stages, steps in each but the last, and the weight of the normalised error of the
+        reconstruction in the first over `reconstruction` [1]; the last counts it in units of the
+        noise. One stage has all of it from the start.
+    steps, tolerance, patience : int, float, int
+        Most steps in the last stage; it ends when `patience` steps in a row lower the objective by
+        less than this fraction [1].
     largest_step, margin : float
         Largest change of an emissivity in a step, and its least distance from 0 and 1 [1].
     start : {"random", "subspace"}
         Emissivities uniform in (0, 1), as published; or emissivities and object of the subspace
         separator, and at random where it has none.
     starts : int
-        Starts, of which the one of least objective is kept; 1 as published. All but a first one at
-        the separator are random.
+        Starts, of which the lowest objective is kept; 1 as published. All but the first are random.
     smooth_from_zero : bool
         A random start's smooth signal is zero, as published, and not the signal itself.
     bend_updates : int

@@ -59,13 +59,13 @@ def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
     solution = subspace.separate(tile, subspace.SubspaceSettings())
     share = solution.emissivity[0]
     emitted = tile.blackbody(0, solution.object_temperature)
-    known = np.all(np.isfinite(emitted * share), axis=0)
-    known &= np.all((solution.emissivity > 0) & (solution.emissivity < 1), axis=0)
+    solved = np.all(np.isfinite(emitted * share), axis=0)
+    solved &= np.all((solution.emissivity > 0) & (solution.emissivity < 1), axis=0)
     # The smooth signal is that of the object before the median background.
-    rest = np.median(mixing.background(share, tile.signals[0], emitted), axis=0)
-    emissivity[:, known] = solution.emissivity[:, known]
-    smooth[:, known] = mixing.mixed(share, emitted, rest)[:, known]
-    return np.asarray(known)
+    still = np.median(mixing.background(share, tile.signals[0], emitted), axis=0)
+    emissivity[:, solved] = solution.emissivity[:, solved]
+    smooth[:, solved] = mixing.mixed(share, emitted, still)[:, solved]
+    return np.asarray(solved)
 
 
 class Search:
@@ -85,7 +85,7 @@ class Search:
         signals = np.tile(tile.signals, settings.starts)
         rise = emissivity[1] / emissivity[0] * (smooth - smooth[0])
         offset = np.mean(signals[1] - rise, axis=0) * (not settings.smooth_from_zero)
-        self.rest = np.stack([offset, *emissivity], axis=1)
+        self.scalars = np.stack([offset, *emissivity], axis=1)
         self.signals = np.moveaxis(signals, -1, 0).copy()
         self.films = np.zeros((columns, 3, frames))
         self.films[:, 0] = smooth.T
@@ -118,7 +118,7 @@ class Search:
     def _descend(self, column: int, progress: float) -> tuple[float, bool]:
         """Minimise the objective of a column, with the reconstruction's weight of that progress."""
         settings, sigma, last = self.settings, self.tile.noise, progress == 1.0
-        images, films, rest = self.signals[column], self.films[column], self.rest[column]
+        images, films, scalars = self.signals[column], self.films[column], self.scalars[column]
         deviation = [
             objective.deviation(*band, settings.deviation_floor)
             for band in zip(images, films[1:], sigma, strict=True)
@@ -128,8 +128,8 @@ class Search:
         scale = objective.Scale(sigma, tuple(deviation), first ** (1.0 - progress))
         steps = settings.steps if last else settings.stage_steps
         patience = settings.patience if last else steps + 1
-        found = objective.descend(films, rest, images, scale, self.weights, steps, patience)
-        self.films[column], self.rest[column], loss, converged = found
+        minimum = objective.descend(films, scalars, images, scale, self.weights, steps, patience)
+        self.films[column], self.scalars[column], loss, converged = minimum
         return loss, converged
 
     def _nonlinearity(self) -> Array:
@@ -139,17 +139,19 @@ class Search:
 
         Zero where a temperature leaves the range of the response, and for a linear one.
         """
-        tile, (_, one, other) = self.tile, self.rest.T[..., np.newaxis]
+        tile, (_, e1, e2) = self.tile, self.scalars.T[..., np.newaxis]
         first, second = np.moveaxis(self.signals - self.films[:, 1:], 1, 0)
-        inside, departures = np.ones(len(first), dtype=bool), []
+        in_range, departures = np.ones(len(first), dtype=bool), []
         # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
-        for ratio in ((1 - other) / (1 - one), other / one):
+        for ratio in ((1 - e2) / (1 - e1), e2 / e1):
             signal = (second - ratio * first) / (1 - ratio)
             temperature = tile.temperature(0, signal)
             curve = tile.curves[0]
-            inside &= np.all((temperature >= curve.lowest) & (temperature <= curve.highest), axis=1)
+            in_range &= np.all(
+                (temperature >= curve.lowest) & (temperature <= curve.highest), axis=1
+            )
             departures.append(tile.blackbody(1, temperature) - signal)
-        return np.where(inside[:, np.newaxis], mixing.mixed(other, *departures), 0.0)
+        return np.where(in_range[:, np.newaxis], mixing.mixed(e2, *departures), 0.0)
 
 
 def _least(loss: Array, pixels: int) -> npt.NDArray[np.intp]:
@@ -162,7 +164,7 @@ def _report(
     tile: Tile, search: Search, kept: npt.NDArray[np.intp], lost: Mask, unfinished: Mask
 ) -> Estimate:
     """Temperatures at the emissivities of the kept columns, by the calibrated closed form."""
-    emissivity, signals = search.rest[kept, 1:].T, tile.signals
+    emissivity, signals = search.scalars[kept, 1:].T, tile.signals
     if search.settings.temperatures_from == "corrected":
         signals = signals - np.moveaxis(search.films[kept, 1:], 0, -1)
     solution = calibrated.separate(

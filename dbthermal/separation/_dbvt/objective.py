@@ -1,10 +1,10 @@
 r"""The paper's objective: five losses of one pixel's smooth signal, noise and emissivities.
 
-Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, algorithm 1, with its slips put right:
-the reconstruction starts from the second band's smooth signal (the paper prints the first's), the
-mean of the noise enters by its square (the paper prints a signed mean, which has no lower bound),
-and a signal is never divided by less than its noise. Signals are linearised, so that both slopes
-a_m are 1. Sums over time are means, so that no weight depends on the number of frames.
+Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, algorithm 1, with three slips put right:
+the reconstruction starts from the second band's smooth signal (printed: the first's), the mean of
+the noise enters by its square (printed: signed, without a lower bound), and a signal is divided by
+no less than its noise. Signals are linearised, so that both slopes a_m are 1. Sums over time are
+means, so that no weight depends on the number of frames.
 
 With the emission and the reflection ratio :math:`k_1 = e_2 / e_1, k_2 = (1-e_2) / (1-e_1)`:
 
@@ -25,8 +25,8 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 1981, doi:10.1002/0471725250) is added, as much as it takes to lower the objective.
 
 All is compiled, a pixel at a time. Its unknowns are `films`, the smooth signal of the first band
-and the noise of both (3, time) [K], and `rest`: the first value of the second band's smooth signal
-[K] and both emissivities [1].
+and the noise of both (3, time) [K], and `scalars`: the first value of the second band's smooth
+signal [K] and both emissivities [1].
 """
 
 from typing import Final, NamedTuple
@@ -68,16 +68,13 @@ class Scale(NamedTuple):
 
 
 @compiled
-def _ratios(rest: Array) -> tuple[float, float]:
-    return rest[2] / rest[1], (1.0 - rest[2]) / (1.0 - rest[1])
+def _ratios(scalars: Array) -> tuple[float, float]:
+    return scalars[2] / scalars[1], (1.0 - scalars[2]) / (1.0 - scalars[1])
 
 
 @compiled
 def deviation(signal: Array, noise: Array, sigma: float, floor: float) -> float:
-    """Standard deviation over time [K] of the corrected signal of a band, at least the noise.
-
-    The mean drops out of a comparison.
-    """
+    """Standard deviation over time [K] of the corrected signal of a band, at least the noise."""
     mean, square = (signal - noise).mean(), 0.0
     for t in range(signal.size):
         square += (signal[t] - noise[t] - mean) ** 2
@@ -85,11 +82,11 @@ def deviation(signal: Array, noise: Array, sigma: float, floor: float) -> float:
 
 
 @compiled
-def departures(films: Array, rest: Array, signals: Array, t: int) -> tuple[float, float, float]:
+def departures(films: Array, scalars: Array, signals: Array, t: int) -> tuple[float, float, float]:
     """Departures p_m from the smooth signals, and error r of the reconstruction, in a frame [K]."""
-    emission, reflection = _ratios(rest)
+    emission, reflection = _ratios(scalars)
     first = signals[0, t] - films[1, t] - films[0, t]
-    second = signals[1, t] - films[2, t] - rest[0] - emission * (films[0, t] - films[0, 0])
+    second = signals[1, t] - films[2, t] - scalars[0] - emission * (films[0, t] - films[0, 0])
     return first, second, second - reflection * first
 
 
@@ -101,9 +98,9 @@ def huber(value: float, threshold: float) -> float:
 
 
 @compiled
-def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Weights) -> Array:
+def losses(films: Array, scalars: Array, signals: Array, scale: Scale, weights: Weights) -> Array:
     """Weighted losses (5,) [1] in the order of the weights; their sum is the objective."""
-    emission, _ = _ratios(rest)
+    emission, _ = _ratios(scalars)
     sums, mean, frames = np.zeros(5), np.zeros(2), films.shape[1]
     sigma, deviation = scale.sigma, scale.deviation
     limit = (
@@ -111,7 +108,7 @@ def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Wei
         weights.huber_threshold * sigma[1] / deviation[1],
     )
     for t in range(frames):
-        first, second, error = departures(films, rest, signals, t)
+        first, second, error = departures(films, scalars, signals, t)
         if t > 1:
             sums[0] += (films[0, t] - 2.0 * films[0, t - 1] + films[0, t - 2]) ** 2
         sums[1] += huber(first / deviation[0], limit[0]) + huber(second / deviation[1], limit[1])
@@ -133,23 +130,20 @@ def losses(films: Array, rest: Array, signals: Array, scale: Scale, weights: Wei
 
 @compiled
 def _noise_weights(scale: Scale, weights: Weights) -> tuple[Array, Array]:
-    """Curvatures (band) of the noise's square, and of its mean: a majorant of the mean's square.
-
-    Jensen: the square of a mean lies below a mean of squares that touches it here.
-    """
+    """Curvatures (band) of the noise's square and of its mean's, which by Jensen is a majorant."""
     variance = np.array(scale.sigma) ** 2
-    each = weights.noise if weights.noise > 0 else _NO_NOISE
-    return each / variance, weights.noise_mean / variance
+    single = weights.noise if weights.noise > 0 else _NO_NOISE
+    return single / variance, weights.noise_mean / variance
 
 
 @compiled
 def _huber_force(
-    part: float, scale: Scale, weights: Weights, band: int, share: float
+    departure: float, scale: Scale, weights: Weights, band: int, share: float
 ) -> tuple[float, float]:
     """Curvature of a band, beyond the threshold a share of a parabola's, and gradient."""
-    threshold, size = weights.huber_threshold * scale.sigma[band], abs(part)
+    threshold, size = weights.huber_threshold * scale.sigma[band], abs(departure)
     parabola = 0.5 * weights.huber / scale.deviation[band] / max(size, threshold)
-    return (parabola if size <= threshold else share * parabola), parabola * part
+    return (parabola if size <= threshold else share * parabola), parabola * departure
 
 
 @compiled
@@ -162,7 +156,7 @@ def _block(a: float, c: float, weight: float, reflection: float) -> tuple[float,
 
 @compiled
 def system(
-    films: Array, rest: Array, signals: Array, scale: Scale, weights: Weights, share: float
+    films: Array, scalars: Array, signals: Array, scale: Scale, weights: Weights, share: float
 ) -> tuple[Array, Array, Array]:
     r"""Newton's equations of each frame, the noise eliminated, in the changes of three forms.
 
@@ -175,31 +169,31 @@ def system(
     y and with z, then yy, yz, zz; the forces (time, 3) of the smooth signal, y and z; and for
     `noise_step` (time, 5) pull and q + h of both bands, and p_1.
     """
-    (k1, k2), frames = _ratios(rest), films.shape[1]
+    (k1, k2), frames = _ratios(scalars), films.shape[1]
     form, forces, blocks = np.empty((frames, 6)), np.empty((frames, 3)), np.empty((frames, 5))
     w = weights.reconstruction * scale.share / scale.sigma[1] ** 2
     square, mean = _noise_weights(scale, weights)
     q, level1, level2 = square + mean, mean[0] * films[1].mean(), mean[1] * films[2].mean()
     for t in range(frames):
-        first, second, error = departures(films, rest, signals, t)
+        first, second, error = departures(films, scalars, signals, t)
         error *= w
         own1, own2 = square[0] * films[1, t] + level1, square[1] * films[2, t] + level2
         h1, pull1 = _huber_force(first, scale, weights, 0, share)
         h2, pull2 = _huber_force(second, scale, weights, 1, share)
         pull1, pull2 = own1 - pull1 + k2 * error, own2 - pull2 - error
-        a, c, one, two, inverse = _block(q[0] + h1, q[1] + h2, w, k2)
+        a, c, n11, n22, inverse = _block(q[0] + h1, q[1] + h2, w, k2)
         # What is left of the quadratic form: with K = N - diag(q), diag(q) N^-1 K in x and y,
         # written so that nothing cancels where both ratios are alike.
-        apart = w * q[0] * q[1] * (k1 - k2)
-        own = q[0] * h1 * two + k1**2 * q[1] * h2 * one
+        coupling = w * q[0] * q[1] * (k1 - k2)
+        diagonal = q[0] * h1 * n22 + k1**2 * q[1] * h2 * n11
         shared = w * (k2**2 * q[0] * h2 + k1**2 * q[1] * h1)
-        form[t, 0] = (own + shared + apart * (k1 - k2)) * inverse
-        form[t, 1] = (k1 * q[1] * (h2 * one + w * h1) + apart) * inverse
-        form[t, 2] = (w * (k1 * q[1] * h1 - k2 * q[0] * h2) + apart) * inverse
-        form[t, 3] = q[1] * (h2 * one + w * a) * inverse
+        form[t, 0] = (diagonal + shared + coupling * (k1 - k2)) * inverse
+        form[t, 1] = (k1 * q[1] * (h2 * n11 + w * h1) + coupling) * inverse
+        form[t, 2] = (w * (k1 * q[1] * h1 - k2 * q[0] * h2) + coupling) * inverse
+        form[t, 3] = q[1] * (h2 * n11 + w * a) * inverse
         form[t, 4], form[t, 5] = q[1] * a * w * inverse, a * c * w * inverse
-        n1 = (two * pull1 + w * k2 * pull2) * inverse
-        n2 = (w * k2 * pull1 + one * pull2) * inverse
+        n1 = (n22 * pull1 + w * k2 * pull2) * inverse
+        n2 = (w * k2 * pull1 + n11 * pull2) * inverse
         force_y = own2 - q[1] * n2
         forces[t, 0], forces[t, 1] = own1 - q[0] * n1 + k1 * force_y, force_y
         forces[t, 2] = error - w * (k2 * n1 - n2)
@@ -209,17 +203,19 @@ def system(
 
 
 @compiled
-def noise_step(blocks: Array, moves: Array, rest: Array, scale: Scale, weights: Weights) -> Array:
+def noise_step(
+    blocks: Array, moves: Array, scalars: Array, scale: Scale, weights: Weights
+) -> Array:
     """Steps of smooth signal and noise (3, time), of the forms x, y and z (3, time)."""
     square, mean = _noise_weights(scale, weights)
-    (_, k2), q, step = _ratios(rest), square + mean, moves.copy()
+    (_, k2), q, step = _ratios(scalars), square + mean, moves.copy()
     w = weights.reconstruction * scale.share / scale.sigma[1] ** 2
     for t in range(len(blocks)):
-        _, _, one, two, inverse = _block(blocks[t, 2], blocks[t, 3], w, k2)
+        _, _, n11, n22, inverse = _block(blocks[t, 2], blocks[t, 3], w, k2)
         x, y, error = moves[0, t], moves[1, t], w * moves[2, t]
         first, second = q[0] * x + k2 * error - blocks[t, 0], q[1] * y - error - blocks[t, 1]
-        step[1, t] = (two * first + w * k2 * second) * inverse - x
-        step[2, t] = (w * k2 * first + one * second) * inverse - y
+        step[1, t] = (n22 * first + w * k2 * second) * inverse - x
+        step[2, t] = (w * k2 * first + n11 * second) * inverse - y
     return step
 
 
@@ -250,17 +246,17 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
     rows = diagonal.size + 4
     solved, pivot = np.zeros((rows, sides.shape[1])), np.full(rows, np.inf)
     below, further = np.zeros(rows), np.zeros(rows)
-    for t in range(2, rows - 2):
+    for t in range(2, rows - 2):  # forward: the factors
         # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
         center = (1.0, 5.0, 6.0)[min(t - 2, rows - 3 - t, 2)]
-        beside = -2.0 if t in (3, rows - 3) else -4.0
-        near = stiffness * (beside - below[t - 1])
+        neighbour = -2.0 if t in (3, rows - 3) else -4.0
+        near = stiffness * (neighbour - below[t - 1])
         below[t], further[t] = near / pivot[t - 1], stiffness / pivot[t - 2]
         pivot[t] = diagonal[t - 2] + center * stiffness - below[t] * near - further[t] * stiffness
         for side in range(sides.shape[1]):
             before = below[t] * solved[t - 1, side] + further[t] * solved[t - 2, side]
             solved[t, side] = sides[t - 2, side] - before
-    for t in range(rows - 3, 1, -1):
+    for t in range(rows - 3, 1, -1):  # and backward
         for side in range(sides.shape[1]):
             after = below[t + 1] * solved[t + 1, side] + further[t + 2] * solved[t + 2, side]
             solved[t, side] = solved[t, side] / pivot[t] - after
@@ -269,34 +265,34 @@ def whittaker(diagonal: Array, stiffness: float, sides: Array) -> Array:
 
 @compiled
 def _emissivity(
-    rest: Array, border: Array, forces: Array, damping: float, weights: Weights
+    scalars: Array, border: Array, forces: Array, damping: float, weights: Weights
 ) -> tuple[float, float]:
     """New emissivities: damped, of limited change, inside (0, 1)."""
-    # The offset is eliminated: a system A in the two ratios.
-    a1 = border[1, 1] - border[0, 1] ** 2 / border[0, 0]
-    a12 = border[1, 2] - border[0, 1] * border[0, 2] / border[0, 0]
-    a2 = border[2, 2] - border[0, 2] ** 2 / border[0, 0]
-    f1 = forces[1] - border[0, 1] * forces[0] / border[0, 0]
-    f2 = forces[2] - border[0, 2] * forces[0] / border[0, 0]
+    # The offset is eliminated: a symmetric system A da = f in the two ratios.
+    pull = border[0, 1:] / border[0, 0]
+    f1, f2 = forces[1] - pull[0] * forces[0], forces[2] - pull[1] * forces[0]
+    a11 = border[1, 1] - pull[0] * border[0, 1]
+    a12 = border[1, 2] - pull[0] * border[0, 2]
+    a22 = border[2, 2] - pull[1] * border[0, 2]
     # With J = d(k_1, k_2) / d(e_1, e_2): (J^T A J + damping) de = J^T f
-    _, one, other = rest
-    j11, j12 = -other / one**2, 1.0 / one
-    j21, j22 = (1.0 - other) / (1.0 - one) ** 2, -1.0 / (1.0 - one)
-    a = a1 * j11**2 + 2.0 * a12 * j11 * j21 + a2 * j21**2 + damping
-    b = a1 * j11 * j12 + a12 * (j11 * j22 + j12 * j21) + a2 * j21 * j22
-    c = a1 * j12**2 + 2.0 * a12 * j12 * j22 + a2 * j22**2 + damping
+    _, e1, e2 = scalars
+    j11, j12 = -e2 / e1**2, 1.0 / e1
+    j21, j22 = (1.0 - e2) / (1.0 - e1) ** 2, -1.0 / (1.0 - e1)
+    a = a11 * j11**2 + 2.0 * a12 * j11 * j21 + a22 * j21**2 + damping
+    b = a11 * j11 * j12 + a12 * (j11 * j22 + j12 * j21) + a22 * j21 * j22
+    c = a11 * j12**2 + 2.0 * a12 * j12 * j22 + a22 * j22**2 + damping
     push1, push2 = j11 * f1 + j21 * f2, j12 * f1 + j22 * f2
     determinant = a * c - b * b
-    first, second = (c * push1 - b * push2) / determinant, (a * push2 - b * push1) / determinant
-    share = min(weights.largest_step / max(abs(first), abs(second)), 1.0)
+    step1, step2 = (c * push1 - b * push2) / determinant, (a * push2 - b * push1) / determinant
+    share = min(weights.largest_step / max(abs(step1), abs(step2)), 1.0)
     low, high = weights.margin, 1.0 - weights.margin
-    return min(max(one + share * first, low), high), min(max(other + share * second, low), high)
+    return min(max(e1 + share * step1, low), high), min(max(e2 + share * step2, low), high)
 
 
 @compiled
 def _propose(
     films: Array,
-    rest: Array,
+    scalars: Array,
     signals: Array,
     scale: Scale,
     weights: Weights,
@@ -304,8 +300,8 @@ def _propose(
     share: float,
 ) -> tuple[Array, Array]:
     """Unknowns after a Newton step: noise, then smooth signal, then border are eliminated."""
-    form, forces, blocks = system(films, rest, signals, scale, weights, share)
-    frames, (k1, k2) = films.shape[1], _ratios(rest)
+    form, forces, blocks = system(films, scalars, signals, scale, weights, share)
+    frames, (k1, k2) = films.shape[1], _ratios(scalars)
     # The smoothness loss is stiff (1 + k_1^2) |D s|^2 / 2, in the smooth signal s and in k_1.
     stiff = weights.smoothness / weights.curvature**2
     bend, square = bending(films[0])
@@ -337,8 +333,8 @@ def _propose(
                 border[i, j] -= sides[t, i + 1] * solved[t, j + 1]
     push[1] -= stiff * k1 * square
     border[1, 1] += stiff * square
-    one, other = _emissivity(rest, border, push, damping * frames, weights)
-    new = np.array([rest[0], one, other])
+    e1, e2 = _emissivity(scalars, border, push, damping * frames, weights)
+    new = np.array([scalars[0], e1, e2])
     # Back substitution: the ratios as they became, then the offset, the smooth signal, the noise.
     after1, after2 = _ratios(new)
     move1, move2 = after1 - k1, after2 - k2
@@ -351,34 +347,31 @@ def _propose(
         step[2, t] = blocks[t, 4] * move2
     # The border's offset is that of the line between the smooth signals: back to the first frame.
     new[0] += offset - k1 * films[0, 0] + after1 * (films[0, 0] + step[0, 0])
-    return films + noise_step(blocks, step, rest, scale, weights), new
+    return films + noise_step(blocks, step, scalars, scale, weights), new
 
 
 @compiled
 def descend(
     films: Array,
-    rest: Array,
+    scalars: Array,
     signals: Array,
     scale: Scale,
     weights: Weights,
     steps: int,
     patience: int,
 ) -> tuple[Array, Array, float, bool]:
-    """Unknowns and objective of a pixel after some steps, each taken where it lowers the objective.
-
-    They end when so many in a row did not lower it by more than the tolerance: true, if they did.
-    """
+    """Unknowns and objective of a pixel after Newton's steps; true if it stopped improving."""
     damping, share, stalled = _FIRST_DAMPING, _SHARE[1], 0
-    loss = losses(films, rest, signals, scale, weights).sum()
+    loss = losses(films, scalars, signals, scale, weights).sum()
     for _ in range(steps):
-        new, other = _propose(films, rest, signals, scale, weights, damping, share)
-        proposed = losses(new, other, signals, scale, weights).sum()
+        new, ratios = _propose(films, scalars, signals, scale, weights, damping, share)
+        proposed = losses(new, ratios, signals, scale, weights).sum()
         before, better = loss, proposed <= loss  # false where it is NaN
         if better:
-            films, rest, loss = new, other, proposed
+            films, scalars, loss = new, ratios, proposed
         stalled = stalled + 1 if before - loss <= weights.tolerance * before else 0
         damping = min(max(damping * (_EASIER if better else _HARDER), _DAMPING[0]), _DAMPING[1])
         share = min(max(share * (_LESS if better else _MORE), _SHARE[0]), _SHARE[1])
         if stalled >= patience:
             break
-    return films, rest, loss, stalled >= patience and np.isfinite(loss)
+    return films, scalars, loss, stalled >= patience and np.isfinite(loss)

@@ -25,8 +25,8 @@ _TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
 class History:
     """Samples of both bands, each a mean of frames, and the maps of the pixels by them.
 
-    When there is no room they are joined in pairs, or the older half is forgotten where the rest
-    is as long as is to be remembered.
+    Without room for more they are joined in pairs, or the older half is forgotten where the newer
+    half is long enough.
     """
 
     def __init__(
@@ -61,17 +61,18 @@ class History:
         last[...] = np.where(np.isnan(last), mean, last + added)
 
     def _make_room(self) -> None:
+        """Forget the older half of the samples, or join them in pairs."""
         half, samples, length = _SAMPLES // 2, self.samples, self._each * self._length
         if half * length >= self._memory:
             samples[:, :half], self._times = samples[:, half:], self._times[:, half:]
             return
         step = np.diff(self._times, axis=1)[:, ::2]
-        apart = (step[0] > APART * length) | (step[1] > 0)
+        gap = (step[0] > APART * length) | (step[1] > 0)
         for i in range(half):
-            one, other = samples[:, 2 * i], samples[:, 2 * i + 1]
-            both = np.where(np.isnan(other), one, 0.5 * (one + other))
-            samples[:, i] = np.where(apart[i] | np.isnan(one), other, both)
-        self._times = self._times[:, 1::2] - np.where(apart, 0.0, 0.5 * step)
+            earlier, later = samples[:, 2 * i], samples[:, 2 * i + 1]
+            mean = np.where(np.isnan(later), earlier, 0.5 * (earlier + later))
+            samples[:, i] = np.where(gap[i] | np.isnan(earlier), later, mean)
+        self._times = self._times[:, 1::2] - np.where(gap, 0.0, 0.5 * step)
         self._each *= 2
 
     def refresh(self, apply: Threads) -> None:
@@ -93,9 +94,9 @@ class History:
                 {"time": self._times[0, :complete]},
             ),
         )
-        together = 1 + number * width // (_TOGETHER * tiles.PIXELS)
-        parts = np.array_split(np.arange(self._next, stop), min(number, together))
-        apply(lambda rows: self._separate(inputs, rows), [rows for rows in parts if rows.size])
+        tasks = 1 + number * width // (_TOGETHER * tiles.PIXELS)
+        blocks = np.array_split(np.arange(self._next, stop), min(number, tasks))
+        apply(lambda rows: self._separate(inputs, rows), [rows for rows in blocks if rows.size])
         self._next, self.solved = stop % height, True
 
     def _separate(self, inputs: Inputs, rows: npt.NDArray[np.intp]) -> None:
@@ -104,13 +105,13 @@ class History:
             maps = np.full((7, cut.status.size), np.nan, np.float32)
             second = self._gain[cut.window].ravel().astype(np.float64)
             gain = np.stack([np.ones_like(second), second])
-            for one in cut.parts:
-                for _, pixels, tile in tiles.of_one_noise(*one, gain, second.size):
-                    found: Any = separate_smooth(tile, inputs.settings)
-                    (a, b), (_, d) = found.emissivity_covariance
-                    ratio = found.reflection_ratio[1], found.reflection_ratio_std[1] ** 2
-                    maps[:, pixels] = [*ratio, *found.emissivity, a, b, d]
-                    cut.status[pixels] |= found.status
+            for section in cut.parts:
+                for _, pixels, tile in tiles.of_one_noise(*section, gain, second.size):
+                    estimate: Any = separate_smooth(tile, inputs.settings)
+                    (a, b), (_, d) = estimate.emissivity_covariance
+                    ratio = estimate.reflection_ratio[1], estimate.reflection_ratio_std[1] ** 2
+                    maps[:, pixels] = [*ratio, *estimate.emissivity, a, b, d]
+                    cut.status[pixels] |= estimate.status
             shape = self.status[cut.window].shape
             self.maps[(slice(None), *cut.window)] = maps.reshape(7, *shape)
             self.status[cut.window] = cut.status.reshape(shape)

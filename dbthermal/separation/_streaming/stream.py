@@ -17,13 +17,13 @@ from dbthermal.schema import Status
 from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import displaced
-from dbthermal.separation._solve import require_workers
+from dbthermal.separation._solve import require_workers, separated_dataset
 from dbthermal.separation._streaming import kernels
 from dbthermal.separation._streaming.history import History
 from dbthermal.separation._streaming.kernels import Planes
 from dbthermal.separation._subspace.fused import FILMS
 from dbthermal.separation._subspace.method import METHOD
-from dbthermal.separation._tiles import KEPT_ATTRS, Array
+from dbthermal.separation._tiles import Array
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -39,13 +39,12 @@ class Stream:
     r"""
     Live separation of two bands: frames in as they come, temperatures out a fixed time later.
 
-    Of each pixel a history of 64 to 128 samples is kept, which are means of more and more frames,
-    and beside it the frames of the last `latency`. The history is separated as by `solve` with
-    the method "subspace", but without its pieces for rapid objects, some rows of the image at a
-    time: reflection ratios, emissivities and `status`. With these the object is the combination of
-    bands without background (eq. 5 and 6 of "subspace"), smoothed by a parabola over four
-    latencies before and one after, or over less where that does not agree; the background is that
-    of every frame (eq. 9). The first object compiles, which takes some seconds.
+    A history of 64 to 128 samples of each pixel, means of more and more frames, is separated by the
+    method "subspace" without its pieces for rapid objects, some rows of the image at a time: it
+    gives reflection ratios, emissivities and `status`. With these the object is the combination of
+    bands without background (eq. 5 and 6 of "subspace"), smoothed by a parabola over four latencies
+    before and one after, or over less where that does not agree; the background is that of every
+    frame (eq. 9). The first object compiles, which takes some seconds.
 
     Parameters
     ----------
@@ -59,14 +58,14 @@ class Stream:
     latency : float
         Age of a frame when its temperatures are known, about [s].
     memory : float
-        Time that is remembered, at least, and at most four times as long [s].
+        Shortest time that is remembered; the longest is four times as long [s].
     refresh : float
         Time in which all rows are separated anew [s].
     settings : SubspaceSettings, optional
         Options of the method "subspace".
     reflection_shift : Dataset, optional
-        From `alignment.reflection_shift`: the second camera's frames are resampled where they show
-        the same reflection. The object is taken to be as warm in both places.
+        From `alignment.reflection_shift`: the second camera's frames are resampled. The object is
+        taken to be as warm in both places.
     response_kind : {"exact", "linear"}
         As for `solve`.
     workers : int
@@ -88,8 +87,7 @@ class Stream:
     -----
     With weights :math:`a_i` of the means in the parabola, the object's variance is that through
     the ratio, as in `solve`, and :math:`\sum_i a_i^2 \, \mathrm{var}(q_i) / h'^2`. A change of the
-    reflection is told as well as from all frames if it lasts longer than a sample of the history;
-    a sample at the detector's limit, or frozen, if it lasts for three.
+    reflection must last longer than a sample of the history, saturated or frozen samples for three.
 
     Examples
     --------
@@ -128,17 +126,17 @@ class Stream:
         for name, value in (("latency", latency), ("memory", memory), ("refresh", refresh)):
             _numbers.real_number(f"{name} [s]", value, _SECONDS)
         require_workers(workers)
-        known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
-        known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
-        known["method"] = replace(METHOD, minimum_frames=1, any_bands=False)
-        inputs = _inputs.check(template, **known)
+        options: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
+        options["reflection_shift"] = reflection_shift
+        options["method"] = replace(METHOD, name="stream", minimum_frames=1, any_bands=False)
+        inputs = _inputs.check(template, response, **options)
         if inputs.settings.device is not None:
             raise ValueError(f"Invalid device '{inputs.settings.device}' of a stream. Omit it.")
         self.bands = tuple(curve.band for curve in inputs.curves)
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.
         self._order, template = inputs.bands, template.isel(band=inputs.bands)
-        inputs = _inputs.check(template, **known | {"response": inputs.response})
+        inputs = _inputs.check(template, inputs.response, **options)
         self._template, self._kind = template.isel(time=0, drop=True), response_kind
         self._shape = shape = (template.sizes["y"], template.sizes["x"])
         height = shape[0]
@@ -180,8 +178,9 @@ class Stream:
     @property
     def nbytes(self) -> int:
         """Memory of the state, which does not grow [byte]."""
-        history, own = self._history, (self._frames, self._means, self._gain, self._status)
-        return sum(part.nbytes for part in (*own, history.samples, history.maps, history.status))
+        frames, history = (self._frames, self._means, self._gain, self._status), self._history
+        arrays = *frames, history.samples, history.maps, history.status
+        return sum(array.nbytes for array in arrays)
 
     def update(
         self, time: npt.ArrayLike, frames: npt.NDArray[np.floating], *, segment: int = 0
@@ -194,8 +193,8 @@ class Stream:
             When the frame was exposed, or each of the frames (time) [s].
         frames : ndarray
             Corrected counts (band, y, x) or (band, time, y, x) [count], the bands as in the
-            template, NaN for no sample. A frame is lost if a band of it has no number, or repeats
-            the frame before.
+            template, NaN for no sample. A frame without a number in a band, or that repeats the one
+            before, is lost.
         segment : int
             Number of shutter events before the frames.
 
@@ -213,7 +212,7 @@ class Stream:
             falls.
         """
         times, counts = self._checked(time, frames, segment)
-        known, films, status = [], [], self._history.status
+        emitted, films, status = [], [], self._history.status
         for now, frame in zip(times.tolist(), counts.swapaxes(0, 1), strict=True):
             if not self._take(now, frame):
                 continue
@@ -221,10 +220,10 @@ class Stream:
             self._history.refresh(self._apply)
             if self._history.solved and self._blocks > self._half:
                 time, block, status = self._emit()
-                known.append(time)
+                emitted.append(time)
                 films.append(block)
-        if known:
-            self._result = self._dataset(known, films, status)
+        if emitted:
+            self._result = self._dataset(emitted, films, status)
             return self._result
         return self._result.isel(time=slice(0)).assign_attrs(lost_frames=self.lost_frames)
 
@@ -305,9 +304,9 @@ class Stream:
         target = self._frames[slot, :, self._filled]
         target[...] = frame
         if self._resample:
-            other = np.where(quality.unusable(self._status), 0.0, frame[1]).ravel()
-            parts = self._threads.map(lambda part: part @ other, self._resample)
-            target[1] = np.concatenate([*parts]).reshape(self._shape)
+            second = np.where(quality.unusable(self._status), 0.0, frame[1]).ravel()
+            rows = self._threads.map(lambda weights: weights @ second, self._resample)
+            target[1] = np.concatenate([*rows]).reshape(self._shape)
         self._filled = (self._filled + 1) % self._block
         return self._filled == 0
 
@@ -326,14 +325,17 @@ class Stream:
         slot = (self._blocks - 1 - self._half) % len(self._frames)
         times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
         order = np.arange(self._blocks - means, self._blocks) % len(self._means)
-        films = np.empty((4, self._block, *self._shape), np.float32)
-        status = self._history.status.copy()
-        pixels = self._history.maps, self._gain, status, films
-        block = kernels.Block(self._frames[slot], self._means, order, *pixels)
         interval, centre = self._block / self._rate, means - 1 - self._half
         fit = kernels.fit(self._mean_times, centre, self._half, interval, times)
+        block = self._as_block(slot, order)
         self._apply(partial(self._temperatures, block, fit), self._rows)
-        return times, films, status
+        return times, block.films, block.status
+
+    def _as_block(self, slot: int, order: npt.NDArray[np.intp]) -> kernels.Block:
+        """Frames of a slot, the means around them, the maps of now, and films without values."""
+        films = np.empty((4, self._block, *self._shape), np.float32)
+        pixels = self._history.maps, self._gain, self._history.status.copy(), films
+        return kernels.Block(self._frames[slot], self._means, order, *pixels)
 
     def _temperatures(self, block: kernels.Block, fit: kernels.Fit, rows: slice) -> None:
         """Films and status of some rows of a block, in place."""
@@ -343,46 +345,38 @@ class Stream:
     def _warm(self) -> None:
         """Compile all that frames need, before the first one comes."""
         kernels.absorb(self._frames[0], self._means[0], 0, 0)
-        films, history = np.empty((4, self._block, *self._shape), np.float32), self._history
         fit = kernels.fit(np.zeros((2, 1)), 0, 1, 1.0, np.zeros(self._block))
-        pixels = history.maps, self._gain, history.status, films
-        block = kernels.Block(self._frames[0], self._means, np.arange(1), *pixels)
-        self._temperatures(block, fit, slice(0, 0))
-        history.warm()
+        self._temperatures(self._as_block(0, np.arange(1)), fit, slice(0, 0))
+        self._history.warm()
 
-    def _dataset(self, known: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
+    def _dataset(self, times: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
         """Stage `separated` of the films (film, frame, y, x) at the times, and the maps of now."""
-        k, variance, one, two, a, b, d = self._history.maps
-        zero = np.float32(0.0) * k
+        ratio, variance, *emissivity, a, b, d = self._history.maps
+        zero = np.float32(0.0) * ratio
         maps = {
-            "emissivity": np.stack([one, two]),
+            "emissivity": np.stack(emissivity),
             "emissivity_std": np.sqrt([a, d]),
             "emissivity_covariance": np.array([[a, b], [b, d]]),
-            "reflection_ratio": np.stack([zero + 1.0, k]),
+            "reflection_ratio": np.stack([zero + 1.0, ratio]),
             "reflection_ratio_std": np.stack([zero, np.sqrt(variance)]),
             "status": status,
         }
         if len(films) != 1:
             films = [np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)]
         maps |= zip(FILMS, films[0], strict=True)
-        kept = {name: v for name, v in self._template.attrs.items() if name in KEPT_ATTRS}
-        stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
-        variables = {n: (stage[n].dims, v, stage[n].attrs | kept) for n, v in maps.items()}
-        variables["status"][2].update(schema.status_attrs())
-        coords = {name: self._template[name] for name in self._template.coords}
-        coords["other_band"] = coords["band"].rename(band="other_band")
-        time = ("time", np.concatenate([[], *known]), schema.COORDINATES["time"].attrs)
-        attrs = kept | {"method": "stream", "response_kind": self._kind}
-        attrs |= {"reference_band": str(self._template["band"].values[0])}
-        result, back = (
-            xr.Dataset(variables, {**coords, "time": time}, attrs),
-            np.argsort(self._order),
+        time = ("time", np.concatenate([[], *times]), schema.COORDINATES["time"].attrs)
+        result = separated_dataset(self._template.assign_coords(time=time), maps)
+        back = np.argsort(self._order)
+        return result.isel(band=back, other_band=back).assign_attrs(
+            method="stream",
+            response_kind=self._kind,
+            reference_band=str(self._template["band"].values[0]),
+            lost_frames=self.lost_frames,
         )
-        return result.isel(band=back, other_band=back).assign_attrs(lost_frames=self.lost_frames)
 
-    def _apply(self, function: Callable[[Any], None], parts: Iterable[Any]) -> None:
-        """Apply a function to parts of the image, in threads."""
-        list(self._threads.map(function, parts))
+    def _apply(self, function: Callable[[Any], None], rows: Iterable[Any]) -> None:
+        """Apply a function to rows of the image, in threads."""
+        list(self._threads.map(function, rows))
 
     def _pair(self, displacement: displaced.Displacement) -> None:
         """Resample the second camera by the shift of what is reflected; see `_apart.displaced`."""

@@ -103,9 +103,9 @@ def _straighten(model: Model, material: Known, work: Work) -> None:
     energy = (work.further - work.straight)[1:].var(dim=1, correction=0) * work.signals.shape[1]
     work.bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
     # Together pixels show a bend that is too small to be seen in each.
-    known = material["noise_variance"].isfinite() if material else torch.zeros_like(work.bent)
+    stated = material["noise_variance"].isfinite() if material else torch.zeros_like(work.bent)
     scatter, _ = _less_noise(model, _scatter(model, work.further)[1], work.order)
-    work.scatter = work.scatter.where(work.bent | known, scatter)
+    work.scatter = work.scatter.where(work.bent | stated, scatter)
 
 
 def _blackbody(
@@ -137,9 +137,9 @@ def _numbers(model: Model, bands: int | slice) -> Tensor:
     return model.tables[bands, -5:].movedim(-1, 0)[..., None, None]
 
 
-def _weighted(parts: Tensor, weights: Tensor) -> Tensor:
+def _weighted(curves: Tensor, weights: Tensor) -> Tensor:
     """Sum over the bands of (band, time, pixel), weighted by (band, pixel)."""
-    return einsum("btp,bp->tp", parts, weights)
+    return einsum("btp,bp->tp", curves, weights)
 
 
 def _quotient(numerator: Tensor, denominator: Tensor, otherwise: float) -> Tensor:
@@ -180,10 +180,10 @@ def _ratios(model: Model, material: Known, work: Work) -> None:
     if material:
         # The mean of the posterior, of the material's ratio for a prior with its spread.
         spread = material["spread"]
-        own = _quotient(spread, spread + inverse, 0.0)
-        mean = material["ratio"] + own * (ratio - material["ratio"])
-        ratio = torch.where(work.pooled, mean.where(own > 0, material["ratio"]), ratio)
-        common = (1.0 - own) * (spread + (1.0 - own) * material["inverse_energy"])
+        blend = _quotient(spread, spread + inverse, 0.0)
+        mean = material["ratio"] + blend * (ratio - material["ratio"])
+        ratio = torch.where(work.pooled, mean.where(blend > 0, material["ratio"]), ratio)
+        common = (1.0 - blend) * (spread + (1.0 - blend) * material["inverse_energy"])
         inverse = common.where(work.pooled, inverse)
     weights, variance = reflection_ratio.null_combination(ratio, model.noise)
     work.ratio, work.inverse_energy = ratio, inverse
@@ -251,16 +251,16 @@ def _alternate(model: Model, material: Known, work: Work) -> None:
     # Middle of the interval that the ratios leave for e_1, for a constant object.
     largest = ratio.amax(dim=0)
     middle = 0.5 + 0.5 * (1.0 - 1.0 / largest).where(largest > 1.0, 0.0)
-    known = torch.zeros_like(work.pooled)
+    fixed = torch.zeros_like(work.pooled)
     if material:
-        told = work.pooled & material["emissivity"].isfinite()
-        middle = material["emissivity"].where(told, middle)
-        known = told & material["noise_variance"].isfinite()
+        material_emissivity = work.pooled & material["emissivity"].isfinite()
+        middle = material["emissivity"].where(material_emissivity, middle)
+        fixed = material_emissivity & material["noise_variance"].isfinite()
 
     def approach(emissivity: Tensor, temperature: Tensor) -> tuple[Tensor, Tensor]:
         """Return the object after a step of Newton towards h(x) = q (eq. 6), and h'(x) before."""
         factors = work.null_weights * (1.0 - ratio * (1.0 - emissivity))
-        value, slope = (_weighted(part, factors) for part in _blackbody(model, temperature))
+        value, slope = (_weighted(values, factors) for values in _blackbody(model, temperature))
         return temperature + (target - value) / slope, slope
 
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
@@ -273,15 +273,15 @@ def _alternate(model: Model, material: Known, work: Work) -> None:
         work.emitted = _blackbody(model, temperature, 0)[0]
         slope = _regress(work, float(model.noise[0]))
         least = pixel.OBJECT_TO_NOISE * work.used * work.null_variance
-        work.constant = (work.energy < least) & ~known
+        work.constant = (work.energy < least) & ~fixed
         rate = (slope - slope_before) / (first - before)
         rate = rate.where(rate.abs() < pixel.FASTEST, 0.0)
         before, slope_before = first, slope
         first = slope + (slope - before) * rate / (1.0 - rate)
-        first = middle.where(work.constant | known, first)
+        first = middle.where(work.constant | fixed, first)
         temperature, work.steepness = approach(first, temperature)
     work.temperature, work.at_object = temperature, _blackbody(model, temperature)[0]
-    work.known, work.emissivity = known, 1.0 - ratio * (1.0 - first)
+    work.known, work.emissivity = fixed, 1.0 - ratio * (1.0 - first)
 
 
 def _emission(model: Model, material: Known, work: Work) -> None:
@@ -310,8 +310,8 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     # Eq. 6 by implicit differentiation; the error of w.kappa moves weight from the other bands to
     # the first, by their share in it.
     shares = (w**2 * (noise[:, None] ** 2 + (work.ratio * noise[0]) ** 2))[1:]
-    others = _weighted(work.at_object[1:], shares / shares.sum(dim=0))
-    partial = mixing.mixed(first, work.at_object[0], others)
+    mean_signal = _weighted(work.at_object[1:], shares / shares.sum(dim=0))
+    partial = mixing.mixed(first, work.at_object[0], mean_signal)
     sensitivity = (partial - model.object_part.T @ work.coefficients[0]) / work.steepness
     leverage = model.leverage[work.order - 1].T
     smooth_variance = leverage * work.null_variance / work.steepness**2
@@ -341,8 +341,8 @@ def _covariance(model: Model, work: Work, level: Tensor) -> Tensor:
 
 def _curve_variance(model: Model, work: Work, kernel: Tensor) -> Tensor:
     """Variance (pixel) of the sum of a kernel (time, pixel) over the object's smoothed noise."""
-    part = (model.object_part @ kernel) * work.columns
-    return work.null_variance * (part**2).sum(dim=0)
+    projected = (model.object_part @ kernel) * work.columns
+    return work.null_variance * (projected**2).sum(dim=0)
 
 
 def _walk(model: Model, work: Work) -> tuple[Tensor, Tensor]:
@@ -373,12 +373,12 @@ def _linear(model: Model, work: Work, limit: Tensor) -> Tensor:
     """Variance (pixel) [1] of the slope from a linear drift, weighted twice; see `bars`."""
     drift, weights = model.rising[0][:, None].expand_as(work.emitted), work.weights
     for last in (False, True):
-        slope, _, beside, _ = _fit(work.emitted, drift, weights)
-        kernel = weights * beside
+        slope, _, centred, _ = _fit(work.emitted, drift, weights)
+        kernel = weights * centred
         kernel = kernel / (kernel * drift).sum(dim=0)
         size = (kernel * work.residual).sum(dim=0)
         if not last:
-            weights = _tukey(work.residual - size * beside, work.scale)
+            weights = _tukey(work.residual - size * centred, work.scale)
     variance = model.noise[0] ** 2 * (kernel**2).sum(dim=0)
     variance = variance + work.emissivity[0] ** 2 * _curve_variance(model, work, kernel)
     before = torch.maximum((limit / model.spread) ** 2, size**2 + variance)
@@ -411,11 +411,11 @@ def _background(model: Model, work: Work) -> None:
     if model.pattern.any():
         slopes = emissivity[:, None] * _blackbody(model, work.temperature)[1]
         direct = weights / (1.0 - emissivity)
-        parts = work.null_weights[:, None] / _weighted(slopes, work.null_weights)
-        others = direct[:, None] - _weighted(slopes, direct) * parts
-        others = others / _blackbody(model, work.background, 0)[1]
-        for name, part in (("variance", parts), ("background_variance", others)):
-            squares = einsum("b,btp->tp", model.pattern**2, part**2)
+        of_object = work.null_weights[:, None] / _weighted(slopes, work.null_weights)
+        of_background = direct[:, None] - _weighted(slopes, direct) * of_object
+        of_background = of_background / _blackbody(model, work.background, 0)[1]
+        for name, weight in (("variance", of_object), ("background_variance", of_background)):
+            squares = einsum("b,btp->tp", model.pattern**2, weight**2)
             setattr(work, name, getattr(work, name) + squares)
 
 
@@ -456,12 +456,15 @@ def _first_residual(abscissa: Tensor, ordinate: Tensor, noise: float) -> Tensor:
     for start in (torch.ones_like(plain), plain >= 0, plain <= 0):
         weights = start.float()
         for _ in range(regression.STARTING_STEPS):
-            one, other, residual, _ = _fit(x, z, weights)
+            trial_slope, trial_intercept, residual, _ = _fit(x, z, weights)
             deviation = _ranked_magnitude(residual)
             scale = regression.ANNEALING * regression.TO_STD * deviation
             weights = _tukey(residual, scale.clip(min=noise)).float()
         better = deviation < smallest
-        slope, intercept = one.where(better, slope), other.where(better, intercept)
+        slope, intercept = (
+            trial_slope.where(better, slope),
+            trial_intercept.where(better, intercept),
+        )
         smallest = deviation.where(better, smallest)
     return up - intercept - slope * centred
 
@@ -494,7 +497,7 @@ def _judge(model: Model, work: Work) -> None:
     residual = _weighted(work.straight, work.null_weights) - model.functions.T @ work.smoothed
     rapid = work.straight[0] - model.functions.T @ work.coefficients[0]
     curve = model.object_part.T @ work.smoothed
-    work.sums = torch.stack([_block_sums(part, model.parts) for part in (residual, curve)])
+    work.sums = torch.stack([_block_sums(film, model.parts) for film in (residual, curve)])
     # Mean autocorrelation over some lags, in standard deviations of white noise.
     lags = range(1, residuals.LAGS + 1)
     lagged = torch.stack([(residual[lag:] * residual[:-lag]).sum(dim=0) for lag in lags]).sum(0)
@@ -522,7 +525,7 @@ def _judge(model: Model, work: Work) -> None:
     variance = work.null_variance.where(work.null_variance > 0, np.inf)
     rapid = rapid - common / variance * residual
     sums, products, squares = (
-        _block_sums(part, model.edges) for part in (residual, residual * rapid, rapid**2)
+        _block_sums(film, model.edges) for film in (residual, residual * rapid, rapid**2)
     )
     unexplained = _quotient(products**2, squares, 0.0).sum(dim=0) / variance > most
     while len(sums) > 1:

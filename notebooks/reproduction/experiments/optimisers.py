@@ -85,7 +85,7 @@ def losses(films: Any, rest: Any, search: Search) -> Any:
 
 def newton_gradient(search: Search, column: int) -> tuple[Array, ...]:
     """Losses, and the gradient of a Newton step: by smooth signal, noise, offset, emissivities."""
-    films, rest, signals = search.films[column], search.rest[column], search.signals[column]
+    films, rest, signals = search.films[column], search.scalars[column], search.signals[column]
     weights, sigma = search.weights, search.tile.noise
     deviation = [
         objective.deviation(*band, SETTINGS.deviation_floor)
@@ -123,7 +123,9 @@ def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
     """
     search = copy.deepcopy(search)
     search.films += rng.standard_normal(search.films.shape) * np.array([[1.0], [0.1], [0.1]])
-    films, rest = (torch.tensor(part, requires_grad=True) for part in (search.films, search.rest))
+    films, rest = (
+        torch.tensor(part, requires_grad=True) for part in (search.films, search.scalars)
+    )
     total = losses(films, rest, search)
     gradient = (part.numpy() for part in torch.autograd.grad(total.sum(), (films, rest)))
     rows = []
@@ -137,20 +139,20 @@ def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
 
 def newton(start: Search, truth: xr.DataArray) -> tuple[Search, xr.Dataset]:
     """Search at the end of its steps, and their mean number with what is `judged`."""
-    stages, stopped = np.full(len(start.rest), SETTINGS.stages), []
+    stages, stopped = np.full(len(start.scalars), SETTINGS.stages), []
     for number in range(1, SETTINGS.steps + 1):
         search, began = copy.deepcopy(start), time.process_time()
         search.settings = replace(SETTINGS, steps=number)
         stopped.append(search._minimise(stages)[1])
     before = SETTINGS.stage_steps * (SETTINGS.stages - 1)
     steps = before + 1 + np.mean(~np.array(stopped[:-1]), axis=1).sum()
-    point = steps, time.process_time() - began, *map(torch.tensor, (search.films, search.rest))
+    point = steps, time.process_time() - began, *map(torch.tensor, (search.films, search.scalars))
     return search, judged(start, truth, [point])
 
 
 def adam(start: Search, truth: xr.DataArray, rate: float, looks: Sequence[int]) -> xr.Dataset:
     """What is `judged` at some steps of Adam of a rate [K, and 1 of emissivities]."""
-    films, rest = (torch.tensor(part, requires_grad=True) for part in (start.films, start.rest))
+    films, rest = (torch.tensor(part, requires_grad=True) for part in (start.films, start.scalars))
     descent, began, points = torch.optim.Adam([films, rest], lr=rate), time.process_time(), []
     for number in range(1, max(looks) + 1):
         descent.zero_grad()

@@ -1,6 +1,11 @@
 """Figures of the experiments: accuracy, filters, limits, comparisons, nuisances, twins."""
 
-from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
+from reproduction.figures.accuracy import (
+    accuracy,
+    error_bar_calibration,
+    truth_and_estimate,
+    validity,
+)
 from reproduction.figures.comparison import (
     compared_reflections,
     descents,
@@ -10,6 +15,7 @@ from reproduction.figures.comparison import (
     reductions,
     sensitivity,
 )
+from reproduction.figures.emissivities import emissivity_bars, emissivity_by_contact
 from reproduction.figures.filters import condition_matrix
 from reproduction.figures.limits import (
     error_over_bands,
@@ -26,6 +32,8 @@ __all__ = [
     "condition_matrix",
     "descents",
     "disturbances",
+    "emissivity_bars",
+    "emissivity_by_contact",
     "emissivity_errors",
     "emissivity_procedures",
     "error_bar_calibration",
@@ -40,5 +48,6 @@ __all__ = [
     "reductions",
     "sensitivity",
     "thermocouples",
+    "truth_and_estimate",
     "validity",
 ]
