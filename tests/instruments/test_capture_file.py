@@ -139,6 +139,15 @@ def test_a_correction_and_the_cameras_own_number_are_kept(tmp_path: Path) -> Non
     assert ("correction", "8-14", 90) in [note[1:] for note in notes(tmp_path / "a.zarr")]
 
 
+def test_a_frame_of_another_shape_is_refused_at_once(tmp_path: Path) -> None:
+    """The frames before it are kept."""
+    capture = begun(tmp_path / "raw.zarr")
+    capture.frame(BANDS[0], shot(0))
+    with pytest.raises(ValueError, match=r"Invalid frame of \(3, 80\) in .*Must be \(4, 80\)"):
+        capture.frame(BANDS[0], shot(1, counts=IMAGE[:3]))
+    assert capture.totals[BANDS[0]]["frames"] == 1
+
+
 def test_copies_of_the_last_frame_say_so(tmp_path: Path) -> None:
     """Padding after a band's last frame is flagged, and has the sequence number -1."""
     second = stored(tmp_path / "a.zarr", map(shot, range(6)), [shot(0)]).isel(band=1)

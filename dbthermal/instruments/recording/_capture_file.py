@@ -198,9 +198,12 @@ class CaptureFile:
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
         """Take a frame, write the chunk if it is full, and return all flags of the frame.
 
-        `refused` is the number of frames of this band that came before it and were not taken.
+        `refused` is the number of frames of this band that came before it and were not taken. A
+        frame of another shape than the source's is a ValueError.
         """
-        state = self._bands[band]
+        state, shape = self._bands[band], (self._sizes["y"], self._sizes["x"])
+        if frame.counts.shape != shape:
+            raise ValueError(f"Invalid frame of {frame.counts.shape} in '{band}'. Must be {shape}.")
         # Flags, from the frame before and from the shutter.
         flags = frame.flags | self._compared(band, frame, refused)
         flags |= self._watch_shutter(band, frame, flags)
