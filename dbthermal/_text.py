@@ -6,7 +6,6 @@ that mean the same in YAML 1.1 and 1.2. Nothing is guessed, and of two equal key
 """
 
 import csv
-import json
 import math
 import os
 import re
@@ -14,7 +13,6 @@ import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import partial
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -161,29 +159,6 @@ def numbers(rows: Sequence[Row], width: int, source: str) -> NDArray[np.float64]
             for line, row in rows
         ]
     )
-
-
-def parse_json(text: str, source: str) -> Any:
-    """Content of JSON; ValueError by place if a key repeats or a number is not finite."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        for key in repeated(key for key, _ in pairs):
-            raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
-        return dict(pairs)
-
-    def whole(digits: str) -> int:
-        number(digits, source)  # a whole number of thousands of digits is none
-        return int(digits)
-
-    finite = partial(number, place=source)
-    hooks: Any = {"parse_float": finite, "parse_int": whole, "parse_constant": finite}
-    try:
-        return json.loads(text, object_pairs_hook=once, **hooks)
-    except json.JSONDecodeError as error:
-        place = at(source, error.lineno, error.colno)
-        raise ValueError(f"{place}: Must be JSON: {error.msg}.") from error
-    except RecursionError as error:
-        raise ValueError(f"{source}: Invalid nesting. Must be less deep.") from error
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:
