@@ -1,8 +1,7 @@
-"""The smooth subspace of time: every curve that a slowly changing object temperature can take.
+"""Smooth subspace of time: the curves that a slowly changing object temperature can take.
 
-An orthonormal basis of polynomials over the capture's own time stamps. The bases are nested, so
-the fit of every order follows from one set of coefficients. An object that changes rapidly now and
-then has polynomials in pieces of the time.
+Orthonormal polynomials over the time stamps, nested, so that one set of coefficients gives the fit
+of every order; of an object that changes rapidly now and then, in pieces of the time.
 """
 
 from dataclasses import dataclass

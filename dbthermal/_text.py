@@ -1,8 +1,8 @@
-"""Text from elsewhere: files, numbers, tables and YAML, read strictly, or refused by line and rule.
+"""Strict reading of text from other programs: files, numbers, tables and YAML.
 
-Whatever a reader opens was written by others. `read_text` opens regular files of a limited size,
-`number` takes decimal numbers alone, `table_rows` and `numbers` whole tables, `parse_yaml` mappings
-that mean the same in YAML 1.1 and 1.2. Nothing is guessed, and of two equal keys neither wins.
+`read_text` opens regular files of a limited size, `number` takes decimal numbers alone,
+`table_rows` and `numbers` whole tables, `parse_yaml` mappings that mean the same in YAML 1.1 and
+1.2. Nothing is guessed; errors name the line and the rule.
 """
 
 import csv

@@ -1,8 +1,7 @@
-"""Noise of the two bands, estimated from a capture in which everything moves.
+"""Noise of two bands, estimated from a capture with motion.
 
-Smooth functions and a second difference in time remove the object. The background is removed
-twice: its rare steps by trimming, and what it moves all the time by the bands, because noise is
-independent between them and the background is not.
+Smooth functions and second differences in time remove the object. Trimming removes rare steps of
+the background; the covariance of the bands, whose noise is independent, removes its other motion.
 """
 
 from collections.abc import Sequence
@@ -172,8 +171,7 @@ def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Arra
     """Variances and covariance (pixel) over the frames in which the bands do not step.
 
     The frames are cut by an ellipse of the shape of the covariance, which scales all of it by one
-    factor: a cut of each band alone would reduce the covariance more than the variances, whose
-    small difference is the noise.
+    factor; the noise is a small difference between variances and covariance.
     """
     scales = [MAD * np.median(np.abs(difference), axis=0) for difference in (first, second)]
     first_scaled, second_scaled = (

@@ -289,8 +289,8 @@ def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     if "band" in temperature.dims:
         raise ValueError(f"Invalid dims {temperature.dims} of the temperature. Must lack 'band'.")
     values = require_range(temperature.values, of_bands[0], "temperature")
-    parts = [temperature.copy(data=one.counts(values)) for one in of_bands]
-    result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))
+    films = [temperature.copy(data=band_curve.counts(values)) for band_curve in of_bands]
+    result = xr.concat(films, dim=xr.DataArray(names, dims="band", name="band"))
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
 

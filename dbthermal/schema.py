@@ -218,10 +218,9 @@ LARGEST: Final = 1e9
 """Magnitude from which a number of counts or kelvin is no measurement of any detector."""
 
 EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
-"""A spectral emissivity outside is no measurement, but a wrong unit or a damaged file [1].
+"""A spectral emissivity outside is a wrong unit or a damaged file [1].
 
-The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from reflectances of 116 %
-and -1.4 % relative to the reference."""
+The libraries have -0.16 (trona) to 1.014 (maple bark)."""
 
 MEASURED: Final = "measured"
 """Attribute `origin` of what a real camera has recorded; of all else it begins otherwise."""

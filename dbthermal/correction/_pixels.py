@@ -245,13 +245,13 @@ def _samples(movie: xr.DataArray, rows: slice) -> Single:
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     """Pixels whose noise differs from that around them by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.log(level / usual)  # minus infinity where nothing changes
-    finite = np.isfinite(apart)
+        logarithm = np.log(level / usual)  # minus infinity where nothing changes
+    finite = np.isfinite(logarithm)
     if not finite.any():
         return np.asarray(level == 0)
-    centre = np.median(apart[finite])
-    scale = max(MAD * float(np.median(np.abs(apart[finite] - centre))), _ROUNDING)
-    return np.asarray((np.abs(apart - centre) > threshold * scale) | (level == 0))
+    centre = np.median(logarithm[finite])
+    scale = max(MAD * float(np.median(np.abs(logarithm[finite] - centre))), _ROUNDING)
+    return np.asarray((np.abs(logarithm - centre) > threshold * scale) | (level == 0))
 
 
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:

@@ -128,10 +128,9 @@ def rank_filters(
 ) -> xr.Dataset:
     """Filters to set beside a band, best conditioned first, by two criteria.
 
-    The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
-    its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
-    The second criterion settles it: the standard deviation of the object temperature from one
-    frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
+    The first criterion is the paper's, the lowest condition number (its section 5 says highest, a
+    slip). The second is the standard deviation of the object temperature from one frame, which
+    includes the noise of a narrow filter. Both are medians over the materials.
 
     Parameters
     ----------
@@ -192,7 +191,7 @@ def _emissivities(table: xr.Dataset) -> xr.DataArray:
     return values
 
 
-def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
+def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, camera_band: str) -> xr.DataArray:
     r"""Standard deviation [K] of the object temperature from one frame (material, band).
 
     For each band m beside band 1, emissivities known, in the linear approximation,
@@ -201,15 +200,15 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     """
     values = _emissivities(table)
     names = [str(name) for name in values["band"].values]
-    if beside not in names or len(names) < 2:
-        raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
+    if camera_band not in names or len(names) < 2:
+        raise ValueError(f"Invalid bands {names}. Must hold '{camera_band}' and at least one more.")
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
-    filters = [name for name in names if name != beside]
+    filters = [name for name in names if name != camera_band]
     camera, filtered = (
-        values.sel(band=beside).values[:, np.newaxis],
+        values.sel(band=camera_band).values[:, np.newaxis],
         values.sel(band=filters).values,
     )
-    noises = std[names.index(beside)], std[[names.index(name) for name in filters]]
+    noises = std[names.index(camera_band)], std[[names.index(name) for name in filters]]
     error = np.hypot((1 - filtered) * noises[0], (1 - camera) * noises[1])
     contrast = np.abs(camera - filtered)
     return xr.DataArray(

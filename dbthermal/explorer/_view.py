@@ -1,4 +1,4 @@
-"""View of a result or a capture: its panes, frames, ranges of colour, curves, and code for them."""
+"""View of a result or a capture: panes, frames, ranges of colour, curves, and code for them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -25,16 +25,15 @@ FILMS: Final = {
     "background_temperature": "reflected temperature",
 }
 _ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
-_SAMPLES: Final = 2**22  # of a region's film that are read at once
-_LOOKED_AT: Final = (12, 40_000)  # frames, and pixels of a frame, of which the range is taken
+_SAMPLES: Final = 2**22  # of a region's film that are read in one pass
+_RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the range of colour
 
 
 class View:
     """Frames, ranges of colour and curves of a result or a capture, as the explorer shows them.
 
-    Films that are not in memory are copied into a temporary file, where the environment variable
-    ``TMPDIR`` says, frame after frame, when they are first read: 4 bytes a pixel and frame on disk,
-    and in memory no more than a row of a store's chunks.
+    Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
+    read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
 
     Parameters
     ----------
@@ -117,7 +116,7 @@ class View:
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
     def _panes(self, *, is_capture: bool) -> Iterator[Pane]:
-        """Yield what can be shown, in the order in which it is."""
+        """Yield the panes, in the order in which they are shown."""
         if self.capture is not None:
             reference = self.data if is_capture else self.data.get("object_temperature")
             yield from self._inputs(self.capture, reference)
@@ -176,7 +175,7 @@ class View:
                 yield Pane(f"input {band}", label, "K", film, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
-        """Pane of a name, read so far that a frame of it is quick; ValueError for another name."""
+        """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
         if name not in self.panes:
             raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
         self.panes[name].stage(self.progress)
@@ -226,12 +225,11 @@ class View:
         return good | ((self.status & COMPLETED) != 0) if pixels == "unflagged" else good
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane: all but one in a hundred of its values at either end.
+        """Range of colour of a pane: the 1st and 99th percentile of some measured values.
 
-        Of some frames and pixels, those that are measured if there are any; a deviation begins
-        at 0.
+        Of all values if none is measured; a deviation begins at 0.
         """
-        pane, (frames, pixels) = self.pane(name), _LOOKED_AT
+        pane, (frames, pixels) = self.pane(name), _RANGE
         times = slice(0, None, -(-self.time.size // frames))
         every = slice(0, None, stride(self.shape, pixels))
         values, good = pane.read(times, every, every), self.counted("measured")[every, every]
@@ -312,10 +310,10 @@ class View:
     def _common(self, pane: Pane, box: tuple[slice, ...], where: Mask) -> Array | None:
         """Deviation (pixel) by the emissivities for a contrast of 1 K; NaN: all is shared."""
         data, (rows, columns) = self.data, box
-        apart = data.attrs.get("reflection_shift", "none") != "none"
-        apart |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
+        displaced = data.attrs.get("reflection_shift", "none") != "none"
+        displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
         needed = {*FILMS, "emissivity", "emissivity_std"}
-        if pane.name not in FILMS or apart or not needed <= set(data):
+        if pane.name not in FILMS or displaced or not needed <= set(data):
             return None
         cut = data[[name for name in data if str(name).startswith("emissivity")]]
         cut = cut.isel(y=rows, x=columns)

@@ -16,8 +16,7 @@ from dbthermal._numbers import POSITIVE, real_number, real_numbers, whole_number
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
-# Standard deviation of a uniform number, over the width of its interval.
-_UNIFORM: Final = 1.0 / np.sqrt(12.0)
+_UNIFORM: Final = 1.0 / np.sqrt(12.0)  # standard deviation of a uniform number over its range
 _LEAST_STD: Final = 1e-9  # of an emissivity that is not known exactly [1]
 
 
@@ -88,9 +87,9 @@ def bounds(
     r"""Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
     The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
-    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a known smooth
-    subspace of polynomials of time; y, one number a frame, eliminated as by variable projection
-    [2]_, and in the frames at rest one number for all of them. Response and noise are known.
+    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a smooth subspace of
+    polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
+    frames at rest one number for all. Response and noise are known.
 
     Parameters
     ----------

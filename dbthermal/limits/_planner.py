@@ -12,10 +12,8 @@ from dbthermal import _numbers, bands, mixing, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
-# Entry of a material without a best filter: none of them determines its temperature.
-_NO_FILTER: Final = "none"
-# Time constant of the object's warming, as a share of the capture.
-_TIME_CONSTANT: Final = 1.0 / 3.0
+_NO_FILTER: Final = "none"  # entry of a material whose temperature no filter determines
+_TIME_CONSTANT: Final = 1.0 / 3.0  # of the object's warming, as a share of the capture
 _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 
 
@@ -23,8 +21,8 @@ _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 class CaptureDesign:
     """Capture conditions: a warming object before a background of regular pulses.
 
-    The object's time constant is a third of the capture. The background is warmer for the end of
-    each period, as if someone stood there, and rests before.
+    The object's time constant is a third of the capture. The background rests, and is warmer at the
+    end of each period.
 
     Attributes
     ----------
@@ -81,9 +79,8 @@ def plan(
 ) -> xr.Dataset:
     r"""Expected accuracy of one pixel for each material and filter, and the best filter.
 
-    The Cramer-Rao bound of `bounds` for a designed capture, with the response of Planck's law over
-    each band. Those of n pixels of one material share their ratios and emissivities, whose
-    deviations fall as :math:`1 / \sqrt{n}`.
+    The Cramer-Rao bound of `bounds` for a designed capture, with Planck's law over each band. The
+    emissivity errors of n pixels of one material fall as :math:`1 / \sqrt{n}`.
 
     Parameters
     ----------
@@ -103,13 +100,12 @@ def plan(
     Returns
     -------
     Dataset
-        Over (material, filter), the filters of a combination joined by " + ":
-        `object_temperature_std`, `background_temperature_std` [K], root mean square over time, and
-        `condition_number` [1]. Over (material, filter, band): `emissivity_std` and
-        `reflection_ratio_std` [1], over the band always recorded; NaN for a band outside the
-        combination. `best` (material): the filter of the smallest object deviation, "none" where
-        each is above that of a uniform number within the capture's range of temperatures. `noise`
-        (band) [K], and the design's numbers as attributes.
+        Over (material, filter), combinations joined by " + ": `object_temperature_std`,
+        `background_temperature_std` [K], root mean square over time, and `condition_number` [1].
+        Over (material, filter, band): `emissivity_std`, and `reflection_ratio_std` over the band
+        `beside` [1]; NaN for a band outside the combination. `best` (material): the filter of the
+        smallest object deviation, "none" if all are above that of a uniform number within the
+        capture's temperatures. `noise` (band) [K], and the design's numbers as attributes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A simulated rig: response from Planck's law, fixed pattern, noise, 16-bit counts."""
+"""Simulated cameras: response by Planck's law, fixed pattern, noise, 16-bit counts."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,8 +19,8 @@ _SLOPE_TEMPERATURE: Final = 300.0
 class Rig:
     """Simulated cameras, one a band: response, noise and fixed pattern.
 
-    The defaults are round figures for the camera of the paper, a 16-bit 640x512 microbolometer.
-    Behind a filter the counts shrink with the band's share of dB/dT; their noise stays.
+    By default about the camera of the paper, a 16-bit 640x512 microbolometer. Behind a filter the
+    counts shrink with the band's share of dB/dT; their noise stays.
 
     Attributes
     ----------

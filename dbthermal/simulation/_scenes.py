@@ -1,4 +1,4 @@
-"""Scenes with known truth: an object that changes smoothly before a background that does not."""
+"""Simulated scenes: an object that changes smoothly before a background that does not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -185,7 +185,7 @@ def independent_pixels(
     stop: float,
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
-    """Scene one row high of many pixels of one material, each with its own heating and background.
+    """Scene of one row of pixels of one material, each with its own heating and background.
 
     Parameters
     ----------
@@ -220,10 +220,10 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """Simulated twin of a plate heated in its middle that reflects people who walk by.
+    """Plate, heated in its middle, that reflects people who walk by.
 
-    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
-    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
+    at a steady pace.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def walkers(
 
 
 def increasing(times: npt.ArrayLike, name: str) -> Array:
-    """Checked times (time,) [s]: two or more, finite, increasing; `name` is for the ValueError."""
+    """Checked times (time,) [s] of a named thing: two or more, finite, increasing."""
     array = _numbers.real_numbers(f"times [s] of {name}", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")
