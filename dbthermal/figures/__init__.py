@@ -9,8 +9,6 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 
 from dbthermal.figures import drawing
 from dbthermal.figures._calibration import (
-    emissivity_bars,
-    emissivity_by_contact,
     gain_offset_maps,
     response_fit,
 )
@@ -20,10 +18,8 @@ from dbthermal.figures._scenes import (
     FilmPanel,
     film,
     reflection_shift,
-    separated_film,
     separated_frames,
     separated_temperatures,
-    truth_and_estimate,
 )
 from dbthermal.figures._status import REASONS, first_reason, status
 
@@ -33,18 +29,14 @@ __all__ = [
     "LiveFigure",
     "Panel",
     "drawing",
-    "emissivity_bars",
-    "emissivity_by_contact",
     "film",
     "first_reason",
     "gain_offset_maps",
     "plan",
     "reflection_shift",
     "response_fit",
-    "separated_film",
     "separated_frames",
     "separated_temperatures",
     "status",
-    "truth_and_estimate",
 ]
 __dir__ = __all__.copy

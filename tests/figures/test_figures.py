@@ -41,21 +41,6 @@ def draw_response(**attrs: object) -> Figure:
     return figures.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
 
 
-def separated(fill: float = 1.0) -> xr.Dataset:
-    """Temperatures of a scene with their deviations."""
-    names = ("object_temperature", "background_temperature")
-    movie = fill * array("time y x", 2, 5, 6)
-    parts = dict.fromkeys(names, movie) | {f"{name}_std": movie - 300 for name in names}
-    return xr.Dataset(parts)
-
-
-def draw_contact(**attrs: object) -> Figure:
-    """Draw the emissivities of two materials beside their truth."""
-    value = array("material band", 2, 2) - 300
-    measured = xr.Dataset({"emissivity": value, "emissivity_std": 0.01 * value}, attrs=attrs)
-    return figures.emissivity_by_contact(measured, value)
-
-
 def draw_frames(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw the inputs, emission and reflection of two times."""
     inputs = (fill * array("band time y x", 2, 2, 5, 6)).assign_attrs(attrs)
@@ -68,17 +53,6 @@ def draw_temperatures(**attrs: object) -> Figure:
     movie = array("time y x", 2, 5, 6)
     apparent = array("band time y x", 2, 2, 5, 6, **attrs)
     return figures.separated_temperatures(apparent, movie, movie - 300, title="scene")
-
-
-def draw_bars(**attrs: object) -> Figure:
-    """Draw the band emissivities of two materials."""
-    table = {"emissivity": array("material band", 2, 2) - 300}
-    return figures.emissivity_bars(xr.Dataset(table, attrs=attrs))
-
-
-def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
-    """Draw the truth of a pixel beside its estimate."""
-    return figures.truth_and_estimate(separated().assign_attrs(attrs), separated(fill), (1, 2))
 
 
 def draw_plan(**attrs: object) -> Figure:
@@ -107,7 +81,6 @@ def draw_shift(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.reflection_shift(xr.Dataset(field, attrs={**attrs, **bands}))
 
 
-CELSIUS = (f"object temperature [{DEGREE}]", f"background temperature [{DEGREE}]", "time [s]")
 KELVINS = (f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background change [K]")
 RESIDUALS = ("residual of the line [K]", "residual of the curve [mK]")
 FILTER = "filter beside 8-14 [\N{MICRO SIGN}m]"
@@ -117,9 +90,6 @@ DRAWN: dict[str, tuple[Callable[..., Figure], tuple[str, ...]]] = {
         draw_response,
         ("signal [count]", *RESIDUALS, f"blackbody temperature [{DEGREE}]"),
     ),
-    "emissivity_by_contact": (draw_contact, ("emissivity [1]",)),
-    "emissivity_bars": (draw_bars, ("band emissivity [1]",)),
-    "truth_and_estimate": (draw_truth, CELSIUS),
     "separated_frames": (draw_frames, LABELS),
     "separated_temperatures": (draw_temperatures, KELVINS),
     "reflection_shift": (draw_shift, (*SHIFTS, "standard deviation [pixel]")),
@@ -132,7 +102,6 @@ DRAWN: dict[str, tuple[Callable[..., Figure], tuple[str, ...]]] = {
 def test_every_figure_is_tested() -> None:
     """The table of figures above holds every public figure."""
     elsewhere = {"FilmPanel", "LiveFigure", "Panel", "REASONS", "drawing", "film", "first_reason"}
-    elsewhere |= {"separated_film"}
     assert {*figures.__all__} - elsewhere == DRAWN.keys()
 
 
@@ -147,7 +116,7 @@ def test_figure(name: str) -> None:
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
 
-@pytest.mark.parametrize("name", ["gain_offset_maps", "separated_frames", "truth_and_estimate"])
+@pytest.mark.parametrize("name", ["gain_offset_maps", "separated_frames"])
 def test_nothing_but_nan(name: str) -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
     figure = DRAWN[name][0](fill=np.nan)
@@ -157,25 +126,9 @@ def test_nothing_but_nan(name: str) -> None:
 
 def test_celsius_on_the_axes() -> None:
     """Kelvin go in, degrees Celsius are drawn."""
-    kelvin = separated()["object_temperature"].isel(y=1, x=2)
-    estimate, truth = draw_truth().axes[0].lines
-    for line in (estimate, truth):
-        np.testing.assert_allclose(np.asarray(line.get_ydata()), kelvin - 273.15, rtol=0, atol=1e-9)
     image = draw_temperatures().axes[0].images[0].get_array()
     apparent = array("band time y x", 2, 2, 5, 6)[0, 0] - 273.15
     np.testing.assert_allclose(np.asarray(image), apparent, rtol=0, atol=1e-9)
-
-
-def test_film() -> None:
-    """A frame a time, of even size, that says what the data are and changes only where it may."""
-    movie = array("time y x", 2, 5, 6)
-    apparent = array("band time y x", 2, 2, 5, 6, origin="simulated")
-    frames = list(figures.separated_film(apparent, movie, movie - 300, title="scene"))
-    assert len(frames) == 2
-    assert all(frame.dtype == np.uint8 and frame.shape == frames[0].shape for frame in frames)
-    assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
-    changed = np.any(frames[0] != frames[1], axis=-1)
-    assert 0.05 < changed.mean() < 0.6  # the images and the time, not the frame around them
 
 
 def test_bad_pixels_are_marked() -> None:
@@ -240,13 +193,5 @@ def test_temperatures_in_another_unit_are_refused() -> None:
     """Data in degrees Celsius are not drawn as if they were kelvins."""
     movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
     inputs = array("band time y x", 2, 2, 5, 6)
-    for call in (
-        lambda: figures.separated_temperatures(inputs, movie, movie, title="scene"),
-        lambda: next(figures.separated_film(inputs, movie, movie, title="scene")),
-    ):
-        with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-            call()
-    scene = separated()
-    celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
-    with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
-        figures.truth_and_estimate(scene, celsius, (1, 2))
+    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
+        figures.separated_temperatures(inputs, movie, movie, title="scene")

@@ -11,6 +11,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import limits, separation, simulation
 from dbthermal.simulation import Background, Rig
+from reproduction import disturbances
 
 Array = npt.NDArray[np.float64]
 Case = Mapping[str, Any]
@@ -154,7 +155,7 @@ def simulate(
     if not later:
         return scene, simulation.observe(scene, response, rng), response
     frames, starts = time.size, [0, *[later] * (len(rig.bands) - 1)]
-    seen = simulation.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
+    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
     first = scene.isel(time=slice(0, (frames - 1) * STEPS + 1, STEPS))
     return first, seen.drop_vars("exposure_time"), response
 

@@ -10,6 +10,7 @@ from reproduction.figures.comparison import (
     reductions,
     sensitivity,
 )
+from reproduction.figures.emissivity import emissivity_bars, emissivity_by_contact
 from reproduction.figures.filters import condition_matrix
 from reproduction.figures.limits import (
     error_over_bands,
@@ -18,6 +19,7 @@ from reproduction.figures.limits import (
     pooling,
 )
 from reproduction.figures.nuisances import disturbances, offsets, parallax
+from reproduction.figures.scenes import separated_film, truth_and_estimate
 from reproduction.figures.twins import error_maps, thermocouples
 
 __all__ = [
@@ -26,6 +28,8 @@ __all__ = [
     "condition_matrix",
     "descents",
     "disturbances",
+    "emissivity_bars",
+    "emissivity_by_contact",
     "emissivity_errors",
     "emissivity_procedures",
     "error_bar_calibration",
@@ -39,6 +43,8 @@ __all__ = [
     "pooling",
     "reductions",
     "sensitivity",
+    "separated_film",
     "thermocouples",
+    "truth_and_estimate",
     "validity",
 ]

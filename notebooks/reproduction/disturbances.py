@@ -1,4 +1,4 @@
-"""Nuisances of real cameras, added one by one to a perfect capture, each with its truth."""
+"""Disturbances of real cameras, added one by one to a perfect capture, each with its truth."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -10,7 +10,7 @@ import xarray as xr
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array
 from dbthermal.correction import lag_coefficients
-from dbthermal.simulation._rig import observe
+from dbthermal.simulation import observe
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""
