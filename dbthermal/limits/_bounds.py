@@ -6,73 +6,17 @@ The image formation is that of Narayanan et al. (2026), doi:10.48550/arXiv.2509.
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal._numbers import POSITIVE, real_number, real_numbers, whole_number
+from dbthermal._numbers import real_number, whole_number
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)  # standard deviation of a uniform number over its range
 _LEAST_STD: Final = 1e-9  # of an emissivity that is not known exactly [1]
-
-
-def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
-    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
-
-    Parameters
-    ----------
-    emissivity : array_like, shape (2, ...)
-        Emissivities [1].
-
-    Examples
-    --------
-    >>> reflection_ratio([0.86, 0.72]).round(3).item()  # plate glass in 8-14 um and 9.5 um
-    2.0
-    """
-    first, second = np.asarray(emissivity, dtype=np.float64)
-    return np.asarray((1.0 - second) / (1.0 - first))
-
-
-def ratio_variance_bound(
-    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
-) -> Array:
-    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
-
-    .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
-              {\sum_t [(1 - e_1) P y(t)]^2}
-
-    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
-
-    Parameters
-    ----------
-    emissivity, noise : tuple of float
-        Emissivities [1] of the two bands, and standard deviations of their noise [K]; TypeError or
-        ValueError for other than two numbers, in [0, 1] and positive.
-    background : ndarray, shape (time, ...)
-        Background temperature [K].
-    functions : ndarray, shape (time, order)
-        Orthonormal functions that span the smooth subspace.
-
-    Examples
-    --------
-    Plate glass before a background that changes by 3 K every five seconds:
-
-    >>> background = 295.0 + 3.0 * (np.arange(200) // 50 % 2)  # K, 10 frames/s
-    >>> functions, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 200), 5))
-    >>> variance = ratio_variance_bound((0.86, 0.72), (0.03, 0.35), background, functions)
-    >>> np.sqrt(variance).round(2).item()
-    0.15
-    """
-    ratio = float(reflection_ratio(real_numbers("emissivity", emissivity, (0.0, 1.0), (2,))))
-    real_numbers("noise [K]", noise, POSITIVE, (2,))
-    background, functions = real_numbers("background", background), real_numbers("basis", functions)
-    rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
-    energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
-    return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)
 
 
 def bounds(
@@ -129,8 +73,8 @@ def bounds(
 
     Notes
     -----
-    For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
-    of `ratio_variance_bound`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
+    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
     alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
     curvature of the exact response determines them without, but hardly, and the bound of the ratio
     is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
