@@ -28,7 +28,6 @@ __all__ = [
     "curve",
     "curves",
     "noise",
-    "require_range",
 ]
 __dir__ = __all__.copy
 
@@ -161,17 +160,7 @@ class LinearCurve(Curve):
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
-    """Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
-
-    Parameters
-    ----------
-    temperature : array_like
-        Temperatures [K], of any shape.
-    curve : Curve
-        Curve of a band.
-    name : str
-        Name of the temperatures, for the ValueError with the first that lies outside or is NaN.
-    """
+    """Temperatures [K] as float64; ValueError for one outside the calibrated range, or NaN."""
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
     if np.any(bad):

@@ -34,17 +34,9 @@ __all__ = [
     "Flags",
     "Status",
     "Variable",
-    "band_positions",
-    "band_values",
     "check",
-    "check_corrected",
-    "check_numbers",
-    "check_variable",
     "has_flag",
-    "measured",
-    "origin",
     "status_attrs",
-    "variables",
 ]
 __dir__ = __all__.copy
 
@@ -227,13 +219,7 @@ MEASURED: Final = "measured"
 
 
 def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
-    """Attribute `origin` of what is made of several inputs: simulated where one of them is.
-
-    Parameters
-    ----------
-    attrs : mapping
-        Attributes of each input. The result is empty if none of them states its origin.
-    """
+    """Attribute `origin` of a result of several inputs, simulated if one is; empty if unknown."""
     stated = [str(mapping["origin"]) for mapping in attrs if "origin" in mapping]
     artificial = [text for text in stated if text != MEASURED]
     return {"origin": (artificial or stated)[0]} if stated else {}
@@ -347,14 +333,8 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
 
 
 def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
-    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite.
-
-    Parameters
-    ----------
-    values : array or DataArray
-        Samples, of any shape and unit.
-    """
-    if values.dtype == np.float16:  # `LARGEST` is none, and all of its numbers are smaller
+    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite."""
+    if values.dtype == np.float16:  # all of its numbers are smaller than `LARGEST`
         return np.isfinite(values)
     return np.abs(values) < LARGEST
 
@@ -414,15 +394,7 @@ def check(
 
 
 def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
-    """Check a dataset as `check` does for the stage `corrected`, and refuse raw counts.
-
-    Whole numbers are a TypeError: those are raw, and corrected counts need NaN besides.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Capture, returned unchanged.
-    """
+    """Check a dataset of the stage `corrected`; whole numbers are raw counts and a TypeError."""
     counts = check(dataset, "corrected")["counts"]
     if counts.dtype.kind != "f":
         raise TypeError(
@@ -434,17 +406,7 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
-    """Check one array against its definition, with the errors of `check`.
-
-    Parameters
-    ----------
-    array : DataArray
-        Array to be checked.
-    variable : Variable
-        Its definition.
-    label : str
-        Its name in the error.
-    """
+    """Check one array against its definition, with the errors of `check`."""
     _require(array, xr.DataArray, label)
     if array.dims != variable.dims:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
@@ -465,18 +427,9 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
-    """Check that an array holds real numbers, of a unit if it states one, and return it as it is.
+    """Check that an array holds real numbers, of a unit if it states one, and return it.
 
     TypeError for another type or dtype, ValueError for another unit.
-
-    Parameters
-    ----------
-    array : DataArray
-        Array to be checked.
-    label : str
-        Its name in the error.
-    units : str, optional
-        Unit that it has if it states one; any by default.
     """
     _require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui":
@@ -491,15 +444,6 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
 
     TypeError if it is none of xarray; ValueError if there is no coordinate `band`, or a band is
     missing or repeated.
-
-    Parameters
-    ----------
-    array : DataArray or Dataset
-        Array with a coordinate `band`.
-    wanted : list of str
-        Names of the bands.
-    label : str
-        Name of the array in the error.
     """
     _require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
@@ -516,18 +460,9 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
 def band_values(
     array: xr.DataArray, wanted: list[str], label: str, units: str
 ) -> npt.NDArray[np.float64]:
-    """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
+    """Values (band,) of an array over the bands alone, in the order of the wanted bands.
 
     Errors as `check_numbers` and `band_positions`; ValueError for other dims, too.
-
-    Parameters
-    ----------
-    array : DataArray
-        Values (band).
-    wanted : list of str
-        Names of the bands, in the order of the result.
-    label, units : str
-        Name of the array in the error, and the unit that it has if it states one.
     """
     if check_numbers(array, label, units).dims != ("band",):
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
@@ -535,15 +470,7 @@ def band_values(
 
 
 def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Variables of a Dataset of a stage, with the dims and attributes of their definitions.
-
-    Parameters
-    ----------
-    stage : str
-        One of `STAGES`.
-    values : mapping
-        Values by name.
-    """
+    """Variables of a Dataset of a stage, with the dims and attributes of their definitions."""
     documented = {**STAGES[stage], **OPTIONAL.get(stage, {})}
     return {
         name: (documented[name].dims, value, documented[name].attrs)
