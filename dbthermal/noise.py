@@ -15,7 +15,7 @@ from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
 
-__all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
+__all__ = ["MINIMUM_FRAMES", "estimate"]
 __dir__ = __all__.copy
 
 MINIMUM_FRAMES: Final = 16
@@ -39,14 +39,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
     Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
-    of the squared weights.
-
-    Parameters
-    ----------
-    signal : Array
-        Signals (time, pixel); ValueError if a sample is infinite.
-    time : array_like
-        Times (time,) [s], which need not be even.
+    of the squared weights. ValueError for an infinite sample, or times [s] that do not rise.
     """
     signal = _numbers.real_numbers("signal", signal)
     if np.any(np.isinf(signal)):
@@ -144,16 +137,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
 
 def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
-    """Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
+    """Noise (band) from signals (time, pixel) of two bands or more in one unit, see `estimate`.
 
-    The noise of the quietest band is the median of the estimates beside each other band.
-
-    Parameters
-    ----------
-    signals : sequence of Array
-        Signals (time, pixel) of each band; of more than two bands all are in one unit.
-    time : array_like
-        Times (time,) [s].
+    Each band is paired with the quietest, whose noise is the median over the pairs.
     """
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))

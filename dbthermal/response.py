@@ -26,7 +26,6 @@ __all__ = [
     "apparent_temperature",
     "counts",
     "curve",
-    "curves",
     "noise",
 ]
 __dir__ = __all__.copy
@@ -193,15 +192,7 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
 
 def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> list[Curve]:
-    """Curves of some bands, as `curve` makes that of one; the response is checked once.
-
-    Parameters
-    ----------
-    response, kind : Dataset, str
-        As for `curve`.
-    bands : sequence of str
-        Names of the bands, in the order of the result.
-    """
+    """Curves of bands by name, see `curve`; the response is checked once."""
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
     schema.check(response, "response")

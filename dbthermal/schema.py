@@ -31,12 +31,10 @@ __all__ = [
     "SHUTTER_CLOSED",
     "STAGES",
     "UNMEASURED",
-    "Flags",
     "Status",
     "Variable",
     "check",
     "has_flag",
-    "status_attrs",
 ]
 __dir__ = __all__.copy
 
@@ -226,13 +224,7 @@ def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
 
 
 class Flags(IntFlag):
-    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`.
-
-    Attributes
-    ----------
-    meaning : str
-        The sentence.
-    """
+    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`."""
 
     meaning: str
 

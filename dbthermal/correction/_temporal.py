@@ -74,13 +74,6 @@ def lag_coefficients(
     r"""Weights (band, time - 1) [1] of the frame before and of the new signal in a pixel that lags.
 
     They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a`, both to full precision.
-
-    Parameters
-    ----------
-    time_constant : float or DataArray
-        Time constant :math:`\tau` [s], positive and at most 1 s, of all bands or (band).
-    counts : DataArray
-        Counts (band, time, ...), whose times are taken.
     """
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]

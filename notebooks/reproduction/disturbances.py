@@ -9,7 +9,7 @@ import xarray as xr
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array
-from dbthermal.correction import lag_coefficients
+from dbthermal.correction._temporal import lag_coefficients
 from dbthermal.simulation import observe
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
