@@ -156,10 +156,7 @@ def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
 
 
 def _clocked(
-    small: xr.Dataset,
-    scale: Scale,
-    synchronous: xr.DataArray,
-    resample: Callable[..., xr.Dataset],
+    small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
 ) -> tuple[xr.DataArray, xr.Dataset | None, float]:
     """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s]."""
     names, trials = small["band"].values, list[_Trial]()

@@ -11,14 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-__all__ = [
-    "COLORS",
-    "band_label",
-    "canvas",
-    "draw_image",
-    "limits_of",
-    "provenance_note",
-]
+__all__ = ["COLORS", "band_label", "canvas", "draw_image", "limits_of", "provenance_note"]
 __dir__ = __all__.copy
 
 COLORS: Final = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7")

@@ -8,11 +8,5 @@ from dbthermal._smooth import polynomial_basis
 from dbthermal.limits._bounds import bounds
 from dbthermal.limits._planner import CaptureDesign, plan, plan_durations
 
-__all__ = [
-    "CaptureDesign",
-    "bounds",
-    "plan",
-    "plan_durations",
-    "polynomial_basis",
-]
+__all__ = ["CaptureDesign", "bounds", "plan", "plan_durations", "polynomial_basis"]
 __dir__ = __all__.copy

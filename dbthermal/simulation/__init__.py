@@ -4,14 +4,7 @@ Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records
 carry `origin = "simulated"`.
 """
 
-from dbthermal.simulation._rig import (
-    Rig,
-    blackbody_movies,
-    capture,
-    digitise,
-    observe,
-    pattern,
-)
+from dbthermal.simulation._rig import Rig, blackbody_movies, capture, digitise, observe, pattern
 from dbthermal.simulation._scenes import (
     Background,
     heating,
