@@ -103,16 +103,13 @@ class Interpolation:
 def exposure_times(corrected: xr.Dataset) -> Array:
     """Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
 
+    TypeError or ValueError if the dataset is no capture, or the times have other dims or another
+    unit, are fewer than two of a band, or do not increase.
+
     Parameters
     ----------
     corrected : Dataset
         Capture with `exposure_time`; without it `time` is taken, in every band.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is none, or they have other dims or another unit, are fewer than two of a
-        band, or do not increase.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if "exposure_time" not in corrected:
@@ -131,12 +128,8 @@ def fill_times(stamps: Array) -> Array:
     ----------
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
-        frame period each.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If they are no numbers, fewer than two frames have a time, or the times do not increase.
+        frame period each. TypeError or ValueError if they are no numbers, fewer than two, or do not
+        increase.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
     _check_stamps(stamps[~np.isnan(stamps)], "the camera")

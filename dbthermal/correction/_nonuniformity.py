@@ -48,12 +48,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
-        [count], the standard deviation of one sample.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, or they hold NaN or do not vary.
+        [count], the standard deviation of one sample. TypeError or ValueError if the movies hold
+        NaN or do not vary.
 
     Examples
     --------

@@ -100,11 +100,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
         Noise-equivalent temperature difference in the first band [K].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the difference is not a positive number, or a band is unknown or named twice.
+        TypeError or ValueError for other bands, or an `netd` that is not positive.
 
     Examples
     --------

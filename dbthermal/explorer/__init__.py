@@ -68,12 +68,7 @@ def explore(
     Returns
     -------
     Explorer
-        Shown by the notebook as the last value of a cell.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `View`.
+        Shown by the notebook as the last value of a cell. TypeError or ValueError as `View`.
 
     Examples
     --------

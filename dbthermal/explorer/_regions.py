@@ -30,11 +30,7 @@ class Region:
     points : tuple of (float, float)
         (row, column) of two opposite corners, of an ellipse those of the rectangle around it, or of
         the corners of a polygon in order [pixel]. Pixel (i, j) covers i to i + 1 and j to j + 1.
-
-    Raises
-    ------
-    ValueError
-        If the kind is another one, or the points are too few or not finite.
+        ValueError if they are too few, or not finite.
 
     Examples
     --------

@@ -182,19 +182,9 @@ class View:
         return self.panes[name]
 
     def frame(self, name: str, index: int) -> Values:
-        """Values (y, x) of a pane at a frame, in its units.
+        """Values (y, x) of a pane at a frame, from 0, in its units; of a map at any frame.
 
-        Parameters
-        ----------
-        name : str
-            One of `panes`.
-        index : int
-            Number of the frame, from 0; of no meaning for a map.
-
-        Raises
-        ------
-        ValueError
-            If there is no such pane or frame.
+        ValueError if there is no such pane or frame.
         """
         if not 0 <= index < self.time.size:
             raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
@@ -209,13 +199,10 @@ class View:
         return source["status"].values.astype(np.uint32)
 
     def counted(self, pixels: Pixels = "unflagged") -> Mask:
-        """Mask (y, x) of the pixels that count.
+        """Mask (y, x) of the pixels that count: "unflagged", "measured" or "all".
 
-        Parameters
-        ----------
-        pixels : {"unflagged", "measured", "all"}
-            Those without a flag and those that were completed; those without a flag; every one.
-            Of measured pixels samples that were bridged in time do not count, either.
+        Unflagged are measured and completed ones. Of measured pixels samples that were bridged in
+        time do not count, either.
         """
         if pixels not in get_args(Pixels):
             raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
@@ -244,19 +231,18 @@ class View:
     def curve(self, name: str, region: Region, *, pixels: Pixels = "unflagged") -> xr.Dataset:
         r"""Mean, least and greatest value of a region over time, with the deviation of the mean.
 
-        An error that all pixels share is not lessened by their number (`std`): of object and
-        reflected temperature what the emissivities' deviations give through the image formation,
-        less the part by which neighbours differ; of emissivities, completed pixels and pixels of
-        cameras that stand apart, all of it. What remains each pixel errs alone,
+        A common error is not reduced by the number of pixels (`std`): of object and reflected
+        temperature the error by the emissivities, less the part by which neighbours differ; of
+        emissivities, completed pixels and displaced cameras all of it. The rest is independent,
 
         .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
         Parameters
         ----------
         name : str
-            One of `panes`, but "status".
+            One of `panes`, but "status"; ValueError for another one.
         region : Region
-            Where.
+            Region of the image; ValueError without a pixel.
         pixels : {"unflagged", "measured", "all"}
             Which pixels count; see `counted`.
 
@@ -267,19 +253,11 @@ class View:
             counts, over (time); without it for a map. NaN where no pixel counts. `std` is NaN where
             the result states no deviation.
 
-        Raises
-        ------
-        ValueError
-            If there is no such pane, or no pixel in the region.
-
         Notes
         -----
-        In no deviation are the calibration of the cameras, and what interpolation between pixels
-        makes neighbours share.
-
-        The reflected temperature's is mostly the prior of its own drift
-        (`SubspaceSettings.background_drift`), which all pixels share: where nothing drifts, the
-        mean is much closer.
+        The deviations exclude the calibration of the cameras, and the correlation of neighbours by
+        interpolation. That of the reflected temperature is mostly the prior of its drift
+        (`SubspaceSettings.background_drift`): without a drift the mean is much closer.
         """
         pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
@@ -308,7 +286,7 @@ class View:
         return result.assign_coords(time=("time", self.time, schema.COORDINATES["time"].attrs))
 
     def _common(self, pane: Pane, box: tuple[slice, ...], where: Mask) -> Array | None:
-        """Deviation (pixel) by the emissivities for a contrast of 1 K; NaN: all is shared."""
+        """Deviation (pixel) by the emissivities for a contrast of 1 K; None if all is common."""
         data, (rows, columns) = self.data, box
         displaced = data.attrs.get("reflection_shift", "none") != "none"
         displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())

@@ -52,12 +52,8 @@ def status(result: xr.Dataset) -> Figure:
     Parameters
     ----------
     result : Dataset
-        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
-
-    Raises
-    ------
-    ValueError
-        If a bit is not one of `schema.Status`.
+        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`; ValueError
+        for another bit.
 
     Examples
     --------

@@ -24,6 +24,9 @@ class CaptureDesign:
     The object's time constant is a third of the capture. The background rests, and is warmer at the
     end of each period.
 
+    TypeError or ValueError if one is not finite, or not positive (all but `span` and `amplitude`),
+    a pulse is longer than the period, or there are fewer than two frames or more than 100 000.
+
     Attributes
     ----------
     seconds : float
@@ -38,12 +41,6 @@ class CaptureDesign:
         Height of a pulse [K].
     period, duration : float
         From pulse to pulse, and of one pulse [s].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If one is not finite, or not positive (all but `span` and `amplitude`), a pulse is
-        longer than the period, or there are fewer than two frames or more than 100 000.
     """
 
     seconds: float = 35.0
