@@ -68,18 +68,15 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     background walks without rest, the quieter band's is too high: for glass by up to 13 %, at
     emissivities 0.3/0.5 by up to 1.7 times, at a correlation time of 0.3 s.
 
+    ValueError if there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond
+    1e9, or a noise comes out as zero.
+
     Parameters
     ----------
     first, second : ndarray, shape (time, pixel)
         Signals of the two bands, each in a unit of its own.
     time : array_like, shape (time,)
         Times [s].
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
-        a noise comes out as zero.
 
     Examples
     --------

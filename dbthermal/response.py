@@ -173,6 +173,9 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
     Its methods take temperatures [K] to counts [count] and back, see `Curve`.
 
+    ValueError if the band is missing, the kind unknown, a coefficient not finite, the slope not
+    positive, or the calibrated range does not increase or lies more than 100 K off the reference.
+
     Parameters
     ----------
     response : Dataset
@@ -181,12 +184,6 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
         Name of the band.
     kind : {"exact", "linear"}
         Sakuma-Hattori, or the linear pair.
-
-    Raises
-    ------
-    ValueError
-        If the band is missing, the kind unknown, a coefficient not finite, the slope not positive,
-        or the calibrated range does not increase or lies more than 100 K off the reference.
     """
     return curves(response, [band], kind)[0]
 

@@ -111,6 +111,10 @@ def fit_correction(
     with c the mean level and v the variance of a mean about the fit: over n - 2 degrees of freedom
     of n temperatures, or, of two temperatures, that of the noise over the number of frames.
 
+    TypeError or ValueError if there are fewer than two temperatures, threshold or `maximum` are out
+    of range, no more than half of the pixels of a band are usable, or the mean does not rise with
+    temperature.
+
     Parameters
     ----------
     blackbody : Dataset
@@ -131,12 +135,6 @@ def fit_correction(
         `calibration.fit_response`; `offset_std` [count], `gain_std` [1] and `centre` [count]
         (band), the deviations above and c, but not of two temperatures without noise. Bad pixels
         have gain 1 and offset 0: their counts pass unchanged.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two temperatures, threshold or `maximum` are out of range, no more
-        than half of the pixels of a band are usable, or the mean does not rise with temperature.
 
     Examples
     --------
@@ -191,6 +189,9 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's. The attribute ``offset_renewed`` is 1.
 
+    TypeError or ValueError if bands or pixels are not the same, or a good pixel is not finite or
+    its gain not positive.
+
     Parameters
     ----------
     correction : Dataset
@@ -198,11 +199,6 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     flat : DataArray
         Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
         camera's shutter, of the bands of the correction.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If bands or pixels are not the same, or a good pixel is not finite or its gain not positive.
     """
     _require_rising(_checked(correction))
     schema.check_numbers(flat, "the flat image", "count")
@@ -233,6 +229,9 @@ def correct(
 ) -> xr.Dataset:
     """Apply gain and offset to a capture, and mark its bad and saturated pixels.
 
+    TypeError or ValueError if the capture is not uint16 or was corrected before, `maximum` is out
+    of range, or the correction lacks a band, is not finite, or is of other pixels.
+
     Parameters
     ----------
     capture : Dataset
@@ -251,12 +250,6 @@ def correct(
         has its deviations, root mean square over the levels of the capture. Attributes:
         ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
         (``gain_offset_...``), and the numbers of marked pixels.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not uint16 or was corrected before, `maximum` is out of range, or the
-        correction lacks a band, is not finite, or is of other pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):

@@ -56,6 +56,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     offsets (by the mask of [1]_); 0 where it is less than 0.7 of the same over two pixels, as of
     detail behind a lens. More than 5 m in every segment give a UserWarning.
 
+    TypeError or ValueError if the threshold is not positive, or a band has fewer frames that are
+    not NaN than 16, or than 0.4 s and three frames more, or no pixel with 16 samples.
+
     Parameters
     ----------
     corrected : Dataset
@@ -71,12 +74,6 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         and the attributes ``noisy_pixels`` and ``jumping_pixels``, their numbers,
         ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a band, which get
         no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
-        than 0.4 s and three frames more, or no pixel with 16 samples.
 
     References
     ----------

@@ -33,6 +33,9 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     then the whole image in blocks of rows. The search is exact only before anything is interpolated
     in time.
 
+    TypeError or ValueError if `closed` is no boolean of the frames, or in a band fewer than 16 of
+    the pixels compared ever change.
+
     Parameters
     ----------
     corrected : Dataset
@@ -48,12 +51,6 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
         One row for each run, (event): `band`; `first_frame` and `frames`, position of the first
         copy and their number; `start` and `stop`, times of the first and last copy [s]; `renewed`,
         true after a closed shutter, whose offsets are new, false for a lost frame.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `closed` is no boolean of the frames, or in a band fewer than 16 of the pixels compared
-        ever change.
 
     Examples
     --------
@@ -94,6 +91,9 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     An event costs accuracy: beside five functions over 35 s, one step in the middle raises the
     standard deviation of the smooth part by 1.9, two, at 11 and 24 s, by 2.7.
 
+    TypeError or ValueError if the counts are whole numbers, which have no NaN, the dataset was
+    marked before, or an event lacks a variable, is of no band or of frames outside the dataset.
+
     Parameters
     ----------
     corrected : Dataset
@@ -108,12 +108,6 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
         The dataset with NaN in place of these samples, and `segment` (time), int32 [1]: number of
         renewals of the offsets before the frame. Attributes: ``shutter_events``,
         ``repeated_frames`` (runs that renew nothing) and ``frames_taken_out`` (by band).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
-        event lacks a variable, is of no band or of frames outside the dataset.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:

@@ -25,6 +25,9 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
     does not.
 
+    TypeError or ValueError if there are fewer than two frames, the lag was undone before, the
+    counts are whole numbers, or a time constant is not positive, or above 1 s.
+
     Parameters
     ----------
     corrected : Dataset
@@ -38,12 +41,6 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
         ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
         latter.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not positive, or above 1 s.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -95,6 +92,10 @@ def undo_drift(
     / \sqrt{n N}` in N frames with K functions, at the ends: 0.11 counts for 100 pixels of 4 counts
     and 350 frames. A motion in front of the patch, or reflected in it, is taken for drift.
 
+    TypeError or ValueError if the drift was undone before, the reference marks no good pixel,
+    `order` is no whole number from 2 to that of the frames, or a part of the patch is NaN in a
+    frame.
+
     Parameters
     ----------
     corrected : Dataset
@@ -112,12 +113,6 @@ def undo_drift(
     Dataset
         The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
         and the attributes ``drift_order`` and ``drift_pixels``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the drift was undone before, the reference marks no good pixel, `order` is no whole
-        number from 2 to that of the frames, or a part of the patch is NaN in a frame.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:

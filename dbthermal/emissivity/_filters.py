@@ -128,6 +128,9 @@ def rank_filters(
     slip). The second is the standard deviation of the object temperature from one frame, which
     includes the noise of a narrow filter. Both are medians over the materials.
 
+    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`
+    and another, or the noise lacks a band, is in another unit, or is not finite and positive.
+
     Parameters
     ----------
     table : Dataset
@@ -143,12 +146,6 @@ def rank_filters(
         Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
         over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
         `lowest_condition_number` and `lowest_std` name the filter of each criterion.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as for `condition_numbers` or has no band `beside` and another, or the
-        noise lacks a band, is in another unit, or is not finite and positive.
 
     Examples
     --------

@@ -35,6 +35,10 @@ def bounds(
     polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
     frames at rest one number for all. Response and noise are known.
 
+    TypeError or ValueError if an input is not as described, there is one band only, an emissivity
+    lies outside (0, 1), a temperature outside the response's range, or no smooth subspace holds the
+    object.
+
     Parameters
     ----------
     scene : Dataset
@@ -64,12 +68,6 @@ def bounds(
         bands, is below that of a uniform number in (0, 1) or in the calibrated range, and for a
         ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
         (time, y, x).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, there is one band only, an emissivity lies outside (0, 1),
-        a temperature outside the response's range, or no smooth subspace holds the object.
 
     Notes
     -----

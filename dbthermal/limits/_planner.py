@@ -79,6 +79,10 @@ def plan(
     The Cramer-Rao bound of `bounds` for a designed capture, with Planck's law over each band. The
     emissivity errors of n pixels of one material fall as :math:`1 / \sqrt{n}`.
 
+    KeyError, TypeError or ValueError if table or noise are not as `schema` has them, a band is
+    unknown, an emissivity lies outside (0, 1), or the band `beside` or as many others as used
+    together are missing.
+
     Parameters
     ----------
     table : Dataset
@@ -103,12 +107,6 @@ def plan(
         `beside` [1]; NaN for a band outside the combination. `best` (material): the filter of the
         smallest object deviation, "none" if all are above that of a uniform number within the
         capture's temperatures. `noise` (band) [K], and the design's numbers as attributes.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If table or noise are not as `schema` has them, a band is unknown, an emissivity
-        lies outside (0, 1), or the band `beside` or as many others as used together are missing.
 
     Examples
     --------
