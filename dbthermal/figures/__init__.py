@@ -18,7 +18,7 @@ from dbthermal.figures._scenes import (
     separated_frames,
     separated_temperatures,
 )
-from dbthermal.figures._status import REASONS, first_reason, status
+from dbthermal.figures._status import REASONS, status
 
 __all__ = [
     "REASONS",
@@ -27,7 +27,6 @@ __all__ = [
     "Panel",
     "drawing",
     "film",
-    "first_reason",
     "gain_offset_maps",
     "plan",
     "reflection_shift",

@@ -92,13 +92,7 @@ def status(result: xr.Dataset) -> Figure:
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
-    """Name of the most decisive flag of each pixel; empty without a flag.
-
-    Parameters
-    ----------
-    flags : DataArray
-        Status (y, x), see `schema.Status`.
-    """
+    """Name of the most decisive flag of each pixel of a `status`; empty without a flag."""
     bits = flags.values.astype(np.uint32)  # of older results they are of 16 bit
     unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
     if unknown:

@@ -9,7 +9,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import limits, separation, simulation
+from dbthermal import _smooth as smooth
+from dbthermal import separation, simulation
 from dbthermal.simulation import Background, Rig
 from reproduction import closed_form, disturbances
 
@@ -92,7 +93,7 @@ def efficiency(
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
-    functions = limits.polynomial_basis(truth["time"].values, order)
+    functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
     bound = np.sqrt(closed_form.ratio_variance_bound(pair, noise, background, functions))
     ratio = closed_form.reflection_ratio(result["emissivity"].values.reshape(2, -1))

@@ -9,7 +9,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures import REASONS, first_reason
+from dbthermal.figures import REASONS
+from dbthermal.figures._status import first_reason
 from dbthermal.figures.drawing import COLORS, band_label, canvas, percent, provenance_note
 
 _RIGHT: Final = "#a8d5b0"
