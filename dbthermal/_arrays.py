@@ -29,10 +29,7 @@ _MAPS: WeakSet[mmap.mmap] = WeakSet()
 
 
 def stride(shape: tuple[int, ...], number: int) -> int:
-    """Step along every axis of a shape that selects about so many values, evenly spaced.
-
-    Rounded down: at most 2^n times the number are selected along n axes.
-    """
+    """Step along every axis that selects about so many values of a shape, at most 2^n times."""
     step = (prod(shape) / number) ** (1.0 / len(shape))
     return max(1, int(round(step, 9)))  # a whole root is whole
 

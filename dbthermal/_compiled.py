@@ -36,10 +36,7 @@ _SIZE: Final = 32  # of a SHA-256 [byte]
 
 
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator that compiles a function at its first call, and keeps its machine code.
-
-    Without a folder that may be written each process compiles. `options` are those of `numba.njit`.
-    """
+    """Decorator that compiles a function at its first call, and keeps its machine code."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         result: Any = njit(**options)(function)

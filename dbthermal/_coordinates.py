@@ -26,10 +26,7 @@ def laid_on(
     of: str,
     dims: Sequence[str] = ("band", "time", "temperature", "material", "y", "x"),
 ) -> Laid:
-    """Array with the bands, order and coordinates of a reference, along the dims of both.
-
-    ValueError, with the names `label` and `of` of the two, for other bands, sizes or values.
-    """
+    """Array with the bands, order and coordinates of a reference; a ValueError names the two."""
     if not isinstance(array, xr.DataArray | xr.Dataset):
         message = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
         raise TypeError(f"{message}. Must be a DataArray or a Dataset.")

@@ -142,11 +142,7 @@ def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
 def resampled_noise(
     counts: npt.NDArray[Any], resampled: npt.NDArray[Any], stated: Array, width: int
 ) -> Array:
-    """Noise (pixel) [1] of resampled counts over the stated one, in an image of some width.
-
-    From the changes between frames of the counts (band, time, pixel) before and after; 1 where no
-    noise is stated.
-    """
+    """Noise (pixel) [1] of resampled counts over the stated one, 1 where none is stated."""
     usual = np.mean(_roughness(counts) ** 2, axis=1) ** 0.5
     roughness = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
     ratio = np.divide(roughness, stated, out=np.zeros_like(stated), where=stated > 0.0)
@@ -204,10 +200,7 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
-
-    Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
-    """
+    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
     sampled = slice(None, None, max(1, counts.shape[1] // PIXELS))
     sample = np.where(valid[:, sampled], counts[:, sampled].astype(np.float64), np.nan)
     changing = np.any(sample[1:] != sample[:-1], axis=1)  # true for NaN
@@ -230,11 +223,7 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
 
 
 def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None, None)) -> Mask:
-    """
-    Pixels (pixel) of counts (time, pixel) that are clipped: many samples have their end value.
-
-    The lowest and highest values (2, pixel) of all samples, valid or not, may be known.
-    """
+    """Clipped pixels of counts (time, pixel): many of their samples have the extreme value."""
     result = np.zeros(counts.shape[1], dtype=bool)
     if band.chance < 1.0:
         for highest in (False, True):
@@ -249,11 +238,7 @@ def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None
 def end_of(
     counts: npt.NDArray[Any], valid: Mask, *, highest: bool, plain: Any = None
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
-    """
-    Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there.
-
-    That of all samples, valid or not, may be known as `plain`.
-    """
+    """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
     if used is True and plain is not None:
         end = plain
@@ -335,10 +320,7 @@ def _needed(frames: int, chance: float) -> int:
 def neighbour_mean(
     values: npt.NDArray[np.floating], weight: npt.NDArray[np.floating], width: float
 ) -> Array:
-    """Weighted mean (..., y, x) of the pixels around each, by a Gaussian of a width [pixel].
-
-    Pixels of weight 0 do not count, whatever their value; NaN where no pixel counts.
-    """
+    """Weighted mean (..., y, x) around each pixel by a Gaussian [pixel]; NaN without a weight."""
     sums = [
         gaussian_filter(weighted, width, mode="constant", axes=(-2, -1))
         for weighted in (np.where(weight > 0, weight * values, 0.0), weight * 1.0)

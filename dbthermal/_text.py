@@ -59,10 +59,7 @@ def regular_file(path: str | Path, limit: int) -> Path:
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
-    """Text of a `regular_file`, with line ends as newlines and without a byte-order mark.
-
-    ValueError by file and line where it is not of the encoding, or holds a control character.
-    """
+    """Text of a `regular_file` with newlines, without byte-order mark; ValueError by line."""
     content = regular_file(path, limit).read_bytes()
     try:
         text = content.decode(encoding).removeprefix("\ufeff")
@@ -115,10 +112,7 @@ def number(text: str, place: str) -> float:
 
 
 def table_rows(text: str, source: str, *, comment: str | None = None) -> list[Row]:
-    """Rows of comma-separated values, each in one line; lines that begin with `comment` left out.
-
-    ValueError if the last line has no end, as where a file was cut, or quotes are not closed.
-    """
+    """Rows of comma-separated values without comments; ValueError if a row or the file was cut."""
     rows: list[Row] = []
     for i, line in enumerate(whole_lines(text, source), 1):
         if comment is None or not line.startswith(comment):

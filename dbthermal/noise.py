@@ -134,10 +134,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
 
 def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
-    """Noise (band) from signals (time, pixel) of two bands or more in one unit, see `estimate`.
-
-    Each band is paired with the quietest, whose noise is the median over the pairs.
-    """
+    """Noise (band) of two bands or more in one unit, each estimated beside the quietest."""
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))
     rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
@@ -151,11 +148,7 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Variances and covariance (pixel) over the frames in which the bands do not step.
-
-    The frames are cut by an ellipse of the shape of the covariance, which scales all of it by one
-    factor; the noise is a small difference between variances and covariance.
-    """
+    """Variances and covariance (pixel) over the frames without steps, within a common ellipse."""
     scales = [MAD * np.median(np.abs(difference), axis=0) for difference in (first, second)]
     first_scaled, second_scaled = (
         np.divide(difference, std, out=np.zeros_like(difference), where=std > 0)

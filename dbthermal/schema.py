@@ -419,10 +419,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
-    """Check that an array holds real numbers, of a unit if it states one, and return it.
-
-    TypeError for another type or dtype, ValueError for another unit.
-    """
+    """Check that an array holds real numbers, of a unit if it states one, and return it."""
     _require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui":
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
@@ -432,11 +429,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """Positions of bands on the dimension `band`, by name as text.
-
-    TypeError if it is none of xarray; ValueError if there is no coordinate `band`, or a band is
-    missing or repeated.
-    """
+    """Positions of bands by name; ValueError if one, or the coordinate, is missing or repeated."""
     _require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
@@ -452,10 +445,7 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
 def band_values(
     array: xr.DataArray, wanted: list[str], label: str, units: str
 ) -> npt.NDArray[np.float64]:
-    """Values (band,) of an array over the bands alone, in the order of the wanted bands.
-
-    Errors as `check_numbers` and `band_positions`; ValueError for other dims, too.
-    """
+    """Values (band,) of an array over the bands alone, in the order of the wanted bands."""
     if check_numbers(array, label, units).dims != ("band",):
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
     return array.values[band_positions(array, wanted, label)].astype(np.float64)

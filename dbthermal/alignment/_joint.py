@@ -254,10 +254,7 @@ def _side(counts: xr.DataArray) -> int:
 
 
 def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
-    """Capture of means over squares of pixels, if its image is large, each band on its own clock.
-
-    Each pixel's changes about its mean are averaged, so that a missing sample moves no mean.
-    """
+    """Capture of means over squares of pixels of a large image, each band on its own clock."""
     counts, side = corrected["counts"], _side(corrected["counts"])
     if side == 1:
         return corrected

@@ -208,11 +208,7 @@ def _transform(first: Array, second: Array, model: str, band: str) -> Array:
 
 
 def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band: str) -> Array:
-    """Transform that matches images best, with the prior of equal cameras that look one way.
-
-    By Gauss-Newton on splines; the enhanced correlation interpolates by lines, and is off by some
-    hundredths of a pixel.
-    """
+    """Match images by Gauss-Newton on splines, with the prior of equal cameras."""
     shape, count = pair[0].shape[1:], len(pair[0])
     splines = np.stack([spline_filter(image) for image in pair[1]], axis=-1)
     span = np.array([*shape[::-1], 1, *shape[::-1], 1, *shape[::-1]], dtype=float)[free]
@@ -266,10 +262,7 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
 
 
 def _motion(matrix: Array, places: Array, overlap: Mask) -> Array:
-    """Derivatives (3, 3, axis, pixel) of pixel places by the entries of a transform.
-
-    With H p = (a, b, c), row and column are b / c and a / c.
-    """
+    """Derivatives (3, 3, axis, pixel) of pixel places by the entries of a transform."""
     row, column = places[:, overlap]
     point = np.stack([*np.indices(places.shape[1:])[::-1, overlap], np.ones_like(row)])
     scale, none = matrix[2] @ point, np.zeros_like(row)

@@ -27,10 +27,7 @@ def on_one_clock(
     lazy: bool = False,
     steps: float = STEP,
 ) -> xr.Dataset:
-    """Registered views on one clock, see `align`; `steps` [standard deviation of noise].
-
-    Means over pixels have less noise, but their steps are as large.
-    """
+    """Registered views on one clock, see `align`; `steps` [standard deviation of noise]."""
     names = [str(name) for name in corrected["band"].values]
     counts, alike = corrected["counts"], corrected
     if reflection_shift is not None:

@@ -84,11 +84,7 @@ class Bias:
         return self.air_temperature + (reading - self.air_temperature) / self._felt
 
     def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
-        """Errors of the object's signal [count]: independent (n), and common (2, n).
-
-        Of n corrected temperatures [K] and the deviation of a reading [K]; common are the offset
-        and the contact error.
-        """
+        """Errors of the object's signal [count]: independent (n), and common ones (2, n)."""
         # dT = dR / (1 - m) + (T - T_a) dm / (1 - m), and dW = U'(T) dT.
         scale = curve.count_slope(temperature) / self._felt
         contact = _uniform_std(self.contact) * (temperature - self.air_temperature)

@@ -68,10 +68,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 def lag_coefficients(
     time_constant: float | xr.DataArray, counts: xr.DataArray
 ) -> tuple[Array, Array]:
-    r"""Weights (band, time - 1) [1] of the frame before and of the new signal in a pixel that lags.
-
-    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a`, both to full precision.
-    """
+    """Weights (band, time - 1): a = exp(-dt / tau) of the frame before, 1 - a of the signal."""
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
     return np.exp(-ratio), -np.expm1(-ratio)

@@ -52,11 +52,7 @@ class Pane:
         return self.array.values if self.array.ndim == 3 else self.array.values[None]
 
     def stage(self, progress: Progress | None = None) -> None:
-        """Copy a film that is not in memory into a temporary file, frame by frame.
-
-        A store keeps all times of a tile of pixels in one chunk, so that one frame costs as much as
-        all. Rows are read chunk by chunk.
-        """
+        """Copy a film that is not in memory into a temporary file, chunk by chunk."""
         array = self.array
         if "_source" in vars(self) or array.ndim < 3 or array.variable._in_memory:
             return

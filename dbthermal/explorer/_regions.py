@@ -130,11 +130,7 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
 
 
 def mean_std(std: Array, common: Array) -> Array:
-    """Standard deviation (time) of a mean over pixels, from theirs (time, pixel); see `View.curve`.
-
-    The common part c is at most all of a pixel's s, and all of it where it is NaN. A pixel whose
-    deviation is NaN does not count.
-    """
+    """Standard deviation (time) of a mean over pixels with a common part, see `View.curve`."""
     shared = np.where(np.isfinite(common), np.minimum(common, std), std)
     number = np.maximum(np.isfinite(std).sum(axis=-1), 1)
     independent = np.nansum(std**2 - shared**2, axis=-1) / number**2

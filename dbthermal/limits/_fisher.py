@@ -229,10 +229,7 @@ class FisherInverse:
     information: Array  # along them (pixel, direction) [1]
 
     def variance(self, gradient: Array) -> Array:
-        """Smallest variance (pixel, quantity) for gradients (pixel or 1, quantity, unknown).
-
-        Infinite where a quantity depends on a direction without information.
-        """
+        """Smallest variance (pixel, quantity) for gradients; infinite without information."""
         along = ((gradient * self.scale[:, np.newaxis]) @ self.directions) ** 2
         blind = self.information <= _ROUNDING
         dependent = along @ blind[..., np.newaxis] > _DEPENDENT * along.sum(axis=-1, keepdims=True)
