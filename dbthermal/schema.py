@@ -340,6 +340,10 @@ def check(
     taken as the agreed unit; a different one is an error. Of the values only those of the
     coordinates are read.
 
+    TypeError or ValueError if it is not a Dataset of real numbers, a variable, dimension or
+    coordinate is missing, misnamed or out of order, a unit is another one, a coordinate does not
+    increase strictly, or bands repeat.
+
     Parameters
     ----------
     dataset : Dataset
@@ -350,13 +354,6 @@ def check(
         Variables of the stage that are checked, where not all are needed.
     label : str
         What the error calls it, "the" and the stage by default.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is not a Dataset of real numbers, a variable, dimension or coordinate is missing,
-        misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
-        bands repeat.
 
     Examples
     --------

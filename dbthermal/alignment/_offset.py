@@ -73,6 +73,12 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
     the capture has the cameras' own stamps, it is the delay beyond them.
 
+    TypeError or ValueError if the band is missing, the search does not fit the capture's length,
+    there are fewer than 16 usable pixels, nothing moves in both bands, their covariance is greatest
+    at an end of the search, the bands share less than half of their frames, the offset is not known
+    within 0.1 frame, a clock was set while it ran, or times are not of exposure, as of frames in
+    bursts.
+
     Parameters
     ----------
     corrected : Dataset
@@ -85,14 +91,6 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         Name of the band; by default the second.
     search : int
         Largest lag to search, either way [frame].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the band is missing, the search does not fit the capture's length, there are fewer than
-        16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
-        search, the bands share less than half of their frames, the offset is not known within 0.1
-        frame, a clock was set while it ran, or times are not of exposure, as of frames in bursts.
 
     Notes
     -----

@@ -62,6 +62,10 @@ def fit_response(
 
     .. math:: \sum_T r^2 > \left( s^2 + \tfrac{1}{12} + (a \, s_T)^2 \right) \chi^2_{n-2}
 
+    TypeError or ValueError if an input is not as described, a value is NaN, or the counts follow no
+    Planck curve, as of a camera that saturates, changes its range, or gives counts linear in
+    temperature. The error names the temperature
+
     Parameters
     ----------
     counts : DataArray
@@ -88,13 +92,6 @@ def fit_response(
     UserWarning
         If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
         then their names or files may be exchanged.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as of
-        a camera that saturates, changes its range, or gives counts linear in temperature. The error
-        names the temperature
 
     References
     ----------

@@ -47,6 +47,10 @@ def band_table(
     over the band's top hat, linear between wavelengths at most 1 um apart. Where a spectrum has a
     gap, or ends, both integrals run over the covered part, whose share is `coverage`.
 
+    KeyError, TypeError or ValueError if there is no spectrum or no band, a band is unknown or
+    repeats, a spectrum is not as `schema` has it or holds NaN, the temperature is outside
+    `bands.TEMPERATURE_RANGE`, or a spectrum covers less of a band than `minimum_coverage`.
+
     Parameters
     ----------
     spectra : mapping of str to Dataset
@@ -63,13 +67,6 @@ def band_table(
     Dataset
         Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
         libraries' spectra outside (0, 1] are averaged as they are.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If there is no spectrum or no band, a band is unknown or repeats, a spectrum is not as
-        `schema` has it or holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a
-        spectrum covers less of a band than `minimum_coverage`.
 
     Examples
     --------

@@ -96,7 +96,9 @@ def separated_temperatures(
     ['emission, 0.0 s', 'reflection less its mean, 0.0 s']
     """
     labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", label)
-    _require_kelvin(apparent, emission, change)
+    names = {"the inputs": apparent, "the emission": emission, "the reflection": change}
+    for name, temperature in names.items():
+        schema.check_numbers(temperature, name, "K")
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
@@ -129,13 +131,6 @@ def reflection_shift(field: xr.Dataset) -> Figure:
         f"Reflection of {bands} in the picture of {reference}" + drawing.provenance_note(field)
     )
     return figure
-
-
-def _require_kelvin(*temperatures: xr.DataArray) -> None:
-    """Refuse inputs, emission or reflection in another unit than kelvin."""
-    labels = ("the inputs", "the emission", "the reflection")
-    for temperature, label in zip(temperatures, labels, strict=True):
-        schema.check_numbers(temperature, label, "K")
 
 
 @dataclass(frozen=True)
