@@ -30,6 +30,7 @@ def laid_on(
     if not isinstance(array, xr.DataArray | xr.Dataset):
         message = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
         raise TypeError(f"{message}. Must be a DataArray or a Dataset.")
+    # Bands by name, then every common dim.
     shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
     if "band" in shared and "band" in array.coords and "band" in reference.coords:
         names = [str(name) for name in reference["band"].values]

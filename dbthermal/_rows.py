@@ -34,6 +34,7 @@ class _Rows(BackendArray):
 
     def _read(self, key: tuple[Any, ...]) -> Values:
         """Values at a number, slice or array of indices along each dim."""
+        # Compute the blocks that hold wanted rows.
         places = [np.arange(size)[index] for size, index in zip(self.shape, key, strict=True)]
         *leading, rows, columns = (np.atleast_1d(place) for place in places)
         result = np.empty([*map(len, leading), rows.size, columns.size], dtype=self.dtype)

@@ -105,6 +105,7 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     rapid, change, surroundings = (
         statistic.reshape(bands, -1) for statistic in (rapid, change, surroundings)
     )
+    # Select the stillest tenth of the groups.
     valid = np.all(np.isfinite(rapid) & (surroundings > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))
     if number < _FEWEST_STILL:
@@ -112,11 +113,13 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     motion = surroundings / np.median(surroundings[:, valid], axis=1, keepdims=True)
     stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
     still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
+    # Noise from the smaller magnitudes, checked by larger ones and by slopes.
     ordered = np.sort(np.abs(still), axis=1)
     noise = ordered[:, :middle].mean(axis=1) / _MEANS[0]
     beyond = ordered[:, middle:last].mean(axis=1) / _MEANS[1]
     slower = np.sort(np.abs(change[:, stillest]), axis=1)[:, :middle].mean(axis=1) / _MEANS[0]
     inner = still[:, np.all(np.abs(still) < ordered[:, last : last + 1], axis=0)]
+    # Covariance between the bands below that of motion proves noise.
     shared = np.cov(inner) + 3.0 * np.outer(noise, noise) / np.sqrt(number)
     np.fill_diagonal(shared, np.inf)
     proved = np.any(shared < (noise**2 - stated**2)[:, np.newaxis] / _UNLIKE, axis=1)

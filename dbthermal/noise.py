@@ -105,6 +105,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         raise ValueError(
             f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
         )
+    # Remove the object: smooth functions, then second differences.
     functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
@@ -113,6 +114,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     auto_first, cross, auto_second = (
         moment / remaining for moment in _trimmed_covariance(*differences)
     )
+    # Ratio of the bands' rapid changes one frame apart, where noise does not enter.
     signal, partner = rapid
     lagged = (signal[1:] * partner[:-1] + signal[:-1] * partner[1:]).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -123,6 +125,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         shared_variance = np.array([cross / ratio, ratio * cross])
         shared = correlation > _SIGNIFICANCE * _CORRELATION_STD * np.sqrt(pixels / frames)
         shared_variance[:, ~np.isfinite(shared_variance).all(axis=0) | ~shared] = 0.0
+    # Median over the pixels.
     variances = np.array([auto_first, auto_second]) - shared_variance
     result = [float(np.median(variance)) for variance in variances]
     if not min(result) > 0:

@@ -174,12 +174,14 @@ def _aligned(
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
     scale = Scale.of_response(response, [str(name) for name in corrected["band"].values])
+    # Stated clocks: the shift alone is estimated.
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = joint.apart(corrected, scale, **options)
         if field is not None and share_displaced(aligned, scale) > 0.0:
             return aligned, field
         return aligned, None
+    # Clocks and shift from the images.
     comparison = joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
     if comparison.field is not None and not share_displaced(aligned, scale) > 0.0:

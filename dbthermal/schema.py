@@ -368,6 +368,7 @@ def check(
         raise ValueError(f"Unknown stage '{stage}'. Must be one of {sorted(STAGES)}.")
     label = label or f"the {stage}"
     _require(dataset, xr.Dataset, label)
+    # Name the missing variable, with the stage that the dataset fits.
     optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
     for name in names or (*STAGES[stage], *optional):
         if name not in dataset:

@@ -232,6 +232,7 @@ def interpolation(
             "the others are NaN or copies of the frame before."
         )
     times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
+    # Frames before and after each wanted time, and weight of the latter.
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)
     width = times[right] - times[right - 1]
     weight = (wanted - times[right - 1]) / width

@@ -124,6 +124,7 @@ def _compared(
         scale = Scale.of_changes(small) if scale is None else scale
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
+    # Compare clocks and shift in the reduced picture.
     offset, field, uncertainty = _clocked(small, scale, synchronous, resample)
     full_field = None if field is None else _enlarged(field, corrected)
     if field is None or full_field is None or not seen_apart(full_field):

@@ -151,6 +151,7 @@ def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
             f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
             "every frame that is not missing."
         )
+    # Smooth curves, bad pixels replaced by the median around them.
     images = np.stack([_smooth(row) for row in frames.swapaxes(0, 1)], axis=1)
     if not images.mean(axis=0).std() > 0:
         raise ValueError(

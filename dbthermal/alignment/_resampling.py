@@ -40,11 +40,13 @@ def on_one_clock(
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
         pair = [0, band]
         require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
+    # The clock of the noisiest band, relative to its signal.
     noise, relative = noise_levels(signals, stamps)
     if clock is not None and clock not in names:
         raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
     reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
+    # Plan the interpolation of each band, and how it reduces noise.
     plans, factors, missing = [], np.ones(len(names)), _missing(counts)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
@@ -66,6 +68,7 @@ def on_one_clock(
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
+    # Warn of bands of which no frame is left.
     rule = f"at offsets of {offsets.tolist()} s: are they in seconds, do the recordings overlap?"
     outside = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
     gone = [name for name, away in zip(names, outside, strict=True) if away]

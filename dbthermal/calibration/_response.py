@@ -125,6 +125,7 @@ def fit_response(
     if noise is not None:
         noises = schema.band_values(noise, names, "the noise", "count")
         planck.require_positive("noise [count]", noises)
+    # Fit curve and line of each band, and refuse counts that follow no Planck curve.
     curves, lines = [], []
     for name, row, std in zip(names, values, noises, strict=True):
         line = _line(temperature, row)
@@ -137,6 +138,7 @@ def fit_response(
         lines.append(line)
     attrs = {"units": "K", "long_name": "blackbody temperature"}
     result = _response(curves, lines).assign_coords(temperature=("temperature", temperature, attrs))
+    # Keep the measured counts with the residuals of both fits.
     result["counts"] = (("band", "temperature"), values, {"units": "count"})
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
         fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
@@ -146,6 +148,7 @@ def fit_response(
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
     if noise is None:
         return result
+    # Noise in kelvin at the reference temperature.
     netd = noises / np.array([curve.reference_slope for curve in curves])
     result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
     return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
@@ -227,6 +230,7 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     lowest, highest = max(low for low, _ in ranges), min(high for _, high in ranges)
     if not lowest < highest:
         raise ValueError(f"Invalid ranges {ranges} K of the bands {[*files]}. Must overlap.")
+    # Fit the form to the maker's curve over the shared range.
     temperature = np.linspace(lowest, highest, _POINTS)
     error, curves, lines = 0.0, [], []
     for band, attrs in files.items():

@@ -128,6 +128,7 @@ def correct_capture(
     if not isinstance(shutter, bool | np.bool_):
         raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
     closed = _closed(capture)
+    # Steps 1 and 2: shutter events, new offsets.
     events = find_shutter(capture, closed=closed) if shutter else None
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))

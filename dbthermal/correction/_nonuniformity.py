@@ -213,6 +213,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     corrected = (
         correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
     )
+    # Offsets that bring every good pixel to the mean.
     level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
     offset = np.where(good, correction["offset"].values - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
@@ -257,6 +258,7 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
+    # Apply gain and offset, one band at a time: no second movie in memory.
     maps = _maps(correction, counts)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -267,6 +269,7 @@ def correct(
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
         saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
+    # Flags, pattern and attributes.
     bad = maps["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(

@@ -118,6 +118,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     marked = np.zeros((counts.sizes["band"], frames), dtype=bool)
     for band, start, stop in zip(bands, first, after, strict=True):
         marked[band, start:stop] = True
+    # Segments begin with the first frame after each renewal.
     renewed = events["renewed"].values.astype(bool)
     within = renewed & (first > 0) & (after < frames)
     changes = _changes(first[within], after[within])

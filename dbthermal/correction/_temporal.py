@@ -125,6 +125,7 @@ def undo_drift(
             f"Invalid reference: a part of it is NaN in frame {frame} of band "
             f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
         )
+    # Smooth curve of the patch, segment by segment.
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
     curves = np.stack([_smooth_change(band, segment, order) for band in level])
 

@@ -158,6 +158,7 @@ def rank_filters(
     [1.26, 2.34, 1.85, 2.25]
     """
     std = _single_frame_std(table, noise, beside).median("material", skipna=False)
+    # Both criteria over the materials, sorted by the first.
     pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)
     pairs = pairs.rename(second="band").sel(band=std["band"])
     result = xr.Dataset(

@@ -87,6 +87,7 @@ def band_table(
         raise ValueError("Empty spectra. Must hold at least one material.")
     if not 0 < _numbers.real_number("minimum_coverage", minimum_coverage) <= 1:
         raise ValueError(f"Invalid minimum_coverage {minimum_coverage}. Must lie in (0, 1].")
+    # Average each spectrum over each band.
     whole = [float(band.radiance(temperature)) for band in chosen]
     rows = np.empty((2, len(spectra), len(chosen)))
     for row, (material, spectrum) in enumerate(spectra.items()):

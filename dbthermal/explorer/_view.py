@@ -264,6 +264,7 @@ class View:
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
         if not mask.any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
+        # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         where = (mask & self.counted(pixels))[box]
         gain = self._common(pane, box, where)
@@ -273,6 +274,7 @@ class View:
         measured = pixels == "measured"
         chunks = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
+        # Dataset over time, of a map without it.
         units = {"units": pane.units}
         result = xr.Dataset(
             {

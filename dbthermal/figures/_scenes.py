@@ -50,6 +50,7 @@ def separated_frames(
     aspect = inputs.sizes["y"] / inputs.sizes["x"]
     columns = len(bands) + 2
     figure, axes = canvas(frames, columns, (3.3 * columns, (2.6 * aspect + 0.45) * frames))
+    # One range of colour for all times.
     scales = [limits_of(inputs.sel(band=band)) for band in bands]
     warm, change = limits_of(emission), limits_of(reflection, symmetric=True)
     for index, row in enumerate(axes):

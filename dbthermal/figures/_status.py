@@ -63,6 +63,7 @@ def status(result: xr.Dataset) -> Figure:
     >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
     ['75.0 %  good', '25.0 %  dead pixel']
     """
+    # Colour of each pixel's first flag.
     first = first_reason(result["status"])
     shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
     shown = {name: share for name, share in shares.items() if share > 0}
@@ -76,6 +77,7 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
+    # Legend with shares.
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
         for name, share in shown.items()

@@ -106,6 +106,7 @@ def bounds(
     for name in TEMPERATURES:
         for curve in curves:
             require_range(getattr(truth, name), curve, name)
+    # Noise in kelvin, and the smooth subspace of each pixel.
     noise = responses.noise(response, names) / [curve.reference_slope for curve in curves]
     reference = int(np.argmin(noise))
     if order is None:
@@ -113,6 +114,7 @@ def bounds(
     else:
         order = whole_number("order", order, (1, truth.time.size))
         orders = np.full(truth.object_temperature.shape[1], order)
+    # Deviations from the Fisher information at the smooth truth.
     sensitivity = truth.smoothed(orders).sensitivity(curves, noise)
     stds = deviations(sensitivity, truth.time, orders, reference, emissivity_std=emissivity_std)
     maps = {

@@ -123,11 +123,13 @@ def plan(
     names = [str(name) for name in table["band"].values]
     if beside not in names:
         raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
+    # Combinations of filters beside the band that is always recorded.
     filters = [place for place, name in enumerate(names) if name != beside]
     together = _numbers.whole_number("together", together, (1, len(filters)))
     sets = [[names.index(beside), *chosen] for chosen in combinations(filters, together)]
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     bodies = [TopHat(bands.get(name), temperature) for name in names]
+    # Deviations of each combination for every material.
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     cases = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -136,6 +138,7 @@ def plan(
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
+    # Best filter of each material, if it says more than the range of temperatures.
     uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
     best = [
         labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER

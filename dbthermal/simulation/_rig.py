@@ -145,6 +145,7 @@ def observe(
     emitted = _blackbody(response, scene["object_temperature"])
     reflected = _blackbody(response, background)
     schema.band_positions(scene, names, "the scene")
+    # Mix emission and reflection in counts, and add noise.
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
         emissivity = scene["emissivity"].sel(band=name).values
@@ -179,6 +180,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
     """
     size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
+    # Random gains and offsets with a vignette, relative to the live pixels.
     vignette = rows**2 + columns**2
     dead = rng.random(size) < rig.bad_fraction
     gain = rig.gain_std * (rng.standard_normal(size) - vignette)

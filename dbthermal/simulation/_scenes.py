@@ -266,10 +266,12 @@ def walkers(
     rows, columns = np.meshgrid(
         np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"
     )
+    # Object: heated in its middle.
     profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
     curve = heating(time, 0.0, hottest - level, time_constant)
     warm = level + curve[:, np.newaxis, np.newaxis] * profile
     cold = np.full(warm.shape, level)
+    # Background: each person crosses the view once.
     starts = (
         time[0] + (time[-1] - time[0]) * (np.arange(crossings) + rng.random(crossings)) / crossings
     )
