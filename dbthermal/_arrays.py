@@ -1,8 +1,7 @@
-"""Types of arrays that most modules share, and films that are in memory or on disk.
+"""Types of arrays, and films in memory or on disk.
 
-Films that a separation fills are in memory, or in files that vanish with the process, and are
-written and read as arrays all the same. The pages of a file count as the process's memory, too,
-until they are released (`release`).
+Films on disk are in files that vanish with the process, and are used as arrays. Their pages count
+as the process's memory until they are released (`release`).
 """
 
 import importlib
@@ -30,10 +29,7 @@ _MAPS: WeakSet[mmap.mmap] = WeakSet()
 
 
 def stride(shape: tuple[int, ...], number: int) -> int:
-    """Step along every axis of a shape that selects about so many values, evenly spaced.
-
-    Rounded down: at most 2^n times the number are selected along n axes.
-    """
+    """Step along every axis that selects about so many values of a shape, at most 2^n times."""
     step = (prod(shape) / number) ** (1.0 / len(shape))
     return max(1, int(round(step, 9)))  # a whole root is whole
 
@@ -45,11 +41,7 @@ def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:
 
 
 def select(values: Any, selected: Any, axis: int = -1) -> Any:
-    """Values at the selected places along an axis, told by a mask or by their numbers.
-
-    Along the last one, an index of NumPy would leave the axes in another order in memory, and take
-    several times as long.
-    """
+    """Values at the selected indices or mask along an axis, in the same order of axes in memory."""
     selected = np.flatnonzero(selected) if selected.dtype == bool else selected
     return values.take(selected, axis=axis)
 
@@ -104,8 +96,8 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
 def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Copy an array."""
     result = empty(values.shape, values.dtype)
-    for part in parts(values):
-        result[part] = values[part]
+    for rows in parts(values):
+        result[rows] = values[rows]
     return result
 
 

@@ -1,9 +1,8 @@
-"""Compiled functions, and files that keep their machine code from process to process.
+"""Compiled functions, whose machine code is kept in files from process to process.
 
-A file has a checksum, and the digest of the code that it was compiled of: of the function and of
-all compiled functions and constants that it uses, in any module, but not of comments, docstrings
-and lines. What is damaged, or of other code, is compiled again; processes that need the same at the
-same time wait for the first to compile it.
+A file has a checksum, and the digest of the function and of all compiled functions and constants
+that it uses, without comments, docstrings and line numbers. Damaged or old files are compiled
+again; processes that need the same function wait for the first one to compile it.
 """
 
 import dis
@@ -37,10 +36,7 @@ _SIZE: Final = 32  # of a SHA-256 [byte]
 
 
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator that compiles a function at its first call, and keeps its machine code.
-
-    Without a folder that may be written each process compiles. `options` are those of `numba.njit`.
-    """
+    """Decorator that compiles a function at its first call, and keeps its machine code."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         result: Any = njit(**options)(function)

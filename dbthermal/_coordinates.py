@@ -1,8 +1,7 @@
-"""Coordinates of two arrays of which one is laid on the other: the same, or an error.
+"""Coordinates of two arrays must be the same, or an error names them.
 
-One rule for every function that takes a second array: bands go by name, in any order; along all
-other dims the two have the same size and, where both have a coordinate, the same values in the same
-order. An array without a coordinate is laid on by position.
+Bands go by name, in any order; along all other dims both arrays have the same size and the same
+coordinate, if both have one. An array without a coordinate goes by position.
 """
 
 from collections.abc import Sequence
@@ -27,14 +26,11 @@ def laid_on(
     of: str,
     dims: Sequence[str] = ("band", "time", "temperature", "material", "y", "x"),
 ) -> Laid:
-    """
-    Array with the bands, in the order, and the coordinates of a reference, along the dims of both.
-
-    `label` and `of` name the two in the ValueError, for other bands, sizes or values.
-    """
+    """Array with the bands, order and coordinates of a reference; a ValueError names the two."""
     if not isinstance(array, xr.DataArray | xr.Dataset):
         message = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
         raise TypeError(f"{message}. Must be a DataArray or a Dataset.")
+    # Bands by name, then every common dim.
     shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
     if "band" in shared and "band" in array.coords and "band" in reference.coords:
         names = [str(name) for name in reference["band"].values]

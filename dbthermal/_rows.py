@@ -1,7 +1,7 @@
 """Arrays that are computed when they are read, some rows of the image at a time.
 
-A long capture fits in memory raw, but not corrected beside it. What is computed of it row by row is
-read like an array on disk: the same calls, the memory of the rows that are asked for.
+A long capture fits in memory raw, but not corrected as well. It is read like an array on disk, with
+the memory of the selected rows.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,7 +21,7 @@ _BLOCK: Final = 2**24  # samples of a block that is computed at once
 
 
 class _Rows(BackendArray):
-    """Array (..., y, x) of float32 by a function of some rows of it."""
+    """Array (..., y, x) of float32 by a function of some rows."""
 
     dtype = np.dtype("float32")
 
@@ -33,7 +33,8 @@ class _Rows(BackendArray):
         return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, kind, self._read))
 
     def _read(self, key: tuple[Any, ...]) -> Values:
-        """Values at a number, slice or array of places along each dim."""
+        """Values at a number, slice or array of indices along each dim."""
+        # Compute the blocks that hold wanted rows.
         places = [np.arange(size)[index] for size, index in zip(self.shape, key, strict=True)]
         *leading, rows, columns = (np.atleast_1d(place) for place in places)
         result = np.empty([*map(len, leading), rows.size, columns.size], dtype=self.dtype)
@@ -50,7 +51,7 @@ class _Rows(BackendArray):
 
 
 def _even(places: Values) -> Any:
-    """Slice of rising places of one step, which copies nothing; others as they are."""
+    """Slice of rising indices with one step, which copies nothing; other indices as they are."""
     steps = np.unique(np.diff(places))
     if places.size == 0 or steps.size > 1 or np.any(steps < 1):
         return places
@@ -66,10 +67,7 @@ def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
 
 
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
-    """Array (..., y, x) as another, with its coordinates and attributes, computed by rows.
-
-    Where films are made on disk it is computed once, and read from there.
-    """
+    """Array with the coordinates and attributes of another, computed by rows, on disk only once."""
     array = _Rows(_once(compute, like.shape) if made_on_disk() else compute, like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)

@@ -1,14 +1,14 @@
-r"""Samples of a capture: those that are no measurement by their values, gaps, subsamples.
+r"""Quality of samples: noise, saturated and frozen samples by their values, subsamples.
 
-A camera that saturates heaps samples on one value, the highest or the lowest of a pixel, wherever
-that lies; one that freezes repeats its values. Whole counts do both by chance. How often follows
-from the noise s and the step q of the counts: a sample takes any one value at most with probability
+A camera that saturates heaps samples on the extreme value of a pixel; one that freezes repeats its
+values. Whole counts do both by chance: with noise s and step q a sample takes one value with a
+probability of at most
 
 .. math:: c = q / (\sqrt{2 \pi} s)
 
 so that k repeats in a row have a probability of :math:`c^k`, and of the samples within 2 s of an
 end, where the density does not grow, at most q / 2 s lie on the last value. With s below 1.25 q
-nothing can be told, and nothing is.
+nothing is flagged.
 """
 
 from dataclasses import dataclass
@@ -23,51 +23,44 @@ from scipy.special import bdtrc, ndtri
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.noise import MINIMUM_FRAMES
 
-# Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
-_QUIET: Final = 0.8
+_QUIET: Final = 0.8  # smallest share of a pixel's changes, that are noise
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
-# Pixels along either side of which the noise of resampled counts is measured, and steps in time.
+PIXELS: Final = 16  # pixels, about, from which noise and step of the counts are estimated
+# Width of the mean over pixels of the noise of resampled counts, and steps in time.
 _AROUND, _STEPS = 5, 700
+_AT_ONCE: Final = 2**17  # samples that are compared in one pass, to stay in the cache
 
-_AT_ONCE: Final = 2**17  # samples that are compared together, to stay in the cache
-
-# Share of the stillest groups of frames, and how many there must be: noise is then known to 3 %.
-_STILLEST: Final = 0.1
-_FEWEST_STILL: Final = 1000
-# Ranks of the magnitudes that tell the noise, and of the next ones; outliers are beyond. Their mean
-# in a normal distribution, and the ratio of what both tell from which it is no noise.
+_STILLEST: Final = 0.1  # share of the groups of frames with the least motion
+_FEWEST_STILL: Final = 1000  # of them, for a noise within 3 %
+# Ranks of the magnitudes that give the noise, and of the next ones; their mean in a normal
+# distribution; and the ratio of both estimates from which it is no noise.
 _RANKS: Final = np.array([0.0, 0.7, 0.95])
 _DENSITY: Final = np.exp(-0.5 * ndtri(0.5 + 0.5 * _RANKS) ** 2) / np.sqrt(2.0 * np.pi)
 _MEANS: Final = -2.0 * np.diff(_DENSITY) / np.diff(_RANKS)
 _UNEQUAL: Final = 1.1
-# Factor from which a noise is another than the stated one; largest between bands of what moves.
-_LARGER: Final = 1.4
-_UNLIKE: Final = 20.0
+_LARGER: Final = 1.4  # ratio from which a noise contradicts the stated one
+_UNLIKE: Final = 20.0  # largest ratio of a motion between bands
 
-# The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
-_MARGIN: Final = 1.25
+_MARGIN: Final = 1.25  # on the probability of a value, for noise that differs between pixels
 _COARSE: Final = 0.4  # probability of a value above which counts are too coarse to be judged
-# A pixel, or a frame, is taken for spoilt by chance once in so many.
-_FALSE_ALARM: Final = 1e-5
+_FALSE_ALARM: Final = 1e-5  # probability that a good pixel or frame is flagged
 FEWEST: Final = 3
 """Fewest samples on one value, and repeats in a row, that are taken for more than chance."""
 
-# Distance from a multiple of the step at which a change of counts is none.
-_OFF_MULTIPLE: Final = 0.01
+_OFF_MULTIPLE: Final = 0.01  # distance from a multiple of the step at which a change is none
 _END: Final = 2.0  # width [noise] of the end of a pixel's values
 
 
 def noise(signal: npt.NDArray[Any]) -> Array:
-    """Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
+    """Noise (pixel ...) of signals (time, pixel ...) with NaN; NaN for too few frames.
 
-    The mean magnitude of the smaller four fifths of the second differences: neither object nor
-    walkers enter.
+    The mean magnitude of the smaller four fifths of the second differences, without object and
+    passing reflections.
     """
     valid = np.isfinite(signal)
     frames = valid.sum(axis=0)
-    if not valid.all():  # the samples of each pixel that are no measurement go behind the others
+    if not valid.all():  # invalid samples of each pixel go behind the valid ones
         order = np.argsort(~valid, axis=0, kind="stable")
         signal = np.take_along_axis(signal, order, axis=0)
     second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
@@ -83,21 +76,18 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     r"""
     Noise (band) where signals (band, time, pixel) prove more than the stated (band), else NaN [K].
 
-    The second differences d of groups of three frames are independent where there is noise alone.
-    The stillest tenth of the groups is selected by what surrounds each in time, in all bands: the
-    second differences of its neighbours, and the third difference of their means, which a step in
-    between raises. Selected so, noise keeps its distribution. The mean of the smaller seven tenths
-    of the magnitudes tells the noise s. Nothing is proved if a larger one follows from the next
-    quarter, where rare motion shows first, or from how slopes differ between neighbouring groups,
-    for motion is slower than white noise.
+    Second differences of groups of three frames are noise in the stillest tenth of the groups,
+    which are selected by the second differences of their neighbours in all bands, and by the third
+    difference of their means, which a step raises; so selected, noise keeps its distribution. The
+    smaller seven tenths of the magnitudes give the noise s. It is not proved if the next quarter,
+    where rare motion shows first, or the slopes of neighbouring groups give a larger one.
 
-    What jumps at every frame is white, but jumps in all bands. If the excess over the stated noise
-    were motion, at most K times weaker in another band n, then
+    Jumps at every frame are white, but occur in all bands. If the excess over the stated noise were
+    motion, at most K times weaker in another band n, then
 
     .. math:: \overline{d_m d_n} \ge (s_m^2 - \sigma_m^2) / K, \quad K = 20
 
-    If the covariance is smaller by three standard deviations, it is noise. One band that proves it
-    is enough: a quiet band's jumps may be lost in another's noise, and then do little.
+    A covariance that is smaller by three standard deviations proves noise; one band is enough.
     """
     # Without the frames that are copies; NaN differs from NaN.
     new = np.all([np.any(band[1:] != band[:-1], axis=1) for band in signals], axis=0)
@@ -108,13 +98,14 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
     rapid, change, surroundings = np.empty((3, bands, groups - 4, signals.shape[2]))
     step = max(16, _AT_ONCE // three[:, 0].size)
-    for start in range(0, groups - 4, step):  # a few at a time, which stay in the cache
+    for start in range(0, groups - 4, step):
         stop = min(start + step, groups - 4)
         differences = _differences(three[:, start : stop + 4])
         rapid[:, start:stop], change[:, start:stop], surroundings[:, start:stop] = differences
     rapid, change, surroundings = (
         statistic.reshape(bands, -1) for statistic in (rapid, change, surroundings)
     )
+    # Select the stillest tenth of the groups.
     valid = np.all(np.isfinite(rapid) & (surroundings > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))
     if number < _FEWEST_STILL:
@@ -122,11 +113,13 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     motion = surroundings / np.median(surroundings[:, valid], axis=1, keepdims=True)
     stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
     still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
+    # Noise from the smaller magnitudes, checked by larger ones and by slopes.
     ordered = np.sort(np.abs(still), axis=1)
     noise = ordered[:, :middle].mean(axis=1) / _MEANS[0]
     beyond = ordered[:, middle:last].mean(axis=1) / _MEANS[1]
     slower = np.sort(np.abs(change[:, stillest]), axis=1)[:, :middle].mean(axis=1) / _MEANS[0]
     inner = still[:, np.all(np.abs(still) < ordered[:, last : last + 1], axis=0)]
+    # Covariance between the bands below that of motion proves noise.
     shared = np.cov(inner) + 3.0 * np.outer(noise, noise) / np.sqrt(number)
     np.fill_diagonal(shared, np.inf)
     proved = np.any(shared < (noise**2 - stated**2)[:, np.newaxis] / _UNLIKE, axis=1)
@@ -135,7 +128,7 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
 
 
 def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
-    """Second difference of groups (band, group, 3, pixel), of their slopes, and what surrounds."""
+    """Second differences of groups (band, group, 3, pixel), of their slopes, and surroundings."""
     inner = three.shape[1] - 4
     means = three.mean(axis=2)
     rapid = (three[:, :, 1] - 0.5 * (three[:, :, 0] + three[:, :, 2])) / np.sqrt(1.5)
@@ -152,11 +145,7 @@ def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
 def resampled_noise(
     counts: npt.NDArray[Any], resampled: npt.NDArray[Any], stated: Array, width: int
 ) -> Array:
-    """Noise (pixel) [1] of resampled counts over that which is stated, of an image so wide.
-
-    Both are told by the changes between frames, of the counts (band, time, pixel) that were
-    resampled and of the results; 1 where nothing is stated.
-    """
+    """Noise (pixel) [1] of resampled counts over the stated one, 1 where none is stated."""
     usual = np.mean(_roughness(counts) ** 2, axis=1) ** 0.5
     roughness = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
     ratio = np.divide(roughness, stated, out=np.zeros_like(stated), where=stated > 0.0)
@@ -180,11 +169,7 @@ def some_pixels(counts: xr.DataArray, pixels: int = PIXELS) -> npt.NDArray[Any]:
 
 
 def rounding_std(counts: npt.NDArray[Any]) -> Array:
-    """
-    Standard deviation (band) [count] of rounding, step / sqrt(12), of counts (band, time, pixel).
-
-    0 where the changes of most pixels are no multiples of a step.
-    """
+    """Rounding (band) [count], step / sqrt(12), of counts (band, time, pixel); 0 without a step."""
     if counts.shape[1] < MINIMUM_FRAMES:
         return np.zeros(len(counts))
     size = max(16, _AT_ONCE // counts[:, 0].size)
@@ -218,10 +203,7 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
-
-    Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
-    """
+    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
     sampled = slice(None, None, max(1, counts.shape[1] // PIXELS))
     sample = np.where(valid[:, sampled], counts[:, sampled].astype(np.float64), np.nan)
     changing = np.any(sample[1:] != sample[:-1], axis=1)  # true for NaN
@@ -244,11 +226,7 @@ def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grai
 
 
 def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None, None)) -> Mask:
-    """
-    Pixels (pixel) of counts (time, pixel) that are clipped: many samples have their end value.
-
-    The lowest and highest values (2, pixel) of all samples, valid or not, may be known.
-    """
+    """Clipped pixels of counts (time, pixel): many of their samples have the extreme value."""
     result = np.zeros(counts.shape[1], dtype=bool)
     if band.chance < 1.0:
         for highest in (False, True):
@@ -263,11 +241,7 @@ def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None
 def end_of(
     counts: npt.NDArray[Any], valid: Mask, *, highest: bool, plain: Any = None
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
-    """
-    Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there.
-
-    That of all samples, valid or not, may be known as `plain`.
-    """
+    """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
     if used is True and plain is not None:
         end = plain
@@ -294,8 +268,8 @@ def near_end(
     counts: npt.NDArray[Any], valid: Mask, end: npt.NDArray[Any], band: Grain
 ) -> npt.NDArray[np.intp]:
     """Number (pixel) of samples of counts (time, pixel) about an end, within some noise."""
-    apart = np.abs(counts.astype(np.float64) - end)
-    return np.asarray(np.count_nonzero((apart < _END * band.noise) & valid, axis=0))
+    distance = np.abs(counts.astype(np.float64) - end)
+    return np.asarray(np.count_nonzero((distance < _END * band.noise) & valid, axis=0))
 
 
 def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
@@ -349,13 +323,10 @@ def _needed(frames: int, chance: float) -> int:
 def neighbour_mean(
     values: npt.NDArray[np.floating], weight: npt.NDArray[np.floating], width: float
 ) -> Array:
-    """Weighted mean (..., y, x) of the pixels around each, by a Gaussian of a width [pixel].
-
-    Pixels of weight 0 do not count, whatever their value; NaN where no pixel counts.
-    """
+    """Weighted mean (..., y, x) around each pixel by a Gaussian [pixel]; NaN without a weight."""
     sums = [
-        gaussian_filter(part, width, mode="constant", axes=(-2, -1))
-        for part in (np.where(weight > 0, weight * values, 0.0), weight * 1.0)
+        gaussian_filter(weighted, width, mode="constant", axes=(-2, -1))
+        for weighted in (np.where(weight > 0, weight * values, 0.0), weight * 1.0)
     ]
     empty = np.full(sums[0].shape, np.nan)
     return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))

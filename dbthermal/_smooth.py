@@ -1,8 +1,7 @@
-"""The smooth subspace of time: every curve that a slowly changing object temperature can take.
+"""Smooth subspace of time: the curves that a slowly changing object temperature can take.
 
-An orthonormal basis of polynomials over the capture's own time stamps. The bases are nested, so
-the fit of every order follows from one set of coefficients. An object that changes rapidly now and
-then has polynomials in pieces of the time.
+Orthonormal polynomials over the time stamps, nested, so that one set of coefficients gives the fit
+of every order; of an object that changes rapidly now and then, in pieces of the time.
 """
 
 from dataclasses import dataclass
@@ -221,14 +220,8 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
-    Column j (..., time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`.
-
-    Parameters
-    ----------
-    time : array_like, shape (..., time)
-        Times [s], strictly increasing, not necessarily evenly spaced; of many captures at once.
-    order : int
-        Number of functions, the constant included, at most that of the times, or a ValueError.
+    Column j (..., time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`. The times
+    (..., time) [s] increase, and are at least as many as the functions, or a ValueError.
     """
     time = np.asarray(time, dtype=np.float64)
     frames = time.shape[-1]

@@ -1,12 +1,11 @@
-"""Text from elsewhere: files, numbers, tables and YAML, read strictly, or refused by line and rule.
+"""Strict reading of text from other programs: files, numbers, tables and YAML.
 
-Whatever a reader opens was written by others. `read_text` opens regular files of a limited size,
-`number` takes decimal numbers alone, `table_rows` and `numbers` whole tables, `parse_yaml` mappings
-that mean the same in YAML 1.1 and 1.2. Nothing is guessed, and of two equal keys neither wins.
+`read_text` opens regular files of a limited size, `number` takes decimal numbers alone,
+`table_rows` and `numbers` whole tables, `parse_yaml` mappings that mean the same in YAML 1.1 and
+1.2. Nothing is guessed; errors name the line and the rule.
 """
 
 import csv
-import json
 import math
 import os
 import re
@@ -14,7 +13,6 @@ import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from functools import partial
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -61,10 +59,7 @@ def regular_file(path: str | Path, limit: int) -> Path:
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
-    """Text of a `regular_file`, with line ends as newlines and without a byte-order mark.
-
-    ValueError by file and line where it is not of the encoding, or holds a control character.
-    """
+    """Text of a `regular_file` with newlines, without byte-order mark; ValueError by line."""
     content = regular_file(path, limit).read_bytes()
     try:
         text = content.decode(encoding).removeprefix("\ufeff")
@@ -117,10 +112,7 @@ def number(text: str, place: str) -> float:
 
 
 def table_rows(text: str, source: str, *, comment: str | None = None) -> list[Row]:
-    """Rows of comma-separated values, each in one line; lines that begin with `comment` left out.
-
-    ValueError if the last line has no end, as where a file was cut, or quotes are not closed.
-    """
+    """Rows of comma-separated values without comments; ValueError if a row or the file was cut."""
     rows: list[Row] = []
     for i, line in enumerate(whole_lines(text, source), 1):
         if comment is None or not line.startswith(comment):
@@ -161,29 +153,6 @@ def numbers(rows: Sequence[Row], width: int, source: str) -> NDArray[np.float64]
             for line, row in rows
         ]
     )
-
-
-def parse_json(text: str, source: str) -> Any:
-    """Content of JSON; ValueError by place if a key repeats or a number is not finite."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        for key in repeated(key for key, _ in pairs):
-            raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
-        return dict(pairs)
-
-    def whole(digits: str) -> int:
-        number(digits, source)  # a whole number of thousands of digits is none
-        return int(digits)
-
-    finite = partial(number, place=source)
-    hooks: Any = {"parse_float": finite, "parse_int": whole, "parse_constant": finite}
-    try:
-        return json.loads(text, object_pairs_hook=once, **hooks)
-    except json.JSONDecodeError as error:
-        place = at(source, error.lineno, error.colno)
-        raise ValueError(f"{place}: Must be JSON: {error.msg}.") from error
-    except RecursionError as error:
-        raise ValueError(f"{source}: Invalid nesting. Must be less deep.") from error
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:

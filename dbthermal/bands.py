@@ -73,15 +73,12 @@ class Band:
 
         .. math:: B(T) = \int_{\lambda_l}^{\lambda_u} L(\lambda, T) \, d\lambda
 
-        Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
+        ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
         return self._integral(planck.spectral_radiance, self._within_range(temperature))
 
     def slope(self, temperature: npt.ArrayLike) -> Array:
-        """Derivative dB/dT [W m^-2 sr^-1 K^-1] of the in-band radiance at temperatures [K].
-
-        Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
-        """
+        """Derivative dB/dT [W m^-2 sr^-1 K^-1] of `radiance`, with its errors."""
         return self._integral(planck.spectral_radiance_slope, self._within_range(temperature))
 
     def temperature(self, radiance: npt.ArrayLike) -> Array:

@@ -42,12 +42,14 @@ def correlation(
     >>> round(float(correlation(emissivity, 290.0 + 10.0 * emissivity)), 6)
     1.0
     """
+    # Broadcast both maps to the same coordinates.
     for values, label in ((first, "the first map"), (second, "the second map")):
         if not {"y", "x"} <= {*schema.check_numbers(values, label).dims}:
             raise ValueError(f"Invalid dims {values.dims} of {label}. Must hold y and x.")
     _require_dims(*sorted((second, first), key=lambda maps: maps.ndim))
     first, second = xr.broadcast(first, laid_on(second, first, "the second map", "the first"))
     signal, partner = (_centred(values, mask) for values in (first, second))
+    # Correlation over the pixels of the mask.
     norm = np.linalg.norm(signal, axis=-1) * np.linalg.norm(partner, axis=-1)
     if np.any(norm <= 0):
         raise ValueError(f"Constant map in {np.sum(norm <= 0)} of {norm.size} frames. Must vary.")

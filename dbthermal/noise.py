@@ -1,8 +1,7 @@
-"""Noise of the two bands, estimated from a capture in which everything moves.
+"""Noise of two bands, estimated from a capture with motion.
 
-Smooth functions and a second difference in time remove the object. The background is removed
-twice: its rare steps by trimming, and what it moves all the time by the bands, because noise is
-independent between them and the background is not.
+Smooth functions and second differences in time remove the object. Trimming removes rare steps of
+the background; the covariance of the bands, whose noise is independent, removes its other motion.
 """
 
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from dbthermal import _numbers, schema
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
 
-__all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
+__all__ = ["MINIMUM_FRAMES", "estimate"]
 __dir__ = __all__.copy
 
 MINIMUM_FRAMES: Final = 16
@@ -40,14 +39,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
     Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
-    of the squared weights.
-
-    Parameters
-    ----------
-    signal : Array
-        Signals (time, pixel); ValueError if a sample is infinite.
-    time : array_like
-        Times (time,) [s], which need not be even.
+    of the squared weights. ValueError for an infinite sample, or times [s] that do not rise.
     """
     signal = _numbers.real_numbers("signal", signal)
     if np.any(np.isinf(signal)):
@@ -76,18 +68,15 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     background walks without rest, the quieter band's is too high: for glass by up to 13 %, at
     emissivities 0.3/0.5 by up to 1.7 times, at a correlation time of 0.3 s.
 
+    ValueError if there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond
+    1e9, or a noise comes out as zero.
+
     Parameters
     ----------
     first, second : ndarray, shape (time, pixel)
         Signals of the two bands, each in a unit of its own.
     time : array_like, shape (time,)
         Times [s].
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
-        a noise comes out as zero.
 
     Examples
     --------
@@ -116,6 +105,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         raise ValueError(
             f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
         )
+    # Remove the object: smooth functions, then second differences.
     functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
@@ -124,6 +114,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     auto_first, cross, auto_second = (
         moment / remaining for moment in _trimmed_covariance(*differences)
     )
+    # Ratio of the bands' rapid changes one frame apart, where noise does not enter.
     signal, partner = rapid
     lagged = (signal[1:] * partner[:-1] + signal[:-1] * partner[1:]).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -134,6 +125,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         shared_variance = np.array([cross / ratio, ratio * cross])
         shared = correlation > _SIGNIFICANCE * _CORRELATION_STD * np.sqrt(pixels / frames)
         shared_variance[:, ~np.isfinite(shared_variance).all(axis=0) | ~shared] = 0.0
+    # Median over the pixels.
     variances = np.array([auto_first, auto_second]) - shared_variance
     result = [float(np.median(variance)) for variance in variances]
     if not min(result) > 0:
@@ -145,17 +137,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
 
 def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
-    """Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
-
-    The noise of the quietest band is the median of the estimates beside each other band.
-
-    Parameters
-    ----------
-    signals : sequence of Array
-        Signals (time, pixel) of each band; of more than two bands all are in one unit.
-    time : array_like
-        Times (time,) [s].
-    """
+    """Noise (band) of two bands or more in one unit, each estimated beside the quietest."""
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))
     rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
@@ -169,12 +151,7 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Variances and covariance (pixel) over the frames in which the bands do not step.
-
-    The frames are cut by an ellipse of the shape of the covariance, which scales all of it by one
-    factor: a cut of each band alone would reduce the covariance more than the variances, whose
-    small difference is the noise.
-    """
+    """Variances and covariance (pixel) over the frames without steps, within a common ellipse."""
     scales = [MAD * np.median(np.abs(difference), axis=0) for difference in (first, second)]
     first_scaled, second_scaled = (
         np.divide(difference, std, out=np.zeros_like(difference), where=std > 0)

@@ -17,7 +17,6 @@ __all__ = [
     "FIRST_RADIATION_CONSTANT",
     "SECOND_RADIATION_CONSTANT",
     "brightness_temperature",
-    "require_positive",
     "spectral_radiance",
     "spectral_radiance_slope",
 ]
@@ -33,18 +32,7 @@ Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
-    """Value as a float array, of which every element must be finite and positive, or a ValueError.
-
-    TypeError for text, truth values, durations, complex numbers and objects.
-
-    Parameters
-    ----------
-    name : str
-        Name of the quantity, for the error; a unit in brackets is the one that `value` must have
-        if it states one, as a DataArray does.
-    value : array_like
-        Its values, of any shape.
-    """
+    """Value as a float array; every element must be finite and positive, or a ValueError."""
     return real_numbers(name, value, POSITIVE)
 
 

@@ -26,9 +26,7 @@ __all__ = [
     "apparent_temperature",
     "counts",
     "curve",
-    "curves",
     "noise",
-    "require_range",
 ]
 __dir__ = __all__.copy
 
@@ -161,17 +159,7 @@ class LinearCurve(Curve):
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
-    """Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
-
-    Parameters
-    ----------
-    temperature : array_like
-        Temperatures [K], of any shape.
-    curve : Curve
-        Curve of a band.
-    name : str
-        Name of the temperatures, for the ValueError with the first that lies outside or is NaN.
-    """
+    """Temperatures [K] as float64; ValueError for one outside the calibrated range, or NaN."""
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
     if np.any(bad):
@@ -185,6 +173,9 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
     Its methods take temperatures [K] to counts [count] and back, see `Curve`.
 
+    ValueError if the band is missing, the kind unknown, a coefficient not finite, the slope not
+    positive, or the calibrated range does not increase or lies more than 100 K off the reference.
+
     Parameters
     ----------
     response : Dataset
@@ -193,26 +184,12 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
         Name of the band.
     kind : {"exact", "linear"}
         Sakuma-Hattori, or the linear pair.
-
-    Raises
-    ------
-    ValueError
-        If the band is missing, the kind unknown, a coefficient not finite, the slope not positive,
-        or the calibrated range does not increase or lies more than 100 K off the reference.
     """
     return curves(response, [band], kind)[0]
 
 
 def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> list[Curve]:
-    """Curves of some bands, as `curve` makes that of one; the response is checked once.
-
-    Parameters
-    ----------
-    response, kind : Dataset, str
-        As for `curve`.
-    bands : sequence of str
-        Names of the bands, in the order of the result.
-    """
+    """Curves of bands by name, see `curve`; the response is checked once."""
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
     schema.check(response, "response")
@@ -226,6 +203,7 @@ def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> l
 
 def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
     """Curve of one band, of the numbers of its response."""
+    # Refuse coefficients and a range that are no response.
     bad = [name for name, value in number.items() if not np.isfinite(value)]
     if bad:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")
@@ -289,8 +267,8 @@ def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     if "band" in temperature.dims:
         raise ValueError(f"Invalid dims {temperature.dims} of the temperature. Must lack 'band'.")
     values = require_range(temperature.values, of_bands[0], "temperature")
-    parts = [temperature.copy(data=one.counts(values)) for one in of_bands]
-    result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))
+    films = [temperature.copy(data=band_curve.counts(values)) for band_curve in of_bands]
+    result = xr.concat(films, dim=xr.DataArray(names, dims="band", name="band"))
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
 

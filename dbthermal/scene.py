@@ -1,7 +1,7 @@
-"""A scene as two cameras record it: from raw counts to temperatures in one call.
+"""Temperatures of a scene from the raw counts of two cameras, in one call.
 
-`separate_capture` does in their order what `correction`, `alignment` and `separation` do step by
-step. With a target on disk its films are there, too, and it works in the memory of some rows.
+`separate_capture` calls the steps of `correction`, `alignment` and `separation` in order. With a
+target on disk its films are there, too, and it works in the memory of some rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,16 +43,15 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     target: str | Path | None = None,
     provenance: Mapping[str, Any] = MappingProxyType({}),
 ) -> xr.Dataset:
-    """Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
+    """Separate a raw capture of two cameras: correct, align and separate, in this order.
 
     1. `correction.correct_capture`.
-    2. `alignment.register`, `align` and `reflection_shift`. Where the cameras stand apart, the
-       clocks are compared where both see the same reflection, and its shift is then found anew;
-       at one place they are those that all pixels tell.
+    2. `alignment.register`, `align` and `reflection_shift`. Clocks of displaced cameras are
+       compared where both see the same reflection, whose shift is then estimated anew.
     3. `separation.separate`.
 
-    Clocks and shift are found in a reduced picture, of means over some pixels and frames, if the
-    capture is large. Errors as the steps; ImportError without OpenCV, for a registration.
+    Clocks and shift of a large capture are estimated from means over some pixels and frames.
+    Errors as the steps; ImportError without OpenCV, for a registration.
 
     Parameters
     ----------
@@ -64,15 +63,15 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     response : Dataset
         From `calibration.fit_response`, with its `noise`.
     registration : {"translation", "affine", "homography"}, optional
-        Kind of transform between the views, see `alignment.register`; None if they are on one grid
-        already. A `transform` in `aligning` takes its place.
+        Kind of transform between the views, see `alignment.register`; None if they share a grid. A
+        `transform` in `aligning` takes its place.
     correcting, aligning, separating : mapping, optional
         Options by name of `correction.correct_capture`, `alignment.align` and
         `separation.separate`, such as ``{"offset": 0.0}`` [s] for cameras with one clock.
     target : str or Path, optional
-        Folder ``*.zarr`` for the result. What is computed on the way is then in files beside it,
-        which vanish with the process: some 64 bytes for each pixel and frame, and for up to 2048
-        pixels of each material as much again.
+        Folder ``*.zarr`` for the result. Intermediate films are in files beside it, which vanish
+        with the process: some 64 bytes for each pixel and frame, and for up to 2048 pixels of each
+        material as much again.
     provenance : mapping, optional
         For the `target`, see `store.save`.
 
@@ -110,25 +109,26 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> bool(abs(error).median() < 0.3)  # K
     True
     """
-    for step, options in zip(_STEPS, (correcting, aligning, separating), strict=True):
-        _check_options(step, options)
+    options: dict[str, Any] = {
+        "correcting": correcting,
+        "aligning": aligning,
+        "separating": separating,
+    }
+    for step, values in zip(_STEPS, options.values(), strict=True):
+        _check_options(step, values)
+    # With a target: the same call with its films on disk, saved row by row.
     if target is not None:
         place = check_place(target, ".zarr").absolute().parent
         place.mkdir(parents=True, exist_ok=True)
         with on_disk(place):
             result = separate_capture(
-                capture,
-                correction,
-                response,
-                registration=registration,
-                correcting=correcting,
-                aligning=aligning,
-                separating=separating,
+                capture, correction, response, registration=registration, **options
             )
             blocks = _rows.blocks(result["object_temperature"].shape)
             results = (_let_go(result.isel(y=rows)) for rows in blocks)
             store.save_rows(results, target, provenance or store.provenance({}))
         return store.open_dataset(target)
+    # Correct each camera, register the views, and synchronise the bands.
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
@@ -161,7 +161,7 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
 
 
 def _let_go(rows: xr.Dataset) -> xr.Dataset:
-    """Free the memory of the rows before; return these."""
+    """Free the memory of earlier rows; return these."""
     release()
     return rows
 
@@ -174,16 +174,18 @@ def _aligned(
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
     scale = Scale.of_response(response, [str(name) for name in corrected["band"].values])
+    # Stated clocks: the shift alone is estimated.
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = joint.apart(corrected, scale, **options)
         if field is not None and share_displaced(aligned, scale) > 0.0:
             return aligned, field
         return aligned, None
-    found = joint.compare(corrected, scale, **options)
-    aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    if found.field is not None and not share_displaced(aligned, scale) > 0.0:
-        # No delay of a shift that is not used.
-        found = joint.compare(corrected, scale, **options, side_by_side=False)
-        aligned = on_one_clock(corrected, **{**options, "offset": found.offset})
-    return found.noted(aligned), found.field
+    # Clocks and shift from the images.
+    comparison = joint.compare(corrected, scale, **options)
+    aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
+    if comparison.field is not None and not share_displaced(aligned, scale) > 0.0:
+        # Displaced cameras without a shift: their clocks at one place.
+        comparison = joint.compare(corrected, scale, **options, side_by_side=False)
+        aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
+    return comparison.noted(aligned), comparison.field

@@ -5,31 +5,15 @@ the value that offends.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntFlag
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-
-from dbthermal._glossary import (
-    COORDINATES,
-    EMISSIVITY_LIMITS,
-    EXPOSURE_TIME,
-    FRAME_FLAGS,
-    LARGEST,
-    MEASURED,
-    NOISE,
-    NOISE_FACTOR,
-    OPTIONAL,
-    PATTERN_STD,
-    SEGMENT,
-    SHUTTER_CLOSED,
-    STAGES,
-    STATUS,
-    Variable,
-    origin,
-)
 
 __all__ = [
     "COMPLETED",
@@ -47,32 +31,200 @@ __all__ = [
     "SHUTTER_CLOSED",
     "STAGES",
     "UNMEASURED",
-    "Flags",
     "Status",
     "Variable",
-    "band_positions",
-    "band_values",
     "check",
-    "check_corrected",
-    "check_numbers",
-    "check_variable",
     "has_flag",
-    "measured",
-    "origin",
-    "status_attrs",
-    "variables",
 ]
 __dir__ = __all__.copy
 
 
-class Flags(IntFlag):
-    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`.
+@dataclass(frozen=True)
+class Variable:
+    """Definition of a variable: dimensions in order, type as written, unit, and meaning.
 
     Attributes
     ----------
-    meaning : str
-        The sentence.
+    dims : tuple of str
+        Dimensions, in order.
+    dtype : str
+        Type as written; read, any real type of the same kind passes.
+    units, long_name : str
+        Unit and meaning.
+    more : mapping
+        Further attributes.
     """
+
+    dims: tuple[str, ...]
+    dtype: str
+    units: str
+    long_name: str
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    @cached_property
+    def attrs(self) -> dict[str, Any]:
+        """Attributes to write on the variable, of which xarray keeps a copy."""
+        return {"units": self.units, "long_name": self.long_name, **self.more}
+
+
+def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
+    return Variable(tuple(dims.split()), dtype, units, long_name)
+
+
+def _with_std(name: str, dims: str, units: str, long_name: str) -> dict[str, Variable]:
+    return {
+        name: _of(dims, units, long_name, "float32"),
+        f"{name}_std": _of(dims, units, f"standard deviation of {long_name}", "float32"),
+    }
+
+
+COORDINATES: Final = MappingProxyType(
+    {
+        "time": _of("time", "s", "time since the first frame"),
+        "temperature": _of("temperature", "K", "blackbody temperature"),
+        "wavelength": _of("wavelength", "m", "wavelength"),
+    }
+)
+"""Coordinates with a unit; they must increase strictly. Coordinate `band` names each band."""
+
+NOISE: Final = _of("band", "count", "noise of one pixel and frame")
+"""Variable `noise`: standard deviation of one pixel's counts from frame to frame."""
+
+EXPOSURE_TIME: Final = _of("band time", "s", "when the frame was exposed")
+"""Variable `exposure_time`: each camera's own stamps, NaN for a frame that is no measurement."""
+
+FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uint16")
+"""Variable `frame_flags` of a recording, bits named by its own CF attributes; see `has_flag`."""
+
+SHUTTER_CLOSED: Final = "shutter_closed"
+"""Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
+
+NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
+"""Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
+
+PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
+"""Variable `pattern_std`: what the correction leaves from pixel to pixel, constant in time."""
+
+SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
+"""Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
+
+STATUS: Final = _of("y x", "1", "validity flags, 0 is good", "uint32")
+
+STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
+    {
+        "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
+        "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
+        "reflection_shift": {
+            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
+            "known": _of("y x", "1", "texture tells the shift", "bool"),
+        },
+        "separated": {
+            **_with_std("object_temperature", "time y x", "K", "object temperature"),
+            **_with_std("background_temperature", "time y x", "K", "background temperature"),
+            **_with_std("emissivity", "band y x", "1", "band emissivity"),
+            **_with_std("reflection_ratio", "band y x", "1", "reflection ratio"),
+            "status": STATUS,
+        },
+        "blackbody": {"counts": _of("band temperature", "count", "mean blackbody signal")},
+        "blackbody_movies": {
+            "counts": _of("band temperature frame y x", "count", "raw signal", "uint16")
+        },
+        "blackbody_frames": {
+            "counts": _of("band temperature y x", "count", "mean over the frames")
+        },
+        "correction": {
+            "gain": _of("band y x", "1", "gain of the pixel"),
+            "offset": _of("band y x", "count", "offset of the pixel"),
+        },
+        "response": {
+            "amplitude": _of("band", "count", "Sakuma-Hattori amplitude"),
+            "effective_wavelength": _of("band", "m", "Sakuma-Hattori effective wavelength"),
+            "wavelength_shift": _of("band", "m K", "Sakuma-Hattori wavelength shift"),
+            "offset": _of("band", "count", "Sakuma-Hattori offset"),
+            "linear_slope": _of("band", "count K-1", "slope of the linear response"),
+            "linear_intercept": _of("band", "count", "intercept of the linear response"),
+            "reference_temperature": _of("", "K", "reference temperature"),
+            "temperature_min": _of("", "K", "lowest calibrated temperature"),
+            "temperature_max": _of("", "K", "highest calibrated temperature"),
+        },
+        "contact": {
+            "counts": _of("band measurement", "count", "signal"),
+            "object_temperature": _of("measurement", "K", "object temperature"),
+            "background_temperature": _of("measurement", "K", "background temperature"),
+        },
+        "reflector": {
+            "counts": _of("band measurement", "count", "signal"),
+            "reflected_counts": _of("band measurement", "count", "signal of the reflector"),
+            "object_temperature": _of("measurement", "K", "object temperature"),
+        },
+        "spectrum": {"emissivity": _of("wavelength", "1", "spectral emissivity")},
+        "emissivity_table": {
+            "emissivity": _of("material band", "1", "band emissivity"),
+            "coverage": _of("material band", "1", "share of the band that the spectrum covers"),
+        },
+    }
+)
+"""Stage -> variable -> its definition."""
+
+OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
+    {
+        "capture": {"exposure_time": EXPOSURE_TIME, "frame_flags": FRAME_FLAGS},
+        "corrected": {
+            "exposure_time": EXPOSURE_TIME,
+            "frame_flags": FRAME_FLAGS,
+            "segment": SEGMENT,
+            "drift": _of("band time", "count", "drift taken out"),
+            "noise_factor": NOISE_FACTOR,
+            "pattern_std": PATTERN_STD,
+            "status": STATUS,
+        },
+        "separated": {
+            "emissivity_covariance": _of(
+                "band other_band y x", "1", "covariance of band emissivities", "float32"
+            ),
+            "noise": _of("band", "count", "noise, as used"),
+            "bridged": _of("time y x", "1", "sample bridged in time, not measured", "bool"),
+            "material": _of("y x", "1", "material, -1 for none", "int32"),
+            "reflection_shift": _of("axis y x", "pixel", "shift of what is reflected", "float32"),
+        },
+        "blackbody_frames": {"noise": NOISE},
+        "correction": {
+            "bad": _of("band y x", "1", "bad pixel", "bool"),
+            "residual": _of("band", "count", "RMS residual over the good pixels"),
+            "level": _of("band temperature", "count", "mean over the good pixels"),
+            "offset_std": _of("band", "count", "standard deviation of the offset at the centre"),
+            "gain_std": _of("band", "1", "standard deviation of the gain"),
+            "centre": _of("band", "count", "level at which the two errors are independent"),
+        },
+        "response": {
+            "noise": NOISE,
+            "netd": _of("band", "K", "noise-equivalent temperature difference"),
+        },
+    }
+)
+"""Stage -> variable that it may hold -> its definition."""
+
+LARGEST: Final = 1e9
+"""Magnitude from which a number of counts or kelvin is no measurement of any detector."""
+
+EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
+"""A spectral emissivity outside is a wrong unit or a damaged file [1].
+
+The libraries have -0.16 (trona) to 1.014 (maple bark)."""
+
+MEASURED: Final = "measured"
+"""Attribute `origin` of what a real camera has recorded; of all else it begins otherwise."""
+
+
+def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
+    """Attribute `origin` of a result of several inputs, simulated if one is; empty if unknown."""
+    stated = [str(mapping["origin"]) for mapping in attrs if "origin" in mapping]
+    artificial = [text for text in stated if text != MEASURED]
+    return {"origin": (artificial or stated)[0]} if stated else {}
+
+
+class Flags(IntFlag):
+    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`."""
 
     meaning: str
 
@@ -173,14 +325,8 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
 
 
 def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
-    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite.
-
-    Parameters
-    ----------
-    values : array or DataArray
-        Samples, of any shape and unit.
-    """
-    if values.dtype == np.float16:  # `LARGEST` is none, and all of its numbers are smaller
+    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite."""
+    if values.dtype == np.float16:  # all of its numbers are smaller than `LARGEST`
         return np.isfinite(values)
     return np.abs(values) < LARGEST
 
@@ -194,6 +340,10 @@ def check(
     taken as the agreed unit; a different one is an error. Of the values only those of the
     coordinates are read.
 
+    TypeError or ValueError if it is not a Dataset of real numbers, a variable, dimension or
+    coordinate is missing, misnamed or out of order, a unit is another one, a coordinate does not
+    increase strictly, or bands repeat.
+
     Parameters
     ----------
     dataset : Dataset
@@ -204,13 +354,6 @@ def check(
         Variables of the stage that are checked, where not all are needed.
     label : str
         What the error calls it, "the" and the stage by default.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is not a Dataset of real numbers, a variable, dimension or coordinate is missing,
-        misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
-        bands repeat.
 
     Examples
     --------
@@ -225,6 +368,7 @@ def check(
         raise ValueError(f"Unknown stage '{stage}'. Must be one of {sorted(STAGES)}.")
     label = label or f"the {stage}"
     _require(dataset, xr.Dataset, label)
+    # Name the missing variable, with the stage that the dataset fits.
     optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
     for name in names or (*STAGES[stage], *optional):
         if name not in dataset:
@@ -240,15 +384,7 @@ def check(
 
 
 def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
-    """Check a dataset as `check` does for the stage `corrected`, and refuse raw counts.
-
-    Whole numbers are a TypeError: those are raw, and corrected counts need NaN besides.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Capture, returned unchanged.
-    """
+    """Check a dataset of the stage `corrected`; whole numbers are raw counts and a TypeError."""
     counts = check(dataset, "corrected")["counts"]
     if counts.dtype.kind != "f":
         raise TypeError(
@@ -260,17 +396,7 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
-    """Check one array against its definition, with the errors of `check`.
-
-    Parameters
-    ----------
-    array : DataArray
-        Array to be checked.
-    variable : Variable
-        Its definition.
-    label : str
-        Its name in the error.
-    """
+    """Check one array against its definition, with the errors of `check`."""
     _require(array, xr.DataArray, label)
     if array.dims != variable.dims:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
@@ -291,19 +417,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
-    """Check that an array holds real numbers, of a unit if it states one, and return it as it is.
-
-    TypeError for another type or dtype, ValueError for another unit.
-
-    Parameters
-    ----------
-    array : DataArray
-        Array to be checked.
-    label : str
-        Its name in the error.
-    units : str, optional
-        Unit that it has if it states one; any by default.
-    """
+    """Check that an array holds real numbers, of a unit if it states one, and return it."""
     _require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui":
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
@@ -313,20 +427,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """Positions of bands on the dimension `band`, by name as text.
-
-    TypeError if it is none of xarray; ValueError if there is no coordinate `band`, or a band is
-    missing or repeated.
-
-    Parameters
-    ----------
-    array : DataArray or Dataset
-        Array with a coordinate `band`.
-    wanted : list of str
-        Names of the bands.
-    label : str
-        Name of the array in the error.
-    """
+    """Positions of bands by name; ValueError if one, or the coordinate, is missing or repeated."""
     _require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
@@ -342,34 +443,14 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
 def band_values(
     array: xr.DataArray, wanted: list[str], label: str, units: str
 ) -> npt.NDArray[np.float64]:
-    """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
-
-    Errors as `check_numbers` and `band_positions`; ValueError for other dims, too.
-
-    Parameters
-    ----------
-    array : DataArray
-        Values (band).
-    wanted : list of str
-        Names of the bands, in the order of the result.
-    label, units : str
-        Name of the array in the error, and the unit that it has if it states one.
-    """
+    """Values (band,) of an array over the bands alone, in the order of the wanted bands."""
     if check_numbers(array, label, units).dims != ("band",):
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
     return array.values[band_positions(array, wanted, label)].astype(np.float64)
 
 
 def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Variables of a Dataset of a stage, with the dims and attributes of their definitions.
-
-    Parameters
-    ----------
-    stage : str
-        One of `STAGES`.
-    values : mapping
-        Values by name.
-    """
+    """Variables of a Dataset of a stage, with the dims and attributes of their definitions."""
     documented = {**STAGES[stage], **OPTIONAL.get(stage, {})}
     return {
         name: (documented[name].dims, value, documented[name].attrs)

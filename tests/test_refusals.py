@@ -32,7 +32,7 @@ from dbthermal import (
 from dbthermal import emissivity as emissivities
 from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
-from reproduction import figures as drawn
+from reproduction import figures as drawings
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -221,7 +221,7 @@ def few(part: xr.DataArray) -> xr.DataArray:
 
 def film(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> list[Any]:
     """A film of two frames."""
-    return list(figures.separated_film(few(APPARENT), few(emission), few(change), title="a"))
+    return list(drawings.separated_film(few(APPARENT), few(emission), few(change), title="a"))
 
 
 def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
@@ -295,7 +295,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "time y x",
     ),
     "truth_and_estimate": (
-        lambda it: drawn.truth_and_estimate(it, RESULT, (1, 1)),
+        lambda it: drawings.truth_and_estimate(it, RESULT, (1, 1)),
         SCENE,
         "y x",
     ),
@@ -304,7 +304,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "separated_film emission": (lambda it: film(emission=it), OBJECT, "time y x"),
     "separated_film change": (lambda it: film(change=it), CHANGE, "time y x"),
     "emissivity_by_contact": (
-        lambda it: drawn.emissivity_by_contact(CONTACT, it),
+        lambda it: drawings.emissivity_by_contact(CONTACT, it),
         CONTACT["emissivity"],
         "material band",
     ),

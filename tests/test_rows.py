@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import _arrays, _rows, alignment, correction, simulation
+from reproduction import disturbances
 
 SHAPE = (2, 5, 13, 7)
 WHOLE = xr.DataArray(
@@ -56,7 +57,7 @@ def recorded(
     scene = simulation.walkers(np.arange(frames) / 10.0, shape, glass, rng)
     seen = simulation.observe(scene, rig.response(), rng)
     if shutter:
-        seen = simulation.fire_shutter(simulation.spoil_pixels(seen, bad, rng), shutter, rng)
+        seen = disturbances.fire_shutter(disturbances.spoil_pixels(seen, bad, rng), shutter, rng)
     detector = simulation.pattern(rig, shape, rng)
     movies = simulation.blackbody_movies(rig, np.array([280.0, 310.0, 340.0]), 16, detector, rng)
     fitted = correction.fit_correction(correction.blackbody_statistics(movies))

@@ -14,6 +14,7 @@ from dbthermal import alignment, separation, simulation, store
 from dbthermal.correction import correct_capture
 from dbthermal.scene import separate_capture
 from dbthermal.simulation import Rig
+from reproduction import disturbances
 from reproduction.experiments import whole
 from reproduction.experiments.pictures import Picture, smooth_shift
 
@@ -42,7 +43,7 @@ def recorded(
     time = np.arange(199 * every + 1 + later) * FRAME / every
     field = None if shift is None else smooth_shift(shape, *shift)
     truth = Picture(shape=shape, walkers=walkers).draw(time, GLASS, rng, field)
-    seen = simulation.expose(
+    seen = disturbances.expose(
         truth, RIG.response(), rng, every=every, offsets=(0, later), frames=200
     )
     seen = seen if stamped else seen.drop_vars("exposure_time")

@@ -23,16 +23,19 @@ def align(
 ) -> xr.Dataset:
     """Resample all bands onto one clock, and onto the first band's grid.
 
-    The samples of one band are not touched in time, and its noise stays white: the noisiest, by its
-    noise relative to its signal, unless `clock` names another. The other bands are interpolated at
-    its exposure times by what is to be expected between four frames: the line between two for a
-    random walk, nearly a cubic for what is smooth. An offset of whole frames is a pure shift.
+    The band with the most noise relative to its signal, or `clock`, keeps its samples in time. The
+    others are interpolated at its exposure times by the expected value between four frames: the
+    line between two for a random walk, nearly a cubic for a smooth signal. An offset of whole
+    frames is a pure shift.
 
-    Frames are NaN in a band where that would reach over a gap, over a change of `segment`, or
-    past an end, and where its camera gave none: NaN, or a copy of the frame before. Where a signal
-    steps between two frames, by five standard deviations of noise, the sample is NaN, too, for when
-    it changed is not known, and those beside it, where a curve overshoots. Interpolation makes the
-    noise of a band smaller, by up to 0.8 (`noise_factor`), and correlates neighbouring frames.
+    Frames are NaN in a band across a gap or a change of `segment`, past an end, and where the
+    camera gave none (NaN, or a copy of the frame before). A sample is NaN where the signal steps by
+    five standard deviations of noise between two frames, and beside it, where a curve overshoots.
+    Interpolation makes the noise of a band smaller, by up to 0.8 (`noise_factor`), and correlates
+    neighbouring frames.
+
+    TypeError or ValueError if an argument is not as described, no offset is found, or a band's
+    clock was set while it ran: its stamps step, and the images go on as without the step.
 
     Parameters
     ----------
@@ -82,12 +85,6 @@ def align(
         more than a tenth of a frame still; if the images contradict an offset that was stated to
         `readers.two_bands`, and are followed.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not as described, no offset is found, or a band's
-        clock was set while it ran: its stamps step, and the images go on as without the step.
-
     Examples
     --------
     A shift by one whole frame: the last frame has no counterpart.
@@ -110,5 +107,5 @@ def align(
     onto = partial(on_one_clock, corrected, clock=clock, lazy=lazy)
     if offset is not None or reflection_shift is not None:
         return onto(offset=offset, search=search, reflection_shift=reflection_shift)
-    found = joint.compare(corrected, search=search, clock=clock, lazy=lazy)
-    return found.noted(onto(offset=found.offset))
+    comparison = joint.compare(corrected, search=search, clock=clock, lazy=lazy)
+    return comparison.noted(onto(offset=comparison.offset))

@@ -13,30 +13,25 @@ from dbthermal._arrays import Array, Mask
 
 Indices = npt.NDArray[np.intp]
 
-# A sample nearer than this to the wanted time is taken as it is [frame period].
-_COINCIDENT: Final = 0.01
+_COINCIDENT: Final = 0.01  # distance within which a sample is taken as it is [frame period]
 _GAP: Final = 1.5  # longest gap that is interpolated across [frame period]
-# Largest relative deviation of a time step from the median of an even clock [1].
-_EVEN: Final = 0.05
+_EVEN: Final = 0.05  # largest relative deviation of a step from the median of an even clock [1]
 _MINIMUM_FRAMES: Final = 2
-# Share of the largest step by which it may leave the line beside a sudden step: the noise.
-_SWING: Final = 0.125
-# Fewest frames in a row, of a recording that pauses.
-_ROW: Final = 64
+_SWING: Final = 0.125  # of the largest step, by which a curve may leave the line beside a step
+_ROW: Final = 64  # fewest frames in a row, of a recording that pauses
 PAUSE: Final = 20
 """Length from which a gap in a camera's frames is a pause of the recording [frame period]."""
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    r"""Interpolation in time by the value to be expected between four frames.
+    r"""Interpolation in time by the expected value between four frames.
 
     .. math:: I(t) = (1 - w) I_{before} + w I_{after} + \sum_{i=-1}^{2} b_i I_{before + i}
 
-    For a random walk that is the line between two frames, for what is smooth from frame to frame
-    nearly the cubic through four: the bend b, which is 0 without four frames in a row. The wrong
-    one takes, or adds, a part of the rapid changes, and so of this band's reflection: half-way
-    between frames the line keeps 71 % of a change of four frames from crest to crest, the cubic 88.
+    The bend b is 0 for a random walk, and without four frames in a row; for a smooth signal the
+    result is nearly the cubic. Half-way between frames the line keeps 71 % of a change of four
+    frames from crest to crest, the cubic 88.
 
     `before`, `after` (wanted): frames; `weight` (wanted): w [1]; `bend` (wanted, 4): b [1];
     `valid` (wanted): false across a gap or past an end; `stamps` (time): exposure times [s].
@@ -54,8 +49,8 @@ class Interpolation:
     ) -> None:
         """Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
 
-        Between two samples that differ by more than `largest_step` no value is known: NaN. Nor is
-        it beside them, where a curve swings.
+        NaN, too, where two samples differ by more than `largest_step`, and beside such a step,
+        where a curve swings.
         """
 
         @lru_cache(maxsize=3)  # of the frames' intervals in turn
@@ -76,12 +71,12 @@ class Interpolation:
                     four = frames[before - 1 : after + 2]
                     off = np.tensordot(self.bend[place].astype(four.dtype), four, 1)
                     out[place] += np.nan_to_num(off)
-                    beside = steps(before - 1, before) | steps(after, after + 1)
-                    unknown = unknown | beside & (np.abs(off) > _SWING * largest_step)
+                    neighbours = steps(before - 1, before) | steps(after, after + 1)
+                    unknown = unknown | neighbours & (np.abs(off) > _SWING * largest_step)
                 out[place][unknown] = np.nan
 
     def _step(self, frames: npt.NDArray[Any], before: int, after: int) -> npt.NDArray[Any]:
-        """Change between two samples, or its excess over the neighbouring changes if smaller."""
+        """Change between two samples, or its excess over the neighbouring changes, the smaller."""
         change, time = frames[after] - frames[before], self.stamps
         rates = [
             (frames[late] - frames[early]) / (time[late] - time[early])
@@ -89,8 +84,8 @@ class Interpolation:
             if early >= 0 and late < len(frames) and np.isfinite(time[late] - time[early])
         ]
         width = time[after] - time[before]
-        beside = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
-        excess = change - sum(beside) / max(len(beside), 1)
+        neighbours = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
+        excess = change - sum(neighbours) / max(len(neighbours), 1)
         return np.asarray(np.minimum(np.abs(change), np.abs(excess)))
 
     def power(self) -> Array:
@@ -108,16 +103,13 @@ class Interpolation:
 def exposure_times(corrected: xr.Dataset) -> Array:
     """Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
 
+    TypeError or ValueError if the dataset is no capture, or the times have other dims or another
+    unit, are fewer than two of a band, or do not increase.
+
     Parameters
     ----------
     corrected : Dataset
         Capture with `exposure_time`; without it `time` is taken, in every band.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is none, or they have other dims or another unit, are fewer than two of a
-        band, or do not increase.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if "exposure_time" not in corrected:
@@ -136,20 +128,16 @@ def fill_times(stamps: Array) -> Array:
     ----------
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
-        frame period each.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If they are no numbers, fewer than two frames have a time, or the times do not increase.
+        frame period each. TypeError or ValueError if they are no numbers, fewer than two, or do not
+        increase.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
     _check_stamps(stamps[~np.isnan(stamps)], "the camera")
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
-    inside = np.interp(slots, recorded, stamps[recorded])
+    interpolated = np.interp(slots, recorded, stamps[recorded])
     early, late = np.minimum(slots - recorded[0], 0), np.maximum(slots - recorded[-1], 0)
-    return np.asarray(inside + step * (early + late))
+    return np.asarray(interpolated + step * (early + late))
 
 
 def _check_stamps(stamps: Array, label: str) -> None:
@@ -168,10 +156,7 @@ def _check_stamps(stamps: Array, label: str) -> None:
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:
-    """Frames (time) that are NaN in all pixels, or a copy of the frame before.
-
-    A driver that loses a frame may deliver the last one again; noise never repeats a whole frame.
-    """
+    """Frames (time) that are NaN in all pixels, or an exact copy of the frame before."""
     result = np.array([bool(np.all(np.isnan(frame))) for frame in frames])
     for place in range(1, len(frames)):
         result[place] |= np.array_equal(frames[place], frames[place - 1], equal_nan=True)
@@ -185,11 +170,10 @@ def frame_period(stamps: Array) -> float:
 
 
 def even_times(stamps: Array, reach: int) -> Array:
-    """Evenly spaced times [s] that all cameras, exposure times (band, time), can be brought to.
+    """Evenly spaced times [s] to which all cameras, with exposure times (band, time), are brought.
 
-    The stamps themselves where all bands share even ones (steps within 5 % of their median); else
-    from the last camera's start to the first one's end, in steps of the longest frame period. Where
-    the cameras pause, only times within `reach` steps of a frame: as many as there are frames.
+    The exposure times themselves if all bands share even ones; else from the last camera's start to
+    the first one's end in steps of the longest frame period, within `reach` steps of a frame.
     """
     step = max(frame_period(row) for row in stamps)
     shared = bool(np.all(stamps == stamps[0]))
@@ -207,10 +191,10 @@ def even_times(stamps: Array, reach: int) -> Array:
 
 
 def require_steady(stamps: Array, bands: list[str]) -> None:
-    """Refuse exposure times (band, time) [s] in which a camera has no frame period.
+    """Refuse exposure times (band, time) [s] of frames that arrive in bursts.
 
-    As of frames that arrive in bursts: of half of the steps it must be the period within 50 %, and
-    half of the frames must lie between pauses in rows of `_ROW` at least.
+    Half of the steps must be the frame period within 50 %, and half of the frames must lie in rows
+    of at least `_ROW` without a pause.
     """
     for band, row in zip(bands, stamps, strict=True):
         times, period = row[np.isfinite(row)], frame_period(row)
@@ -236,11 +220,10 @@ def pauses(times: Array) -> Array:
 def interpolation(
     stamps: Array, present: Mask, wanted: Array, segment: Indices, growth: float
 ) -> Interpolation:
-    """Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
+    """Interpolation of frames exposed at `stamps` (time) [s], at times `wanted` [s].
 
-    Of a signal with that `growth`, see the function. Valid where a frame was exposed within 1 % of
-    a period of the wanted time, or one each before and after it of one `segment` (time), no more
-    than one and a half frame periods apart.
+    Valid where a frame was exposed within 1 % of a period, or one each before and after in one
+    `segment` (time), at most one and a half frame periods apart. For `growth` see the function.
     """
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:
@@ -249,17 +232,19 @@ def interpolation(
             "the others are NaN or copies of the frame before."
         )
     times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
+    # Frames before and after each wanted time, and weight of the latter.
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)
     width = times[right] - times[right - 1]
     weight = (wanted - times[right - 1]) / width
     nearest = np.rint(weight)
     weight = np.where(np.abs(weight - nearest) * width <= _COINCIDENT * step, nearest, weight)
-    # The frames one before the other without a gap, within one segment.
+    # Neighbours in time without a gap, within one segment.
     joined = (np.diff(times) <= _GAP * step) & (np.diff(segment[usable]) == 0)
     between = (weight > 0) & (weight < 1) & joined[right - 1]
     valid = (weight == 0) | (weight == 1) | between
     in_a_row = np.pad(joined & (np.diff(usable) == 1), (1, 1))
     four = (growth > 1.0) & between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
+    # Bend from the weights of four frames in a row, less those of the line.
     nodes = times[np.clip(right[:, np.newaxis] + np.arange(-2, 2), 0, usable.size - 1)]
     bend = np.zeros(nodes.shape)
     bend[four] = _expected(nodes[four], wanted[four], growth)
@@ -269,10 +254,10 @@ def interpolation(
 
 
 def _expected(nodes: Array, wanted: Array, growth: float) -> Array:
-    """Weights (wanted, 4) of the samples at four nodes (wanted, 4), at the times wanted.
+    """Weights (wanted, 4) of samples at four nodes (wanted, 4), for values at the times wanted.
 
-    Universal kriging with a linear trend (Matheron 1973, doi:10.2307/1425829), of the generalised
-    covariance |h|^growth less h^2, of which the trend knows nothing, for a limit at a growth of 2.
+    Universal kriging with a linear trend (Matheron 1973, doi:10.2307/1425829) of the generalised
+    covariance |h|^growth - h^2, which has a limit at a growth of 2.
     """
     times = np.column_stack([nodes, wanted]) - wanted[:, np.newaxis]
     times /= np.diff(nodes).mean(axis=1)[:, np.newaxis]
@@ -288,10 +273,10 @@ def _expected(nodes: Array, wanted: Array, growth: float) -> Array:
 
 
 def growth(signal: npt.NDArray[Any]) -> float:
-    """Exponent a in mean [x(t + h) - 2 x(t) + x(t - h)]^2 ~ h^a of signals (time, ...), 1 to 3.9.
+    """Exponent a of signals (time, ...) in mean [x(t + h) - 2 x(t) + x(t - h)]^2 ~ h^a, 1 to 3.9.
 
-    Of lags of 1, 2 and 4 frames, whose differences hold no noise: 1 of a random walk, 4 of what is
-    smooth from frame to frame. It is 1 where nothing changes.
+    From differences between lags of 1, 2 and 4 frames, which hold no noise: 1 for a random walk or
+    no change, 4 for a signal that is smooth from frame to frame.
     """
     spread = []
     for lag in (1, 2, 4):

@@ -1,9 +1,8 @@
 """Clocks of cameras compared jointly with the shift between the reflections that they see.
 
-What moves one way before cameras side by side comes to a pixel of one view earlier, as by an
-earlier clock. So the clocks are compared at places of the same reflection, whose shift is then
-found anew, until neither changes. Of cameras at one place, where no shift is seen, the clocks are
-those that all pixels tell: a delay beside a shift that is none would be the shift's error.
+What moves before cameras side by side comes to a pixel of one view earlier, as by an earlier clock.
+So the clocks are compared at places of the same reflection, whose shift is then estimated anew,
+until neither changes. Without a shift the clocks are those of all pixels.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,18 +24,16 @@ from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status
 
-# Pixels and frames, at most, of the means from which all is found that is of the whole image.
-_PIXELS: Final = 20_000
-_FRAMES: Final = 400
+_PIXELS: Final = 20_000  # of the image of means in which clocks and shift are estimated, at most
+_FRAMES: Final = 400  # of the same, at most
 _COMMON: Final = 0.5  # share of a square's pixels that a frame must have
-# Clocks that are tried, at most, and in a row without being better than one before.
-_ROUNDS, _VAIN = 8, 2
-_LATE: Final = 0.02  # clocks no further apart are the same [frame]
+_ROUNDS, _VAIN = 8, 2  # clocks that are tried, at most, and in a row without improvement
+_LATE: Final = 0.02  # difference below which clocks are the same [frame]
 _FLAT: Final = 0.125  # least share of a delay that is taken to be seen [1]
-# Uncertainty of the clocks, or difference from what was stated, from which it is said [frame].
+# Uncertainty of the clocks, or difference from a stated offset, that gives a warning [frame].
 _PRECISION: Final = 0.1
-_SIGMAS: Final = 3.0  # standard deviations from which the images contradict what was stated
-_SAME: Final = 0.5  # median shift of what both cameras see in one pixel [pixel]: 0.2, apart 2.0
+_SIGMAS: Final = 3.0  # standard deviations from which the images contradict a stated offset
+_SAME: Final = 0.5  # median shift of cameras at one place, at most [pixel]: 0.2, displaced 2.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class Comparison:
     doubts: tuple[str, ...] = ()
 
     def noted(self, aligned: xr.Dataset) -> xr.Dataset:
-        """Capture on these clocks, with what was found beside them; doubts are warned of."""
+        """Capture with the standard deviation of its clocks; doubts become warnings."""
         deviation = {"time_offset_std": self.std} if np.isfinite(self.std) else {}
         return warned(aligned.assign_attrs(deviation), *self.doubts)
 
@@ -63,11 +60,10 @@ def compare(
     lazy: bool = False,
     side_by_side: bool = True,
 ) -> Comparison:
-    """Clocks of the cameras of registered views; those stated at the import if nothing contradicts.
+    """Clocks of the cameras of registered views; the stated ones unless the images contradict.
 
-    The scale of the bands is by default that of their own changes. Cameras that may not stand
-    `side_by_side` are taken to stand at one place. ValueError where nothing tells the clocks, as
-    `time_offset`.
+    The scale of the bands is by default that of their changes. Cameras that are not `side_by_side`
+    stand at one place. ValueError where nothing tells the clocks, as `time_offset`.
     """
     names = [str(name) for name in corrected["band"].values]
     synchronous = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
@@ -94,7 +90,7 @@ def compare(
 
 
 def _at_one_place(corrected: xr.Dataset, search: int) -> Comparison:
-    """Clocks of cameras at one place, which all pixels tell, of registered views."""
+    """Clocks of cameras at one place, from all pixels of registered views."""
     names = [str(name) for name in corrected["band"].values]
     pairs = [measured_offset(corrected, name, search) for name in names[1:]]
     offsets = np.array([0.0, *(offset for offset, _ in pairs)])
@@ -104,7 +100,7 @@ def _at_one_place(corrected: xr.Dataset, search: int) -> Comparison:
 def apart(
     corrected: xr.Dataset, scale: Scale, offset: float | xr.DataArray, **options: Any
 ) -> xr.Dataset | None:
-    """Shift of the reflections at an offset that is stated; None where they are not apart."""
+    """Shift of the reflections at a stated offset; None if they are not displaced."""
     small, resample = _reduced(corrected, **options)
     field = _shift(resample(small, offset=offset), scale)
     field = None if field is None else _enlarged(field, corrected)
@@ -112,7 +108,7 @@ def apart(
 
 
 def _reduced(corrected: xr.Dataset, **options: Any) -> tuple[xr.Dataset, Callable[..., xr.Dataset]]:
-    """Capture in which is found what is of the whole image, and how it is resampled."""
+    """Capture of means over squares of pixels, and how it is resampled."""
     steps = STEP * _side(corrected["counts"])
     return _of_squares(corrected), partial(on_one_clock, **options, steps=steps)
 
@@ -120,7 +116,7 @@ def _reduced(corrected: xr.Dataset, **options: Any) -> tuple[xr.Dataset, Callabl
 def _compared(
     corrected: xr.Dataset, scale: Scale | None, synchronous: xr.DataArray, **options: Any
 ) -> Comparison:
-    """Clocks that the images tell."""
+    """Clocks from the images."""
     stamps = clocks.exposure_times(corrected)
     clocks.require_steady(stamps, [str(name) for name in corrected["band"].values])
     small, resample = _reduced(corrected, **options)
@@ -128,6 +124,7 @@ def _compared(
         scale = Scale.of_changes(small) if scale is None else scale
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
+    # Compare clocks and shift in the reduced picture.
     offset, field, uncertainty = _clocked(small, scale, synchronous, resample)
     full_field = None if field is None else _enlarged(field, corrected)
     if field is None or full_field is None or not seen_apart(full_field):
@@ -153,19 +150,16 @@ def _compared(
 
 
 def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
-    """Share of the others' energy that each of two shifts explains, in the pixels of both."""
+    """Share of the second camera's energy that each shift explains, in the pixels of all."""
     common = np.all([field["known"].values for field in fields], axis=0)
     sums = [field["energy"].values[:, common].sum(axis=1) for field in fields]
     return tuple(float(explained / max(energy, 1e-9)) for explained, energy in sums)
 
 
 def _clocked(
-    small: xr.Dataset,
-    scale: Scale,
-    synchronous: xr.DataArray,
-    resample: Callable[..., xr.Dataset],
+    small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
 ) -> tuple[xr.DataArray, xr.Dataset | None, float]:
-    """Offsets of the clocks, the shift of the reflections, and what clocks are off by [s]."""
+    """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s]."""
     names, trials = small["band"].values, list[_Trial]()
 
     def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
@@ -193,7 +187,7 @@ def _clocked(
     if not trials:
         return offset, field, np.nan
     best, step = _step(trials, frame)
-    # A delay that is not seen is known no better than by its deviation.
+    # The uncertainty is at least the standard deviation of the delay.
     return best.offset, best.field, float(np.hypot(step, best.field.attrs["delay_std"]))
 
 
@@ -207,24 +201,25 @@ class _Trial:
 
     @property
     def delay(self) -> float:
-        """Time by which the others are seen late with these clocks [s]."""
+        """Delay that remains with these clocks [s]."""
         return float(self.field.attrs["delay"])
 
     @property
     def clock(self) -> float:
-        """Offset of the others from the reference [s]."""
+        """Offset of the late bands from the reference [s]."""
         offset = self.offset.values
         return float(offset[self.late_bands].mean() - offset[~self.late_bands].mean())
 
 
 def _step(trials: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
-    """Trial with the least delay, and the step of the others' clocks that ends it [s]."""
+    """Trial with the least delay, and the step of its clocks that removes the delay [s]."""
     best = min(trials, key=lambda trial: abs(trial.delay))
     alike = [trial for trial in trials if np.array_equal(trial.late_bands, best.late_bands)]
     distinct = [trial for trial in alike if abs(trial.clock - best.clock) >= _LATE * frame]
     opposite = [trial for trial in distinct if trial.delay * best.delay < 0.0]
     slope = 1.0
-    if distinct:  # Newton's steps are short beside noise: from the second on they are a secant's
+    # Newton's steps are short beside noise: from the second on they are a secant's.
+    if distinct:
         neighbour = min(opposite or distinct, key=lambda trial: abs(trial.clock - best.clock))
         slope = (neighbour.delay - best.delay) / (best.clock - neighbour.clock)
     if not slope > 0.0:
@@ -235,7 +230,7 @@ def _step(trials: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
 
 
 def _next(trials: Sequence[_Trial], frame: float) -> xr.DataArray | None:
-    """Offsets of the clocks to be tried next [s]; None if they, or enough others, have been."""
+    """Offsets of the clocks to be tried next [s]; None when the trials end."""
     best, step = _step(trials, frame)
     if len(trials) >= _ROUNDS or len(trials) - 1 - trials.index(best) >= _VAIN:
         return None
@@ -246,7 +241,7 @@ def _next(trials: Sequence[_Trial], frame: float) -> xr.DataArray | None:
 
 
 def _shift(aligned: xr.Dataset, scale: Scale) -> xr.Dataset | None:
-    """Shift of the reflections over all pixels; None where nothing tells it."""
+    """Shift of the reflections over all pixels; None if it cannot be estimated."""
     try:
         field = shift_of(*_of_means(aligned, scale))
     except ValueError:  # as where nothing moves, or the image is too small
@@ -255,15 +250,12 @@ def _shift(aligned: xr.Dataset, scale: Scale) -> xr.Dataset | None:
 
 
 def _side(counts: xr.DataArray) -> int:
-    """Side of the squares [pixel] of which what is of the whole image is found."""
+    """Side of the squares [pixel] over which the image is averaged."""
     return int(np.ceil(np.sqrt(max(1.0, counts[0, 0].size / _PIXELS))))
 
 
 def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
-    """Capture of means over squares of pixels, if its image is large, each band on its own clock.
-
-    Of each pixel's changes about its own mean: one that lacks a sample does not move the others'.
-    """
+    """Capture of means over squares of pixels of a large image, each band on its own clock."""
     counts, side = corrected["counts"], _side(corrected["counts"])
     if side == 1:
         return corrected
@@ -343,7 +335,7 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
     for name in ("shift", "shift_std"):
         filled = field[name].values[:, nearest[0], nearest[1]]
         shift = side * np.stack(
-            [map_coordinates(part, places, order=1, mode="nearest") for part in filled]
+            [map_coordinates(component, places, order=1, mode="nearest") for component in filled]
         )
         full = np.where(missing[squares], np.nan, shift)
         values[name] = (field[name].dims, full, field[name].attrs)

@@ -1,4 +1,4 @@
-r"""The time by which one camera lags another, from the rapid changes that both see.
+r"""Time by which one camera lags another, from the rapid changes that both see.
 
 With the smooth part projected out, the first band holds the background b(t) and the second
 :math:`\rho \, b(t + \delta)`, both noise besides. A background moves in steps: its autocovariance R
@@ -31,23 +31,17 @@ from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.noise import MAD
 
-# Pixels, at most, of which a capture is judged; a full frame would say it no better.
-_PIXELS: Final = 16384
-# Samples of a band, at most: of a long capture fewer pixels.
-_SAMPLES: Final = 2**25
+_PIXELS: Final = 16384  # pixels of a capture that are compared, at most
+_SAMPLES: Final = 2**25  # samples of a band, at most: of a long capture fewer pixels
 SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
-
-# Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
-# [frame period].
+# Step of one clock against the other from which a lost frame or a set clock is suspected [frame].
 _CLOCK_STEP: Final = 0.5
 _COMMON: Final = 0.5  # least share of the frames that both bands must have [1]
 _MINIMUM_FRAMES: Final = 32  # fewest frames from which an offset is estimated
-# Groups of pixels of the jackknife, which gives the offset's standard deviation.
-_GROUPS: Final = 16
-_SIGNIFICANCE: Final = 6.0
-# Largest standard deviation of an offset [frame].
-_PRECISION: Final = 0.1
-_ORDER: Final = 8
+_GROUPS: Final = 16  # groups of pixels of the jackknife
+_SIGNIFICANCE: Final = 6.0  # least covariance of the bands [standard deviation]
+_PRECISION: Final = 0.1  # largest standard deviation of an offset [frame]
+_ORDER: Final = 8  # smooth functions that are projected out
 
 
 @dataclass(frozen=True)
@@ -67,8 +61,8 @@ class _Pair:
         frames = self.times.size - abs(lag)
         late, early = max(lag, 0), max(-lag, 0)
         signals, segments = (
-            np.stack([part[0][late : late + frames], part[1][early : early + frames]])
-            for part in (self.signals, self.segments)
+            np.stack([movie[0][late : late + frames], movie[1][early : early + frames]])
+            for movie in (self.signals, self.segments)
         )
         return _Pair(signals, segments, self.times[:frames])
 
@@ -78,6 +72,12 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
 
     Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
     the capture has the cameras' own stamps, it is the delay beyond them.
+
+    TypeError or ValueError if the band is missing, the search does not fit the capture's length,
+    there are fewer than 16 usable pixels, nothing moves in both bands, their covariance is greatest
+    at an end of the search, the bands share less than half of their frames, the offset is not known
+    within 0.1 frame, a clock was set while it ran, or times are not of exposure, as of frames in
+    bursts.
 
     Parameters
     ----------
@@ -91,14 +91,6 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         Name of the band; by default the second.
     search : int
         Largest lag to search, either way [frame].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the band is missing, the search does not fit the capture's length, there are fewer than
-        16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
-        search, the bands share less than half of their frames, the offset is not known within 0.1
-        frame, a clock was set while it ran, or times are not of exposure, as of frames in bursts.
 
     Notes
     -----
@@ -142,24 +134,25 @@ def require_one_clock(
 ) -> None:
     """Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set.
 
-    Where their clocks step against one another the longest, frames were lost, or not taken, if the
-    signals (band, time, pixel) [count] keep their offset at the times as they are; if they keep it
-    without the step, a clock was set.
+    At the longest step of the clocks against each other a clock was set if the signals (band, time,
+    pixel) keep their offset without the step, and frames were lost if they keep it with the step.
     """
     rows = np.flatnonzero(np.all(np.isfinite(stamps), axis=0))
     steps = np.diff(stamps[:, rows], axis=1)
-    apart = steps[1] - steps[0]
-    if not apart.size or np.abs(apart).max() <= _CLOCK_STEP * clocks.frame_period(stamps[0]):
+    slip = steps[1] - steps[0]
+    if not slip.size or np.abs(slip).max() <= _CLOCK_STEP * clocks.frame_period(stamps[0]):
         return
-    place = int(np.argmax(np.abs(apart)))
+    place = int(np.argmax(np.abs(slip)))
     excess = steps[:, place] - np.median(steps, axis=1)
     band, last = int(np.argmax(np.abs(excess))), int(rows[place])
     before, after, undone = (stamps.copy() for _ in range(3))
     before[band, last + 1 :] = after[band, : last + 1] = undone[band, : last + 1] = np.nan
     undone[band] -= excess[band]
-    known, as_is, without = (_try(pair, signals, part, search) for part in (before, after, undone))
-    # NaN is no smaller: without motion before or after nothing can be said.
-    if abs(without - known) < np.nan_to_num(abs(as_is - known), nan=np.inf):
+    reference, stepped, without = (
+        _try(pair, signals, times, search) for times in (before, after, undone)
+    )
+    # NaN, of no motion before or after the step, refuses nothing.
+    if abs(without - reference) < np.nan_to_num(abs(stepped - reference), nan=np.inf):
         raise ValueError(
             f"Invalid exposure times of band '{pair['band'].values[band]}': a step of "
             f"{steps[band, place]:.6g} s after {stamps[band, last]:.6g} s, but the images go on "
@@ -169,7 +162,7 @@ def require_one_clock(
 
 
 def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
-    """Offset as `_offset` [s]; NaN where it is not known."""
+    """Offset [s] as `_offset`; NaN where it cannot be measured."""
     if np.isfinite(stamps).sum(axis=1).min() < _MINIMUM_FRAMES:
         return np.nan
     try:
@@ -180,18 +173,18 @@ def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tuple[float, float]:
-    """Offset of two bands and its deviation [s], of their signals at their stamps."""
+    """Offset of two bands and its standard deviation [s], from signals at their exposure times."""
     names = [str(name) for name in pair["band"].values]
     start = [row[np.isfinite(row)][0] for row in stamps]
     times = f"times begin at {start[1]:.4g} and {start[0]:.4g} s"
     label = f"of band '{names[1]}' against '{names[0]}', whose {times}"
-    # Frames of the one side of a pause never meet those of the other, at any lag.
+    # Frames on either side of a pause never meet, at any lag.
     shared = _on_one_clock(signals, stamps, schema.segments(pair), search + 3)
     lag = _peak(_covariances(shared, search, names)[0], label)
-    # Whole frames first: smooth functions over the same scene take the same out of both bands.
-    both = lag + _delays(*_covariances(shared.shifted(lag), 1, names))
-    # The pair of frames that it lies best between in all pixels, for the groups as well.
-    delays = both[:, np.argmin(np.abs(both[0] - lag - np.array([-0.5, 0.5])))]
+    # Shift by whole frames first, so that the smooth functions span the same scene in both bands.
+    lags = lag + _delays(*_covariances(shared.shifted(lag), 1, names))
+    # The side of the lag on which the offset of all pixels lies, for the groups as well.
+    delays = lags[:, np.argmin(np.abs(lags[0] - lag - np.array([-0.5, 0.5])))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
     if not std <= _PRECISION:
@@ -204,7 +197,7 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tup
 
 
 def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
-    """Position of a band whose offset is to be found, which is checked with the capture."""
+    """Check a capture and a band whose offset is measured; return the position of the band."""
     counts = schema.check(corrected, "corrected")["counts"]
     names = [str(name) for name in counts["band"].values]
     if len(names) < 2:
@@ -225,24 +218,24 @@ def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
 def sample(corrected: xr.Dataset) -> Array:
     """Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames.
 
-    Usable is a pixel that is not flagged as dead, saturated or invalid, changes in every band, and
-    is finite in every frame that is not missing.
+    A usable pixel is not flagged as dead, saturated or invalid, changes in every band, and is
+    finite in every recorded frame.
     """
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     fitting = int(np.ceil(np.sqrt(pixels * corrected.sizes["time"] / _SAMPLES)))
     step = max(stride((corrected.sizes["y"], corrected.sizes["x"]), _PIXELS), fitting)
-    part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
-    counts = part["counts"].values.astype(np.float64)
+    subsample = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
+    counts = subsample["counts"].values.astype(np.float64)
     counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
     usable = np.ones(counts.shape[2], dtype=bool)
-    if "status" in part:
-        usable &= (part["status"].values.reshape(-1) & int(schema.UNMEASURED)) == 0
+    if "status" in subsample:
+        usable &= (subsample["status"].values.reshape(-1) & int(schema.UNMEASURED)) == 0
     for movie in counts:
         absent = clocks.missing(movie)
-        movie[absent], here = np.nan, movie[~absent]
-        changes = here.max(axis=0, initial=-np.inf) > here.min(axis=0, initial=np.inf)
-        usable &= np.all(np.isfinite(here), axis=0) & changes
+        movie[absent], recorded = np.nan, movie[~absent]
+        changes = recorded.max(axis=0, initial=-np.inf) > recorded.min(axis=0, initial=np.inf)
+        usable &= np.all(np.isfinite(recorded), axis=0) & changes
     if usable.sum() < _GROUPS:
         raise ValueError(
             f"Invalid capture of {usable.sum()} usable pixels. Must be at least {_GROUPS} that are "
@@ -252,12 +245,12 @@ def sample(corrected: xr.Dataset) -> Array:
 
 
 def noise_levels(signals: Array, stamps: Array) -> Array:
-    """Noise of each band by second differences in time: in counts, and relative to its signal."""
+    """Noise of each band from second differences in time, in counts and over its signal."""
     levels = []
     for frames, times in zip(signals, stamps, strict=True):
-        here = present(frames) & np.isfinite(times)
-        signal = frames[here]
-        rough = noises.second_difference(signal, times[here])
+        valid = present(frames) & np.isfinite(times)
+        signal = frames[valid]
+        rough = noises.second_difference(signal, times[valid])
         if not rough.size:  # too few frames to tell
             levels.append((0.0, 0.0))
             continue
@@ -273,7 +266,7 @@ def present(frames: npt.NDArray[Any]) -> Mask:
 
 
 def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach: int) -> _Pair:
-    """Both bands on evenly spaced times; as they are, where they are already."""
+    """Both bands at evenly spaced times, interpolated where they are not already."""
     times = clocks.even_times(stamps, reach)
     if stamps.shape[1] == times.size and np.all(stamps == times):
         return _Pair(signals, np.stack([segment, segment]), times)
@@ -289,59 +282,55 @@ def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach:
 def _covariances(shared: _Pair, search: int, names: list[str]) -> tuple[Array, Array]:
     """Covariances of the rapid changes, in groups of pixels.
 
-    C (group, lag) of the bands, the first one taken later by each lag up to `search` and two more,
-    either way; and R (group, 2) of the first band, one and two frames apart.
+    C (group, lag) of the bands, with the first one later by each lag up to `search` and two more,
+    either way; R (group, 2) of the first band, one and two frames apart.
     """
     # One step at a shutter event of either band, the same for both.
     _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
-    here = _common(shared, names)
-    first, second = (_rapid(movie, shared.times, here, segment) for movie in shared.signals)
-    cross = [_lagged(first, second, here, lag) for lag in range(-search - 2, search + 3)]
-    auto = [_lagged(first, first, here, lag) for lag in (1, 2)]
+    common = _common(shared, names)
+    first, second = (_rapid(movie, shared.times, common, segment) for movie in shared.signals)
+    cross = [_lagged(first, second, common, lag) for lag in range(-search - 2, search + 3)]
+    auto = [_lagged(first, first, common, lag) for lag in (1, 2)]
     return np.stack(cross, axis=1), np.stack(auto, axis=1)
 
 
 def _common(shared: _Pair, names: list[str]) -> Mask:
-    """Frames (time) that both bands have.
-
-    The smooth part must be taken out over the same frames of both: a part of it that is left in one
-    band only would be taken for rapid changes.
-    """
-    here = np.stack([present(movie) for movie in shared.signals])
-    both, either = here.all(axis=0), here.any(axis=0).sum()
-    if both.sum() < _COMMON * either:
-        lacking = int(np.argmin(here.sum(axis=1)))
-        share = 1.0 - here[lacking].sum() / either
+    """Frames (time) that both bands have, over which the smooth part is removed from both."""
+    valid = np.stack([present(movie) for movie in shared.signals])
+    common, either = valid.all(axis=0), valid.any(axis=0).sum()
+    if common.sum() < _COMMON * either:
+        lacking = int(np.argmin(valid.sum(axis=1)))
+        share = 1.0 - valid[lacking].sum() / either
         raise ValueError(
             f"Invalid frames of band '{names[lacking]}': {100 * share:.0f} % are missing, and the "
-            f"bands '{names[0]}' and '{names[1]}' share {100 * both.sum() / either:.0f} %. Must "
+            f"bands '{names[0]}' and '{names[1]}' share {100 * common.sum() / either:.0f} %. Must "
             f"share at least {100 * _COMMON:.0f} %, for a time offset; give the offset."
         )
-    if both.sum() < _MINIMUM_FRAMES:
+    if common.sum() < _MINIMUM_FRAMES:
         raise ValueError(
-            f"Invalid capture of {both.sum()} valid frames of both bands '{names[0]}' and "
+            f"Invalid capture of {common.sum()} valid frames of both bands '{names[0]}' and "
             f"'{names[1]}'. Must be at least {_MINIMUM_FRAMES} for a time offset."
         )
-    return np.asarray(both)
+    return np.asarray(common)
 
 
-def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> Array:
-    """Residual of a signal (time, pixel) on smooth functions and steps; 0 in other frames."""
-    steps = segment[here][:, np.newaxis] == np.unique(segment[here])[1:]
-    functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[here], _ORDER), steps]))
+def _rapid(movie: Array, times: Array, valid: Mask, segment: clocks.Indices) -> Array:
+    """Residual of a signal (time, pixel) on smooth functions and steps; 0 in invalid frames."""
+    steps = segment[valid][:, np.newaxis] == np.unique(segment[valid])[1:]
+    functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[valid], _ORDER), steps]))
     residual = np.zeros_like(movie)
-    residual[here] = movie[here] - functions @ (functions.T @ movie[here])
+    residual[valid] = movie[valid] - functions @ (functions.T @ movie[valid])
     return residual
 
 
-def _lagged(first: Array, second: Array, here: Mask, lag: int) -> Array:
-    """Covariance (group) of the first signal, so many frames later, with the second."""
+def _lagged(first: Array, second: Array, valid: Mask, lag: int) -> Array:
+    """Covariance (group) of the first signal, later by a lag [frame], with the second."""
     frames = len(first) - abs(lag)
     late, early = (slice(start, start + frames) for start in (max(lag, 0), max(-lag, 0)))
     products = np.einsum("tp,tp->p", first[late], second[early])
     size = products.size - products.size % _GROUPS
     grouped = products[:size].reshape(-1, _GROUPS).sum(axis=0)
-    return np.asarray(grouped / np.sum(here[late] & here[early]))
+    return np.asarray(grouped / np.sum(valid[late] & valid[early]))
 
 
 def _peak(cross: Array, label: str) -> int:
@@ -366,10 +355,9 @@ def _peak(cross: Array, label: str) -> int:
 
 
 def _delays(cross: Array, auto: Array) -> Array:
-    """
-    Offset [frame] near lag 0 if it lies between the frames -1 and 0, and between 0 and 1, columns.
+    """Sub-frame offsets (group, 2) [frame] if they lie in (-1, 0), and in (0, 1).
 
-    In rows: of all groups of pixels, and without each of them in turn, for the jackknife.
+    The first row is of all groups of pixels, the others omit one group each, for the jackknife.
     """
     kept, middle = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)]), cross.shape[1] // 2
     cross, (near, far) = kept @ cross, (kept @ auto).T

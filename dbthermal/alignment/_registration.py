@@ -15,33 +15,28 @@ from dbthermal.alignment._products import sampled
 from dbthermal.alignment._views import TRANSFORM, positions
 from dbthermal.noise import MAD
 
-# Kinds of transform, of two, six and eight numbers.
-_MODELS: Final = ("translation", "affine", "homography")
-# Coarse to fine: widths of the blur as a share of the image's height, the last one a pixel or so.
-_BLURS: Final = (0.08, 0.04, 0.02)
-_FINEST: Final = 0.7
-_SMALLEST: Final = 16
-# A pixel that differs from the median around it by more than so many standard deviations is bad.
-_MEDIAN_WINDOW, _OUTLYING = 3, 6.0
-# Frames that are read, about, of a longer capture.
-_READ: Final = 200
-# Of smooth curves: most frames that they are fitted to, functions, steps of the weights, Tukey's
-# constant in standard deviations, and the least weight, which keeps a fit to few frames solvable.
-_FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
-# Numbers of a homography that each model changes.
+# Entries of a homography that each kind of transform changes.
 _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography": list(range(8))}
-# Gauss-Newton: steps, length of the last step and border left out [pixel]; degree of the polynomial
-# from view to view, and scales of the residual from which a pixel does not count.
+_MODELS: Final = tuple(_FREE)
+# Blurs from coarse to fine, as shares of the image's height, and the finest [pixel].
+_BLURS, _FINEST = (0.08, 0.04, 0.02), 0.7
+_SMALLEST: Final = 16  # rows and columns, at least
+# A pixel farther from the median around it is bad: window [pixel], limit [standard deviation].
+_MEDIAN_WINDOW, _OUTLYING = 3, 6.0
+_READ: Final = 200  # frames that are read of a longer capture, about
+# Smooth curves: most frames, functions, iterations, Tukey's constant [standard deviation], and the
+# least weight, which keeps a fit to few frames solvable.
+_FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
+# Gauss-Newton: iterations, length of the last step and excluded border [pixel], degree of the
+# polynomial between the views, and limit of the residual over its scale.
 _NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
-# Deviation of rotation, scale, and perspective over the image, of equal cameras side by side [1].
+# Prior deviation of rotation, scale, and perspective over the image [1].
 _RIGID: Final = 0.01
 _FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
-# Steps, and relative change of the correlation, at which the maximisation stops.
-_STEPS, _TOLERANCE = 200, 1e-7
+_STEPS, _TOLERANCE = 200, 1e-7  # of the maximised correlation: iterations, relative change
 _LEAST_CORRELATION: Final = 0.5
-# Share of the first view that the other must show: the last rows of two views correlate by chance.
-_LEAST_OVERLAP: Final = 0.5
+_LEAST_OVERLAP: Final = 0.5  # of the image: the last rows of two views correlate by chance
 
 
 def register(
@@ -49,23 +44,21 @@ def register(
 ) -> xr.DataArray:
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
-    Compared are smooth curves fitted robustly to each pixel, in which what passes by in the
-    reflection hardly counts. Their means are brought together by the translation of the highest
-    correlation [1]_, and then, to some hundredths of a pixel, the curves by robust least squares,
+    Smooth curves are fitted robustly to each pixel, so that passing reflections hardly count. The
+    translation of the highest correlation of their means [1]_ is refined to some hundredths of a
+    pixel by robust least squares of the curves,
 
     .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \right)
 
-    with Tukey's bisquare :math:`\varrho`, so that pixels in which the views mirror different things
-    do not count, and a quadratic :math:`f`, for the bands' radiances bend against one another: a
-    warm spot would be narrower in the one than in the other. Added is a weak prior of equal cameras
-    that look one way: rotation, scale and perspective within 1 % (0.6 degrees), one standard
-    deviation, which counts where the texture does not tell them. H takes positions to positions:
+    with Tukey's bisquare :math:`\varrho`, which excludes pixels with different reflections, and a
+    quadratic :math:`f`, because the bands' radiances are not proportional. A weak prior of equal
+    cameras that look one way (rotation, scale and perspective within 1 %, one standard deviation)
+    counts where the texture does not tell them. H takes positions to positions:
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
-    A plane is registered exactly by a homography. Its reflections lie behind it, and are seen by
-    side-by-side cameras at different places of the plane: no transform brings object and reflection
-    together.
+    A homography registers a plane exactly. Side-by-side cameras see its reflections at different
+    places of the plane: no transform brings object and reflection together.
 
     Parameters
     ----------
@@ -116,7 +109,8 @@ def register(
     if model not in _MODELS:
         raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
-    if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
+    # The longest segment: a new pattern would be detail that does not move.
+    if "segment" in corrected:
         numbers, frames = np.unique(corrected["segment"], return_counts=True)
         longest = corrected["segment"].values == numbers[np.argmax(frames)]
         counts = counts.isel(time=longest)
@@ -127,10 +121,10 @@ def register(
             f"Must be at least {_SMALLEST} either way."
         )
     bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
-    first, *others = [_curves(view, bad) for view in counts]
+    curves = [_curves(view, bad) for view in counts]
     matrices = [np.eye(3)]
-    for band, other in zip(counts["band"].values[1:], others, strict=True):
-        matrices.append(_transform(first, other, model, str(band)))
+    for band, curve in zip(counts["band"].values[1:], curves[1:], strict=True):
+        matrices.append(_transform(curves[0], curve, model, str(band)))
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
@@ -157,6 +151,7 @@ def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
             f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
             "every frame that is not missing."
         )
+    # Smooth curves, bad pixels replaced by the median around them.
     images = np.stack([_smooth(row) for row in frames.swapaxes(0, 1)], axis=1)
     if not images.mean(axis=0).std() > 0:
         raise ValueError(
@@ -164,19 +159,19 @@ def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
             "object."
         )
     for image in images:
-        around = median_filter(image, size=_MEDIAN_WINDOW)
-        away = abs(image - around)
-        # A bad pixel stays where it is in every view: it would pull the transform to the identity.
-        wrong = bad | (away > _OUTLYING * MAD * np.median(away))
-        image[wrong] = around[wrong]
+        median = median_filter(image, size=_MEDIAN_WINDOW)
+        difference = abs(image - median)
+        # A bad pixel has the same place in every view and pulls the transform to the identity.
+        outlier = bad | (difference > _OUTLYING * MAD * np.median(difference))
+        image[outlier] = median[outlier]
     return np.asarray((images - images.mean()) / images.std())
 
 
 def _smooth(signal: Array) -> Array:
-    """Smooth curves through signals (time, pixel), by Tukey's bisquare weights, at a few times.
+    """Fit smooth curves to signals (time, pixel), by Tukey's bisquare weights, at a few times.
 
-    What passes by in the reflection is an outlier: a plain mean holds some of it, in each band
-    another share, and a warm spot without detail then seems displaced by 0.2 pixel.
+    A plain mean holds a share of passing reflections, different in each band, which displaces a
+    warm spot without detail by 0.2 pixel.
     """
     order = min(_ORDER, len(signal))
     functions = polynomial_basis(np.arange(len(signal)), order)
@@ -192,51 +187,46 @@ def _smooth(signal: Array) -> Array:
     return np.asarray(curve[((np.arange(order) + 0.5) * len(signal) / order).astype(int)])
 
 
-def _transform(first: Array, other: Array, model: str, band: str) -> Array:
-    """Homography (3, 3) from the first images (time, y, x) to others."""
-    found, failures = [], []
-    # What rises steadily, as only a heated object does, tells the start where it correlates better.
+def _transform(first: Array, second: Array, model: str, band: str) -> Array:
+    """Homography (3, 3) from images (time, y, x) of the first view to those of the second."""
+    starts, failures = [], []
+    # Start from the mean or, of a heated object, from the rise: whichever correlates better.
     for weights in (np.ones(len(first)), np.linspace(-1.0, 1.0, len(first))):
         try:
-            pair = [np.tensordot(weights, images, axes=1) for images in (first, other)]
-            found.append(_start(pair, band))
+            pair = [np.tensordot(weights, images, axes=1) for images in (first, second)]
+            starts.append(_start(pair, band))
         except ValueError as error:
             failures.append(error)
-    if not found:
+    if not starts:
         raise failures[0]
-    matrix, kinds = max(found, key=itemgetter(0))[1], _MODELS[: _MODELS.index(model) + 1]
+    matrix, allowed = max(starts, key=itemgetter(0))[1], _MODELS[: _MODELS.index(model) + 1]
     # The coarse images have little perspective.
-    for blur, some in ((_BLURS[-1] * first.shape[1], kinds[:2]), (_FINEST, kinds)):
-        pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, other)]
-        for kind in some:
+    for blur, models in ((_BLURS[-1] * first.shape[1], allowed[:2]), (_FINEST, allowed)):
+        pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, second)]
+        for kind in models:
             matrix = _fitted(pair, matrix, _FREE[kind], blur, band)
     return matrix
 
 
 def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band: str) -> Array:
-    """Transform that matches images best, beside the prior of equal cameras that look one way.
-
-    By Gauss-Newton steps, of splines: the enhanced correlation interpolates by lines, and is off by
-    some hundredths of a pixel.
-    """
+    """Match images by Gauss-Newton on splines, with the prior of equal cameras."""
     shape, count = pair[0].shape[1:], len(pair[0])
     splines = np.stack([spline_filter(image) for image in pair[1]], axis=-1)
     span = np.array([*shape[::-1], 1, *shape[::-1], 1, *shape[::-1]], dtype=float)[free]
     unit = span ** -np.array([1, 1, 1, 1, 1, 1, 2, 2])[free]
     rows, columns = np.divmod(free, 3)
-    # Residuals are alike over the blur, and at all times: one for each 4 pi blur^2 pixels.
+    # Residuals are equal over the blur, and at all times: one for each 4 pi blur^2 pixels.
     alike = 4.0 * np.pi * blur**2
-    weights, variance = np.ones(shape), alike * count  # at first of images without a transform
-    # Of residuals over time: a pattern that a shutter event left rests, and spoils the mean alone.
-    white = np.eye(count)
+    weights, variance = np.ones(shape), alike * count  # of images without a transform
+    white = np.eye(count)  # whitens the residuals over time
     prior = np.where(span > 1.0, (_RIGID * span) ** -2, 0.0)  # [1/pixel^2], none on a translation
     for _ in range(_NEWTON):
         places = positions(matrix, shape)
-        inside = _inside(places, band)
-        first = pair[0][:, inside]
-        values, *slopes = white @ sampled(splines, places[:, inside]).swapaxes(1, 2)
+        overlap = _overlap(places, band)
+        first = pair[0][:, overlap]
+        values, *slopes = white @ sampled(splines, places[:, overlap]).swapaxes(1, 2)
         # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
-        motion = _motion(matrix, places, inside)[rows, columns] * unit[:, np.newaxis, np.newaxis]
+        motion = _motion(matrix, places, overlap)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = np.concatenate(
             [
                 -np.einsum("atp,nap->ntp", slopes, motion),
@@ -244,48 +234,45 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
                 np.repeat(white.T[:, :, np.newaxis], first.shape[1], axis=2),
             ]
         )
-        weighted = design * weights[inside]
+        weighted = design * weights[overlap]
         flat = weighted.reshape(len(design), -1)
         normal, right = flat @ design.reshape(len(design), -1).T, flat @ values.ravel()
         moved = (matrix - np.eye(3)).ravel()[free] / unit  # so far [pixel]
         normal[: len(free), : len(free)] += np.diag(variance * prior)
         right[: len(free)] -= variance * prior * moved
-        found = np.linalg.pinv(normal, hermitian=True) @ right
-        residual = values - np.tensordot(found, design, axes=1)
+        solution = np.linalg.pinv(normal, hermitian=True) @ right
+        residual = values - np.tensordot(solution, design, axes=1)
         square, texture = np.sum(residual**2, axis=0), np.sum(np.square(slopes), axis=(0, 1))
         # Scale of the residual of the texture's quarter that matches best: an edge is no outlier
         # of what is flat, and much may mirror other things.
         order = np.argsort(square)
         quarter = np.searchsorted(np.cumsum(texture[order]), _QUARTER * texture.sum())
         limit = _CUT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
-        weights[inside] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
-        variance = alike * np.average(square, weights=weights[inside])
-        apart = np.linalg.solve(white, residual)
-        covariance = (apart * weights[inside]) @ apart.T / weights[inside].sum()
+        weights[overlap] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
+        variance = alike * np.average(square, weights=weights[overlap])
+        plain = np.linalg.solve(white, residual)
+        covariance = (plain * weights[overlap]) @ plain.T / weights[overlap].sum()
         mean = np.trace(covariance) / count + np.finfo(np.float32).tiny
         white = np.linalg.inv(np.linalg.cholesky(covariance / mean + _FLOOR * np.eye(count)))
         matrix = matrix.copy()
-        matrix[rows, columns] += found[: len(free)] * unit
+        matrix[rows, columns] += solution[: len(free)] * unit
         matrix /= matrix[2, 2]
-        if np.max(np.abs(found[: len(free)])) < _CONVERGED:
+        if np.max(np.abs(solution[: len(free)])) < _CONVERGED:
             break
     return matrix
 
 
-def _motion(matrix: Array, places: Array, inside: Mask) -> Array:
-    """Derivatives (3, 3, axis, pixel) of the places of some pixels by the numbers of a transform.
-
-    The row and column of H p = (a, b, c), c the scale, are b / c and a / c.
-    """
-    row, column = places[:, inside]
-    point = np.stack([*np.indices(places.shape[1:])[::-1, inside], np.ones_like(row)])
+def _motion(matrix: Array, places: Array, overlap: Mask) -> Array:
+    """Derivatives (3, 3, axis, pixel) of pixel places by the entries of a transform."""
+    row, column = places[:, overlap]
+    point = np.stack([*np.indices(places.shape[1:])[::-1, overlap], np.ones_like(row)])
     scale, none = matrix[2] @ point, np.zeros_like(row)
     of_product = np.stack([[none, none + 1.0], [none + 1.0, none], [-row, -column]]) / scale
     return np.asarray(of_product[:, np.newaxis] * point[:, np.newaxis])
 
 
-def _inside(places: Array, band: str) -> Mask:
-    """Pixels of the first view, not at the border, whose places (2, y, x) in the other are not."""
+def _overlap(places: Array, band: str) -> Mask:
+    """Pixels of the first view whose places (2, y, x) lie inside the second, without borders."""
     ends = np.reshape(places.shape[1:], (2, 1, 1)) - 1
     shared = np.mean(np.all((places > -0.5) & (places < ends + 0.5), axis=0))
     if not shared >= _LEAST_OVERLAP:
@@ -293,24 +280,26 @@ def _inside(places: Array, band: str) -> Mask:
             f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
             f"Must be at least {_LEAST_OVERLAP:.0%}."
         )
-    own = np.indices(places.shape[1:])
-    lowest, highest = np.minimum(places, own), np.maximum(places, own)
+    pixels = np.indices(places.shape[1:])
+    lowest, highest = np.minimum(places, pixels), np.maximum(places, pixels)
     return np.asarray(np.all((lowest >= _MARGIN) & (highest <= ends - _MARGIN), axis=0))
 
 
 def _start(pair: list[Array], band: str) -> tuple[float, Array]:
-    """Translation (3, 3) of the highest correlation of two images (y, x), and that before it."""
+    """Highest correlation of two images (y, x), and its translation (3, 3)."""
     import cv2  # noqa: PLC0415  (optional: only registration needs it)
 
     matrix, correlation = np.eye(3), 0.0
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
     everywhere = np.ones(pair[0].shape, dtype=np.uint8)
     for share in _BLURS:
-        one, two = (gaussian_filter(it, share * it.shape[0]).astype(np.float32) for it in pair)
+        reference, target = (
+            gaussian_filter(it, share * it.shape[0]).astype(np.float32) for it in pair
+        )
         start = matrix[:2].astype(np.float32)
         try:
             correlation, matrix[:2] = cv2.findTransformECC(
-                one, two, start, cv2.MOTION_TRANSLATION, stop, everywhere, 1
+                reference, target, start, cv2.MOTION_TRANSLATION, stop, everywhere, 1
             )
         except cv2.error as error:
             raise ValueError(

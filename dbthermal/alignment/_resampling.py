@@ -11,16 +11,10 @@ from dbthermal._arrays import Array, Mask
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _views as views
-from dbthermal.alignment._offset import (
-    SEARCH,
-    noise_levels,
-    require_one_clock,
-    sample,
-    time_offset,
-)
+from dbthermal.alignment._offset import SEARCH, noise_levels, require_one_clock, sample, time_offset
 from dbthermal.alignment._views import Movie
 
-STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
+STEP: Final = 5.0  # standard deviations of noise of a step between two frames
 
 
 def on_one_clock(
@@ -33,10 +27,7 @@ def on_one_clock(
     lazy: bool = False,
     steps: float = STEP,
 ) -> xr.Dataset:
-    """Registered views on one clock, see `align`; of other steps [standard deviation of noise].
-
-    Means over pixels have less noise, but step no less where something passes.
-    """
+    """Registered views on one clock, see `align`; `steps` [standard deviation of noise]."""
     names = [str(name) for name in corrected["band"].values]
     counts, alike = corrected["counts"], corrected
     if reflection_shift is not None:
@@ -49,9 +40,13 @@ def on_one_clock(
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
         pair = [0, band]
         require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
+    # The clock of the noisiest band, relative to its signal.
     noise, relative = noise_levels(signals, stamps)
-    reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
+    if clock is not None and clock not in names:
+        raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
+    reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
+    # Plan the interpolation of each band, and how it reduces noise.
     plans, factors, missing = [], np.ones(len(names)), _missing(counts)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
@@ -73,9 +68,10 @@ def on_one_clock(
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
+    # Warn of bands of which no frame is left.
     rule = f"at offsets of {offsets.tolist()} s: are they in seconds, do the recordings overlap?"
-    apart = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
-    gone = [name for name, away in zip(names, apart, strict=True) if away]
+    outside = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
+    gone = [name for name, away in zip(names, outside, strict=True) if away]
     result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
     if "noise_factor" in corrected:
         factors = factors * corrected["noise_factor"].values
@@ -93,8 +89,8 @@ def _offsets(
 ) -> Array:
     """Offset of each band against the first [s]."""
     if offset is None:
-        found = [time_offset(corrected, band=name, search=search) for name in names[1:]]
-        return np.array([0.0, *found])
+        measured = [time_offset(corrected, band=name, search=search) for name in names[1:]]
+        return np.array([0.0, *measured])
     if isinstance(offset, xr.DataArray):
         values = schema.band_values(offset, names, "the time offset", "s")
     else:
@@ -111,30 +107,24 @@ def _offsets(
     return values
 
 
-def _place(clock: str, names: list[str]) -> int:
-    if clock not in names:
-        raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
-    return names.index(clock)
-
-
 def _largest(noise: float, movie: Movie) -> float:
-    """Largest step [count] of so much noise: a difference less the mean of its two neighbours."""
+    """Largest step [count] of this noise: a difference less the mean of its two neighbours."""
     rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
     return float(np.sqrt(3.0) * noise + rounding)
 
 
 def _missing(films: xr.DataArray) -> Mask:
     """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
-    parts = [
+    blocks = [
         [clocks.missing(views.single(movie)) for movie in films.isel(y=rows).values]
         for rows in _rows.blocks(films.shape)
     ]
-    return np.asarray(np.all(parts, axis=0))
+    return np.asarray(np.all(blocks, axis=0))
 
 
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
     """Capture with the aligned counts at the times of the reference."""
-    old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
+    old = [name for name, variable in corrected.data_vars.items() if "time" in variable.dims]
     result = corrected.drop_vars(set(old) - {"counts", "segment"})
     result = result.assign(counts=aligned.variable.copy(deep=False))
     attrs = schema.STAGES["corrected"]["counts"].attrs

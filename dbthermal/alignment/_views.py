@@ -25,14 +25,13 @@ MAP: Final = schema.Variable(
 """Transform of a curved surface: for each band where each pixel of the first view lies in it."""
 
 TAPS: Final = 6  # pixels a side that a sample between pixels is made of
-_ROUNDING: Final = 1e-7  # a weight that is none [1]
-_BEYOND: Final = 0.1  # so far outside the centre of the last pixel its line still holds [pixel]
-# A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
-_DIGITS: Final = 9
+_ROUNDING: Final = 1e-7  # weights that are rounding [1]
+_BEYOND: Final = 0.1  # distance from the last pixel's centre at which its line holds [pixel]
+_DIGITS: Final = 9  # of a rounded position, so that a border met exactly counts [pixel]
 
 
 def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) -> xr.Dataset:
-    """Capture with all views on the first one's grid, each band on its own clock, see `align`."""
+    """Capture with all views on the first one's grid, each band on its own clock."""
     result, shares = moved(corrected, _maps(transform, corrected), lazy=lazy)
     factors = shares * (corrected["noise_factor"].values if "noise_factor" in corrected else 1.0)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
@@ -47,64 +46,66 @@ def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) ->
 
 
 def moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[xr.Dataset, Array]:
-    """All views, and the status, at other rows and columns; factor of each one's noise (band)."""
+    """Views and status at other rows and columns, and the factor of each band's noise."""
     counts, status = corrected["counts"], corrected.get("status")
     flags = np.zeros(counts.shape[2:], dtype=np.uint8) if status is None else status.values
     weights = [_weights(places, flags > 0) for places in maps]
 
     def views(rows: slice) -> Movie:
-        """Some rows of all bands."""
-        parts = [_warped(view, part, rows) for view, part in zip(counts, weights, strict=True)]
-        return np.stack(parts)
+        """Rows of all bands."""
+        warped_views = [
+            _warped(view, matrix, rows) for view, matrix in zip(counts, weights, strict=True)
+        ]
+        return np.stack(warped_views)
 
     warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
     result = corrected.assign(counts=warped)
     if status is not None:
         result = result.assign(status=status.copy(data=_warped_status(flags, weights)))
-    # Independent noises of the pixels that a sample is made of: root mean square over the image.
-    squares = [(part**2).sum(axis=1)[np.diff(part.indptr) > 0] for part in weights]
-    return result, np.sqrt([np.mean(part) if part.size else 1.0 for part in squares])
+    # Root mean square over the image, for pixels of independent noise.
+    squares = [(matrix**2).sum(axis=1)[np.diff(matrix.indptr) > 0] for matrix in weights]
+    return result, np.sqrt([np.mean(matrix) if matrix.size else 1.0 for matrix in squares])
 
 
 def reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
-    """Rows and columns (2, y, x) in each band of one reflection; NaN where it is not known."""
+    """Rows and columns (2, y, x) of one reflection in each band; NaN where it is unknown."""
     field = laid_on(field, corrected, "the reflection shift", "the capture")
-    here = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
-    place = here + field["shift"].where(field["known"]).transpose("axis", "y", "x").values
+    pixels = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
+    place = pixels + field["shift"].where(field["known"]).transpose("axis", "y", "x").values
     reference = str(field.attrs["reference_band"])
-    return [place if str(band) == reference else here for band in corrected["band"].values]
+    return [place if str(band) == reference else pixels for band in corrected["band"].values]
 
 
 def interpolation(places: Array, taps: int) -> csr_array:
     """Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
 
-    Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
-    what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
-    90 %. A place without so many has no weights, but for `_BEYOND`.
+    Of Lagrange polynomials through `taps` neighbours a side: half-way between pixels 6 of them keep
+    95 % of a wave of four pixels and 99.7 % of seven, lines keep 71 and 90 %. A place without so
+    many neighbours has no weights, but for `_BEYOND`.
     """
-    shape, inside, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
+    shape, complete, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        here, first, weight = lagrange(place, size, taps)
-        inside &= here
+        within, first, weight = lagrange(place, size, taps)
+        complete &= within
         factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
     (down, row), (right, column) = factors
     weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
     pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
-    kept = inside[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
+    kept = complete[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
     ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
-    return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
+    return csr_array((weight[kept], pixel[kept], ends), shape=(complete.size, complete.size))
 
 
 def lagrange(place: Array, size: int, taps: int) -> tuple[Mask, npt.NDArray[np.int32], Array]:
-    """Places on a line of a size [pixel] with so many neighbours, the first, and all weights."""
+    """Positions with enough neighbours on a line of pixels, the first one, and all weights."""
     nodes = np.arange(taps)
     spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
-    inside = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
-    here = np.where(inside, place, 0.0)
-    first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
-    away = (here - first)[:, np.newaxis] - nodes
-    others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
-    return inside, first.astype(np.int32), np.prod(others / spacing, axis=2)
+    complete = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
+    position = np.where(complete, place, 0.0)
+    first = np.clip(np.floor(position) - (taps // 2 - 1), 0, size - taps)
+    away = (position - first)[:, np.newaxis] - nodes
+    factors = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
+    return complete, first.astype(np.int32), np.prod(factors / spacing, axis=2)
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
@@ -129,8 +130,8 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
     """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
     names = [str(name) for name in corrected["band"].values]
     shape = corrected["counts"].shape[2:]
-    given = schema.check_numbers(transform, "transform")
-    expected = MAP if "axis" in given.dims else TRANSFORM
+    array = schema.check_numbers(transform, "transform")
+    expected = MAP if "axis" in array.dims else TRANSFORM
     schema.check_variable(transform, expected, "the transform")
     values = transform.values[schema.band_positions(transform, names, "the transform")]
     if expected is MAP:
@@ -154,7 +155,7 @@ def _weights(places: Array, bad: Mask) -> csr_array:
     fine = interpolation(places, TAPS)
     near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
     coarse = interpolation(places, 2)
-    keep, swap = (diags_array(part.astype(np.float32)) for part in (~near, near))
+    keep, swap = (diags_array(rows.astype(np.float32)) for rows in (~near, near))
     result = csr_array(keep @ fine + swap @ coarse)
     result.eliminate_zeros()  # for a weight of 0 would pass a NaN on
     return result
@@ -164,16 +165,16 @@ def _warped(view: xr.DataArray, weights: csr_array, rows: slice) -> Movie:
     """Some rows (time, y, x) of the first view's pixels; NaN outside the view."""
     height, width = view.shape[1:]
     top, end, _ = rows.indices(height)
-    part = csr_array(weights[top * width : end * width])
+    block = csr_array(weights[top * width : end * width])
     result = np.full((len(view), end - top, width), np.nan, dtype=np.float32)
-    if part.nnz == 0:
+    if block.nnz == 0:
         return result
-    first, last = part.indices.min() // width, part.indices.max() // width
-    part = csr_array(part[:, first * width : (last + 1) * width])
+    first, last = block.indices.min() // width, block.indices.max() // width
+    block = csr_array(block[:, first * width : (last + 1) * width])
     frames = single(view.isel(y=slice(first, last + 1)).values)
-    inside = np.diff(part.indptr).reshape(end - top, width) > 0
+    covered = np.diff(block.indptr).reshape(end - top, width) > 0
     for frame, out in zip(frames, result, strict=True):
-        out[inside] = (part @ frame.ravel()).reshape(inside.shape)[inside]
+        out[covered] = (block @ frame.ravel()).reshape(covered.shape)[covered]
     return result
 
 
@@ -182,6 +183,6 @@ def _warped_status(flags: npt.NDArray[Any], weights: Sequence[csr_array]) -> npt
     result = np.zeros_like(flags)
     for value in np.unique(flags[flags > 0]):
         bad = (flags == value).ravel().astype(np.float32)
-        for part in weights:
-            result[(abs(part) @ bad).reshape(flags.shape) > 0] |= value
+        for matrix in weights:
+            result[(abs(matrix) @ bad).reshape(flags.shape) > 0] |= value
     return result

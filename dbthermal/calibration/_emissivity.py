@@ -1,8 +1,8 @@
 """Emissivity of a material by contact thermometry, with a reflected blackbody or a foil.
 
-Every method fits, by generalised least squares, :math:`I_i - W_{b,i} = e (W_{o,i} - W_{b,i})` with
-the counts I of the material, the signal :math:`W_o` of a blackbody at its temperature, and the
-reflected signal :math:`W_b`. Both sides have errors, some of them common to all measurements.
+Generalised least squares of :math:`I_i - W_{b,i} = e (W_{o,i} - W_{b,i})`, with counts I, blackbody
+signal :math:`W_o` at the object's temperature and reflected signal :math:`W_b`, all with errors,
+some of them common to all measurements.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ _BEYOND: Final = 3.0  # standard deviations by which an emissivity may lie outsi
 class Bias:
     r"""Errors that all readings of one series have in common, each uniform in a range.
 
-    A range's middle is corrected for, and its standard deviation, the width over :math:`\sqrt{12}`,
-    is carried into the result (JCGM 100:2008, Guide to the expression of uncertainty, 4.3.7).
+    The middle of a range is corrected for; its standard deviation, the width over
+    :math:`\sqrt{12}`, is part of the result's (JCGM 100:2008, 4.3.7).
 
     Attributes
     ----------
@@ -84,11 +84,7 @@ class Bias:
         return self.air_temperature + (reading - self.air_temperature) / self._felt
 
     def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
-        """Errors of the object's signal [count]: independent (n), and common (2, n).
-
-        Of n measurements at corrected temperatures [K], for a standard deviation of one reading
-        [K]; the common ones by the offset and by the contact error.
-        """
+        """Errors of the object's signal [count]: independent (n), and common ones (2, n)."""
         # dT = dR / (1 - m) + (T - T_a) dm / (1 - m), and dW = U'(T) dT.
         scale = curve.count_slope(temperature) / self._felt
         contact = _uniform_std(self.contact) * (temperature - self.air_temperature)
@@ -144,21 +140,12 @@ class _Signals(NamedTuple):
         return self.counts - self.reflected.values
 
     def weighted(self, emissivity: float, values: Array) -> Array:
-        """Inverse covariance of the residual y - e x, times values (n).
-
-        The covariance is diagonal but for the few common errors F (term, n), which the Woodbury
-        identity inverts: (D + F'F)^-1 v = v/D - (F/D)' (1 + F (F/D)')^-1 F (v/D).
-        """
-        reflectivity = 1.0 - emissivity
-        # D = s_I^2 + e^2 s_o^2 + (1 - e)^2 s_b^2.
-        readings = (emissivity * self.emitted.std) ** 2 + (reflectivity * self.reflected.std) ** 2
-        variance = self.noise**2 + readings
-        common = np.concatenate(
-            [emissivity * self.emitted.bias, reflectivity * self.reflected.bias]
-        )
-        inner = np.eye(len(common)) + common @ (common / variance).T
-        scaled = values / variance
-        return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
+        """Inverse covariance of the residual y - e x, times values (n)."""
+        # s_I^2 + e^2 cov(W_o) + (1 - e)^2 cov(W_b)
+        covariance = self.noise**2 * np.eye(values.size)
+        for share, signal in ((emissivity, self.emitted), (1.0 - emissivity, self.reflected)):
+            covariance += share**2 * (np.diag(signal.std**2) + signal.bias.T @ signal.bias)
+        return np.asarray(np.linalg.solve(covariance, values))
 
 
 def fit_emissivity(
@@ -174,10 +161,10 @@ def fit_emissivity(
 
     .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
 
-    weighted by the covariance of both sides, of which the independent part is :math:`s_i^2 = s_I^2
-    + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the readings adds the
-    outer product of its effects [2]_; iterated in e. As both sides have errors, the differences on
-    the right are weighted as the fit adjusts them [3]_: their scatter would pass for contrast.
+    weighted by the covariance of both sides, iterated in e: the independent part :math:`s_i^2 =
+    s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2`, and for each common error the outer product
+    of its effects [2]_. The differences on the right are weighted as the fit adjusts them [3]_,
+    because their scatter would pass for contrast.
 
     Parameters
     ----------
@@ -187,8 +174,7 @@ def fit_emissivity(
     response : Dataset
         From `fit_response`, with its noise.
     reading_std : tuple of float
-        Standard deviation of one reading of the thermocouple and of the blackbody [K], independent
-        from reading to reading.
+        Standard deviation of one reading of the thermocouple and of the blackbody [K], independent.
     bias : Bias
         Errors that all readings have in common; by default none.
 
@@ -202,9 +188,8 @@ def fit_emissivity(
     ------
     TypeError, ValueError
         If an input is not as described or not finite, there are fewer than two measurements, a
-        temperature lies outside the response, object and background never differ by more than three
-        standard deviations of their difference, or a result lies outside `schema.EMISSIVITY_LIMITS`
-        by more than three of its own.
+        temperature lies outside the response, object and background differ by less than three
+        standard deviations, or a result lies outside `schema.EMISSIVITY_LIMITS` by more than three.
     ArithmeticError
         If the fit does not converge.
 
@@ -260,9 +245,8 @@ def reflector_emissivity(
     .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
               s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
 
-    Several measurements are combined by least squares with these weights. A foil reflects the whole
-    surroundings, a smooth object one direction of them: where the emissivity is low the difference
-    is taken for emission.
+    Several measurements are combined by least squares. A foil reflects the whole surroundings, a
+    smooth object one direction of them; at low emissivity the difference is taken for emission.
 
     Parameters
     ----------
@@ -271,7 +255,7 @@ def reflector_emissivity(
         measurement) [count]; `object_temperature` by contact (measurement) [K].
     reading_std : tuple of float
         Standard deviation of one reading of the contact thermometer, and of the reflected
-        temperature beyond the camera's noise, as from one part of the foil to another [K].
+        temperature beyond the camera's noise [K].
     response, bias
         As for `fit_emissivity`; the terms of the background are not used.
 
@@ -318,7 +302,7 @@ def reflector_emissivity(
 def _readings(
     measured: xr.Dataset, stage: str, reading_std: tuple[float, float], bias: Bias
 ) -> tuple[Array, Array]:
-    """Corrected object temperature (measurement) [K], and the two deviations of a reading [K]."""
+    """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
         if not np.all(schema.measured(variable.values)):
@@ -342,12 +326,12 @@ def _bands(
     return bands
 
 
-def _require_contrast(difference: Array, stds: Array, beside: str) -> None:
-    """Refuse temperatures that differ by less than the readings resolve, or are NaN."""
+def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
+    """Refuse temperatures that differ by less than the readings resolve."""
     contrast, least = np.abs(difference).max(), 3.0 * float(np.hypot(*stds))
     if not contrast > least:
         raise ValueError(
-            f"Invalid contrast {contrast} K between object and {beside}. Must exceed {least} K, "
+            f"Invalid contrast {contrast} K between object and {partner}. Must exceed {least} K, "
             "three standard deviations of the difference, in some measurement."
         )
 
@@ -369,8 +353,7 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
     x, y = signals.x, signals.y
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
-        # Scatter of the readings would pass for contrast and pull the slope down: York et al.
-        # (2004) weigh by the abscissa as the fit adjusts it,
+        # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,
         # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
         weighted = signals.weighted(emissivity, y - emissivity * x)
         adjusted = x + emissivity * signals.emitted.covariance(weighted)

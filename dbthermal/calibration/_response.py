@@ -23,26 +23,24 @@ MINIMUM_TEMPERATURES: Final = 4
 """Fewest blackbody temperatures: the Sakuma-Hattori curve has four parameters."""
 
 TEMPERATURE_STD: Final = 0.1
-"""Standard deviation of a blackbody's temperature about its reading [K], as of an area blackbody
-or a calibrated thermocouple on it."""
+"""Standard deviation of the temperature of an area blackbody about its reading [K]."""
 
 NO_BARS: Final = "maker's constants, without error bars"
 """Attribute ``calibration`` of a response, and of what is made with it."""
 
-# Range of the curve's mean wavelength A + B / T at the middle temperature: a known band's edges,
-# wider by this factor (a real detector is no top hat), or else all of the thermal infrared.
+# Range of the curve's mean wavelength A + B / T: the band's edges, wider by a factor because a
+# detector is no top hat; the thermal infrared for an unknown band.
 _WAVELENGTH_MARGIN: Final = 1.2
 _THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
-# Range of its relative growth A T / (A T + B): 1 at a single wavelength, 0.94 in 8-14 um, 0.65 in
-# 3-14 um; more than 1 in no band, but for the little that a detector is not linear.
+# Range of A T / (A T + B): 1 at one wavelength, 0.94 in 8-14 um, 0.65 in 3-14 um; above 1 only by
+# the nonlinearity of a detector.
 _GROWTH: Final = (0.6, 1.1)
 _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
-_FALSE_ALARM: Final = 1e-4  # good counts are refused once in so many sweeps
+_FALSE_ALARM: Final = 1e-4  # share of good sweeps that are refused
 _FALLING: Final = 5.0  # standard deviations of a difference by which noise may let counts fall
-_QUIETER: Final = 0.5  # NETD relative to a containing band's, below which bands may be exchanged
+_QUIETER: Final = 0.5  # NETD over a containing band's, below which the bands may be exchanged
 _ROUNDING: Final = 1.0 / 12.0  # variance of rounding to whole counts [count^2]
-# Points at which a maker's curve is fitted over the camera's range, and its largest error [K].
-_POINTS, _LARGEST_ERROR = 64, 0.2
+_POINTS, _LARGEST_ERROR = 64, 0.2  # of a fit to a maker's curve: temperatures, error [K]
 
 
 def fit_response(
@@ -56,13 +54,17 @@ def fit_response(
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
     the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
-    eliminated [2]_; A and B are found by nonlinear least squares, within what a blackbody can give
-    in the band: the mean wavelength A + B / T lies in it.
+    eliminated [2]_; A and B are found by nonlinear least squares, with the mean wavelength
+    A + B / T within the band.
 
-    The n residuals r of each band are held against what noise s, rounding and the blackbody's own
-    error explain. If they are that, then at most once in 1e4 sweeps
+    Counts are refused whose n residuals r are larger than noise s, rounding and the error of the
+    blackbody explain, of good counts once in 1e4 sweeps:
 
     .. math:: \sum_T r^2 > \left( s^2 + \tfrac{1}{12} + (a \, s_T)^2 \right) \chi^2_{n-2}
+
+    TypeError or ValueError if an input is not as described, a value is NaN, or the counts follow no
+    Planck curve, as of a camera that saturates, changes its range, or gives counts linear in
+    temperature. The error names the temperature
 
     Parameters
     ----------
@@ -70,9 +72,8 @@ def fit_response(
         Mean counts (band, temperature) [count] of a blackbody, `temperature` [K] increasing, at
         least four.
     noise : DataArray, optional
-        Standard deviation of one pixel's counts from frame to frame, (band) [count]. The response
-        then has it, and its NETD. Without it the counts are taken for means of so many samples
-        that their noise is none.
+        Standard deviation of one pixel's counts from frame to frame, (band) [count], for `noise`
+        and NETD of the response. Without it the counts have no noise but rounding.
     temperature_std : float
         Standard deviation of the blackbody's temperature from reading to reading, s_T [K].
 
@@ -91,13 +92,6 @@ def fit_response(
     UserWarning
         If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
         then their names or files may be exchanged.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as
-        where a camera saturates, changes its range, or gives counts linear in temperature: the
-        error names the temperature that is off the curve of the others, if it is one.
 
     References
     ----------
@@ -131,6 +125,7 @@ def fit_response(
     if noise is not None:
         noises = schema.band_values(noise, names, "the noise", "count")
         planck.require_positive("noise [count]", noises)
+    # Fit curve and line of each band, and refuse counts that follow no Planck curve.
     curves, lines = [], []
     for name, row, std in zip(names, values, noises, strict=True):
         line = _line(temperature, row)
@@ -143,6 +138,7 @@ def fit_response(
         lines.append(line)
     attrs = {"units": "K", "long_name": "blackbody temperature"}
     result = _response(curves, lines).assign_coords(temperature=("temperature", temperature, attrs))
+    # Keep the measured counts with the residuals of both fits.
     result["counts"] = (("band", "temperature"), values, {"units": "count"})
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
         fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
@@ -152,6 +148,7 @@ def fit_response(
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
     if noise is None:
         return result
+    # Noise in kelvin at the reference temperature.
     netd = noises / np.array([curve.reference_slope for curve in curves])
     result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
     return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
@@ -233,6 +230,7 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     lowest, highest = max(low for low, _ in ranges), min(high for _, high in ranges)
     if not lowest < highest:
         raise ValueError(f"Invalid ranges {ranges} K of the bands {[*files]}. Must overlap.")
+    # Fit the form to the maker's curve over the shared range.
     temperature = np.linspace(lowest, highest, _POINTS)
     error, curves, lines = 0.0, [], []
     for band, attrs in files.items():

@@ -18,7 +18,7 @@ from dbthermal.correction._nonuniformity import (
 )
 from dbthermal.correction._pixels import mark_bad
 from dbthermal.correction._shutter import find_shutter, mark_shutter
-from dbthermal.correction._temporal import lag_coefficients, undo_drift, undo_lag
+from dbthermal.correction._temporal import undo_drift, undo_lag
 
 __all__ = [
     "DETECTOR_MAXIMUM",
@@ -29,7 +29,6 @@ __all__ = [
     "corrected_by_camera",
     "find_shutter",
     "fit_correction",
-    "lag_coefficients",
     "mark_bad",
     "mark_shutter",
     "renew_offset",

@@ -1,4 +1,4 @@
-"""All corrections of a capture, in the one order in which they are right."""
+"""Every correction of a raw capture, in order."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ from dbthermal.correction._temporal import undo_drift, undo_lag
 def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
     """State that each camera corrects gain and offset of its pixels itself.
 
-    Nothing in the counts proves it: of a camera that does not, each pixel would be off by kelvins.
+    The counts cannot prove it: without a correction each pixel would be off by kelvins.
 
     Parameters
     ----------
@@ -55,22 +55,19 @@ def correct_capture(
     drift_reference: xr.DataArray | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
-    """Raw capture to corrected counts with a status: every correction, in the right order.
+    """Correct a raw capture: gain, offset, shutter events, lag, bad pixels and drift, in order.
+
+    1. `find_shutter` on raw counts, in which a repeated frame is an exact copy; frames recorded as
+       closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added.
+    2. `renew_offset` and `correct`, while the limits of the detector still hold for each sample.
+    3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN.
+       Pixels whose raw counts heap on one level are saturated, those that repeat their counts for
+       longer than noise does are frozen.
+    4. `undo_lag`, after 3, because a repeated frame says nothing of the pixel's past.
+    5. `mark_bad`: pixels that are noisy, stuck or jump, in units of this capture's noise.
+    6. `undo_drift` last, so that no bad pixel is part of the reference patch.
 
     TypeError or ValueError if capture or correction is not of its stage, and as the steps.
-
-    1. `find_shutter` on the raw counts, where a frame that the camera repeats is an exact copy; the
-       bit `schema.SHUTTER_CLOSED` of recorded `frame_flags` adds those that the camera reports.
-    2. `renew_offset` and `correct`: gain and offset of each pixel, saturated and dead pixels. The
-       limits of the detector hold for raw counts, so this comes before anything mixes frames.
-    3. `mark_shutter`: repeated and closed frames become NaN, and so do frames without an exposure
-       time, which are damaged; `segment` counts the events. In what is left a pixel is saturated
-       too, if its highest or lowest raw counts heap on one level, and frozen if it repeats its
-       counts for longer than its noise does.
-    4. `undo_lag`, only now: a repeated frame says nothing of the pixel's past. With constant gain
-       and offset the order of 2 and 4 does not matter, for the weights of the lag add up to one.
-    5. `mark_bad`: pixels that are noisy, stuck or jump in this capture, in units of its own noise.
-    6. `undo_drift` last, so that no bad pixel is part of the reference patch.
 
     Parameters
     ----------
@@ -78,32 +75,28 @@ def correct_capture(
         Stage `capture` of `schema`, raw: `counts` (band, time, y, x) [count], uint16; optionally
         `frame_flags` and `exposure_time` (band, time), as recorded.
     correction : Dataset
-        From `fit_correction`, or `corrected_by_camera` where no file of gain and offset is needed,
-        or `gain` [1], `offset` [count] and `bad` (bool) of your own, each (band, y, x); it may hold
-        more bands.
+        From `fit_correction` or `corrected_by_camera`, or your own `gain` [1], `offset` [count] and
+        `bad` (bool), each (band, y, x); it may hold more bands.
     flat : DataArray, optional
-        Mean raw frames (band, y, x) [count] of a uniform view, taken before the capture: they renew
-        the offsets.
+        Mean raw frames (band, y, x) [count] of a uniform view before the capture, for new offsets.
     shutter : bool
         False if no camera had a shutter, and no frame was lost.
     time_constant : float or DataArray, optional
-        Thermal time constant of the pixels [s], of all bands or (band). By default the lag is left.
+        Thermal time constant of the pixels [s], of all bands or (band); by default no correction.
     bad_pixels : float, optional
-        Limit of the robust z-score of noise and jumps [1]; None leaves the bad pixels of the
-        correction only, as in a capture of fewer than 16 frames.
+        Limit of the robust z-score of noise and jumps [1]; None for the bad pixels of the
+        correction only, as for a capture of fewer than 16 frames.
     drift_reference : DataArray, optional
-        True on a patch of constant temperature in view, (y, x), bool. By default the common drift
-        is left.
+        True on a patch of constant temperature, (y, x), bool; by default no correction.
     lazy : bool
-        Compute the counts when they are read, some rows at a time and each time anew: those of a
-        long capture need twice the memory of the raw ones, which may be lazy too.
+        Compute the counts anew whenever rows of them are read, for captures larger than memory.
 
     Returns
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
         measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]; `pattern_std`
-        (band) [count], as from `correct`. Attributes: those of the steps; ``shutter_events``
+        (band) [count]. Attributes: those of the steps; ``shutter_events``
         (renewals of the offsets), ``frames_taken_out`` (set to NaN, by band), and
         ``shutter_closed_frames`` (recorded as closed, by band; -1 without `frame_flags`).
 
@@ -135,12 +128,13 @@ def correct_capture(
     if not isinstance(shutter, bool | np.bool_):
         raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
     closed = _closed(capture)
+    # Steps 1 and 2: shutter events, new offsets.
     events = find_shutter(capture, closed=closed) if shutter else None
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
 
     def measured(rows: slice) -> xr.Dataset:
-        """Steps of some rows that need no others."""
+        """Correct some rows, in the steps that need no other rows."""
         corrected = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
         corrected = _without_damaged(
             corrected if events is None else mark_shutter(corrected, events)
@@ -158,13 +152,13 @@ def correct_capture(
 
 
 def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
-    """All rows of a function of some, block by block; the counts are left to be computed."""
+    """Correct block by block of rows, with counts that are computed when they are read."""
     blocks = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
     whole = xr.concat(blocks, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
         squares = np.array([block["pattern_std"].values ** 2 for block in blocks])
-        finite = squares[np.isfinite(squares).all(axis=1)]  # not of a border without a good pixel
+        finite = squares[np.isfinite(squares).all(axis=1)]  # blocks with a good pixel
         if len(finite):
             whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)

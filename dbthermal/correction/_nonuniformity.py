@@ -1,8 +1,7 @@
-"""Non-uniformity correction (NUC): a gain and an offset for each pixel, and its bad pixels.
+"""Non-uniformity correction (NUC): gain, offset and bad pixels from views of a blackbody.
 
-By the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: a blackbody fills the
-view at several temperatures, and each pixel is brought to the frame's mean by least squares. A bad
-pixel is marked, never filled from its neighbours, which would look like a measurement.
+By the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334. A bad pixel is marked,
+never filled from its neighbours, which would look like a measurement.
 """
 
 from typing import Any, Final
@@ -26,9 +25,9 @@ OUTLIER: Final = 6.0
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "by_camera"}
 _PARAMETERS |= {"offset_renewed"}
 _PATTERN = {"offset_std", "gain_std", "centre"}
-_PASSES, _LEVELS = 2, 65536  # about as many samples of a band tell its levels
-# Below this a difference between pixels is rounding, and no pixel is an outlier [count].
-_ROUNDING = 0.01
+_PASSES = 2  # fits of the mean, of which the first finds the outliers
+_LEVELS = 65536  # samples of a band, about, for the levels of a capture
+_ROUNDING = 0.01  # differences between pixels that are rounding [count]
 
 
 def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
@@ -49,12 +48,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
-        [count], the standard deviation of one sample.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, or they hold NaN or do not vary.
+        [count], the standard deviation of one sample. TypeError or ValueError if the movies hold
+        NaN or do not vary.
 
     Examples
     --------
@@ -74,11 +69,12 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     frames = counts.sizes["frame"]
     if frames < 2:
         raise ValueError(f"Invalid movies of {frames} frame. Must have at least 2, for the noise.")
-    # Half the mean square of the frames' differences, (band, temperature and pixel).
+    # Variance of one sample: half the mean square of the differences, (band, temperature, pixel).
     variance = np.empty((*counts.shape[:2], *counts.shape[3:]))
     for place in np.ndindex(*counts.shape[:2]):
         movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
         variance[place] = 0.5 * np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
+    # Median over pixels and temperatures, over that of the chi-square distribution.
     variance = variance.reshape(len(variance), -1)
     freedom = 2 * (frames - 1) ** 2 / (3 * (frames - 1) - 1)
     noise = np.sqrt(np.median(variance, axis=1) * freedom / chdtri(freedom, 0.5))
@@ -115,6 +111,10 @@ def fit_correction(
     with c the mean level and v the variance of a mean about the fit: over n - 2 degrees of freedom
     of n temperatures, or, of two temperatures, that of the noise over the number of frames.
 
+    TypeError or ValueError if there are fewer than two temperatures, threshold or `maximum` are out
+    of range, no more than half of the pixels of a band are usable, or the mean does not rise with
+    temperature.
+
     Parameters
     ----------
     blackbody : Dataset
@@ -135,12 +135,6 @@ def fit_correction(
         `calibration.fit_response`; `offset_std` [count], `gain_std` [1] and `centre` [count]
         (band), the deviations above and c, but not of two temperatures without noise. Bad pixels
         have gain 1 and offset 0: their counts pass unchanged.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two temperatures, threshold or `maximum` are out of range, no more
-        than half of the pixels of a band are usable, or the mean does not rise with temperature.
 
     Examples
     --------
@@ -164,11 +158,17 @@ def fit_correction(
     _numbers.real_numbers("temperature [K]", counts["temperature"].values, _numbers.KELVIN)
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
-    image = (counts.sizes["y"], counts.sizes["x"])
-    fits = []
-    for band in counts:
-        frames = band.values.astype(np.float64).reshape(-1, image[0] * image[1])
-        fits.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
+    image = counts.shape[2:]
+    # Fit each band by itself.
+    fits = [
+        _fit_band(
+            band.values.astype(np.float64).reshape(len(band), -1),
+            str(band["band"].item()),
+            threshold,
+            maximum,
+        )
+        for band in counts
+    ]
     gain, offset, bad, residual, level = (np.stack(values) for values in zip(*fits, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
     values = {name: values.reshape(-1, *image) for name, values in maps.items()}
@@ -189,6 +189,9 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's. The attribute ``offset_renewed`` is 1.
 
+    TypeError or ValueError if bands or pixels are not the same, or a good pixel is not finite or
+    its gain not positive.
+
     Parameters
     ----------
     correction : Dataset
@@ -196,11 +199,6 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     flat : DataArray
         Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
         camera's shutter, of the bands of the correction.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If bands or pixels are not the same, or a good pixel is not finite or its gain not positive.
     """
     _require_rising(_checked(correction))
     schema.check_numbers(flat, "the flat image", "count")
@@ -215,6 +213,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     corrected = (
         correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
     )
+    # Offsets that bring every good pixel to the mean.
     level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
     offset = np.where(good, correction["offset"].values - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
@@ -230,6 +229,9 @@ def correct(
     capture: xr.Dataset, correction: xr.Dataset, *, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
     """Apply gain and offset to a capture, and mark its bad and saturated pixels.
+
+    TypeError or ValueError if the capture is not uint16 or was corrected before, `maximum` is out
+    of range, or the correction lacks a band, is not finite, or is of other pixels.
 
     Parameters
     ----------
@@ -249,12 +251,6 @@ def correct(
         has its deviations, root mean square over the levels of the capture. Attributes:
         ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
         (``gain_offset_...``), and the numbers of marked pixels.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not uint16 or was corrected before, `maximum` is out of range, or the
-        correction lacks a band, is not finite, or is of other pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):
@@ -262,6 +258,7 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
+    # Apply gain and offset, one band at a time: no second movie in memory.
     maps = _maps(correction, counts)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -272,6 +269,7 @@ def correct(
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
         saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
+    # Flags, pattern and attributes.
     bad = maps["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(
@@ -290,7 +288,7 @@ def correct(
 
 
 def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> dict[str, Array]:
-    """Deviations of offset and gain that the fit leaves, and their centre, see `fit_correction`."""
+    """Deviations of offset and gain about the centre of the levels, see `fit_correction`."""
     number, centre = level.shape[1], level.mean(axis=1)
     if number > 2:
         variance = residual**2 * number / (number - 2)
@@ -304,10 +302,7 @@ def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> d
 
 
 def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr.DataArray:
-    """Deviation (band) [count] that a correction leaves at the levels of good pixels (y, x).
-
-    NaN without any of these, as in the rows of a border.
-    """
+    """Deviation (band) [count] of the pattern at the levels of good pixels; NaN of none."""
     names = [str(name) for name in counts["band"].values]
     places = schema.band_positions(correction, names, "the correction")
     offset, gain, centre = (
@@ -326,9 +321,10 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
 def _fit_band(
     frames: Array, band: str, threshold: float, maximum: int
 ) -> tuple[Array, Array, Mask, float, Array]:
-    """Gain, offset, bad, residual and level of one band, from frames (temperature, pixel)."""
-    good = np.all((frames > 0) & (frames < maximum), axis=0)  # false for NaN
-    frames = np.where(good, frames, 0.0)  # bad pixels enter neither mean nor fit
+    """Fit gain, offset, bad pixels, residual, level of a band to frames (temperature, pixel)."""
+    # Saturated and dead pixels enter neither mean nor fit; NaN is saturated.
+    good = np.all((frames > 0) & (frames < maximum), axis=0)
+    frames = np.where(good, frames, 0.0)
     good &= np.ptp(frames, axis=0) > 0
     for _ in range(_PASSES):
         level = _level(frames, good, band)
@@ -362,7 +358,7 @@ def _level(frames: Array, good: Mask, band: str) -> Array:
 
 
 def _least_squares(frames: Array, level: Array) -> tuple[Array, Array, Mask]:
-    """Gain and offset (pixel) of the regression of the level on a pixel, and where it rises."""
+    """Regress the mean level on each pixel: gain, offset, and where the gain is positive."""
     centre = frames.mean(axis=0)
     deviation = frames - centre
     covariance = (level - level.mean()) @ deviation
@@ -373,7 +369,7 @@ def _least_squares(frames: Array, level: Array) -> tuple[Array, Array, Mask]:
 
 
 def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
-    """Values [count] within `threshold` robust standard deviations of the good ones' median."""
+    """Values [count] within `threshold` robust standard deviations of the good pixels' median."""
     if not good.any():
         return good
     centre = np.median(values[good])
@@ -382,14 +378,14 @@ def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
 
 
 def _checked(correction: xr.Dataset) -> xr.Dataset:
-    """Refuse what is no correction with its bad pixels."""
+    """Return a correction; ValueError if it does not mark its bad pixels."""
     if "bad" not in schema.check(correction, "correction"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
     return correction
 
 
 def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
-    """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
+    """Maps of a correction for the bands and pixels of a capture."""
     correction = laid_on(_checked(correction), counts, "the correction", "the capture")
     return _require_rising(correction[["gain", "offset", "bad"]])
 

@@ -1,7 +1,6 @@
-"""Bad pixels that only a capture shows: noisy, stuck, and those that jump by themselves.
+"""Bad pixels that only a capture shows: noisy, stuck, clipped, frozen or jumping by themselves.
 
-A blackbody finds the pixels that are bad at the time of the calibration (`fit_correction`). Some
-turn bad later, or blink (random telegraph signal) too seldom for it.
+They turned bad after the calibration, or blink (random telegraph signal) too seldom for it.
 """
 
 from typing import Final
@@ -21,17 +20,13 @@ from dbthermal.schema import Status
 
 Single = npt.NDArray[np.float32]
 
-# A pixel is held against those around it: the median of a window this wide, and the eight nearest.
-_WINDOW = 5
+_WINDOW = 5  # width of the median that gives the noise around a pixel
 _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
-# A neighbour shares a jump of which it shows this part, earlier or later by at most so many seconds
-# or, at slow frame rates, frames.
-_SHARED = 0.3
-_REACH_SECONDS = 0.2
-_REACH_FRAMES = 5
+# A neighbour with this share of a jump, earlier or later by at most so long, sees it too.
+_SHARED, _REACH_SECONDS, _REACH_FRAMES = 0.3, 0.2, 5
 _LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
-# A pattern of the detector is as strong from pixel to pixel as over two, where detail of a scene,
-# blurred by the lens, has less; warned of where it is so many times the noise of a frame [1].
+# Least ratio of the pattern over one pixel to that over two, where detail of a blurred scene has
+# less; and pattern over the noise of a frame from which a warning is given [1].
 _WHITE, _PATTERN = 0.7, 5.0
 _UNCORRECTED: Final = (
     "Fixed pattern of {} times the noise of a frame: the pixels differ from each other as without "
@@ -47,22 +42,22 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     r"""Mark pixels that are noisy, stuck or jump by themselves, in any band.
 
     Noise. A pixel's noise s is the mean magnitude of the smaller four fifths of its second
-    differences in time, so that neither object nor walkers enter. With m the median of s over 5 by
-    5 pixels, a pixel is bad whose :math:`\ln (s / m)` lies more than `threshold` robust standard
-    deviations (1.48 times the median absolute deviation over the image) off the median. A pixel
-    that never changes is bad.
+    differences in time, free of object and reflections. With m its median over 5 by 5 pixels, a
+    pixel is bad if :math:`\ln (s / m)` lies more than `threshold` robust standard deviations off
+    the median of the image, or if it never changes.
 
-    Jumps. A pixel is bad that changes from one frame to the next by more than `threshold` standard
-    deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in the
-    same direction by 0.3 of it within 0.2 s or five frames, the longer, as by someone who walks by.
-    Frames that are NaN, the steps between segments, and 0.2 s or five frames at either end do not
-    count; a jump is seen over two NaN samples of a pixel, over more it is not. A scene's detail one
-    pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked, too.
+    Jumps. A pixel is bad if it changes between two frames by more than `threshold` standard
+    deviations of a difference, :math:`\sqrt 2 m`, and no neighbour changes in the same direction by
+    0.3 of it within 0.2 s or five frames, the longer. Steps between segments and the same time at
+    either end do not count; a jump across up to two NaN samples does. Detail one pixel wide, such
+    as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
-    Pattern. What the mean picture has beside planes and edges, from one pixel to the next, is the
-    fixed pattern p of gains and offsets (by the mask of [1]_), and none, 0, where it is less than
-    0.7 of the same over two pixels, as of detail behind a lens. A UserWarning says where it is more
-    than 5 m in every segment.
+    Pattern. What the mean picture has beside planes and edges is the fixed pattern p of gains and
+    offsets (by the mask of [1]_); 0 where it is less than 0.7 of the same over two pixels, as of
+    detail behind a lens. More than 5 m in every segment give a UserWarning.
+
+    TypeError or ValueError if the threshold is not positive, or a band has fewer frames that are
+    not NaN than 16, or than 0.4 s and three frames more, or no pixel with 16 samples.
 
     Parameters
     ----------
@@ -79,12 +74,6 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         and the attributes ``noisy_pixels`` and ``jumping_pixels``, their numbers,
         ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a band, which get
         no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
-        than 0.4 s and three frames more, or no pixel with 16 samples.
 
     References
     ----------
@@ -108,7 +97,6 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     """
     counts = schema.check_corrected(corrected)["counts"]
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
-    segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
     patterns: list[float] = []
@@ -118,9 +106,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
-        segment_numbers = np.zeros(frames.size) if segment is None else segment[frames]
+        segment_numbers = schema.segments(corrected)[frames]
         movie, stepped = movie.isel(time=frames), np.diff(segment_numbers) != 0
         segments = np.unique(segment_numbers)
+        # Noise and mean picture of each pixel, block by block of rows.
         level, still = np.empty(image), np.empty((segments.size, *image))
         for rows in _rows.blocks(movie.shape, _BLOCK):
             block = _samples(movie, rows)
@@ -132,20 +121,21 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
                 f"Invalid band '{movie['band'].item()}': no pixel has "
                 f"{MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
             )
+        # Noise around each pixel.
         unjudged |= ~judged
         usual = np.where(judged, level, np.median(level[judged]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
-        noise = float(np.median(usual))  # none in counts without noise, in units of which it is
+        noise = float(np.median(usual))  # 0 of counts without noise
         patterns.append(min(map(_pattern, still)) / noise if noise > 0.0 else 0.0)
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
-    names = corrected["band"].values
-    labels = [
-        f"{pattern:.3g} in band '{name}'" for name, pattern in zip(names, patterns, strict=True)
+    strong = [
+        f"{pattern:.3g} in band '{name}'"
+        for name, pattern in zip(corrected["band"].values, patterns, strict=True)
+        if pattern > _PATTERN
     ]
-    strong = [label for label, ratio in zip(labels, patterns, strict=True) if ratio > _PATTERN]
     return warned(
         corrected.assign(status=(("y", "x"), status, schema.status_attrs())),
         *([_UNCORRECTED.format(", ".join(strong))] if strong else []),
@@ -166,7 +156,7 @@ def _mean(block: Single) -> Array:
 
 
 def _pattern(image: Array) -> float:
-    """Deviation of the fixed pattern of a picture (y, x) [count]; 0 where it may be detail."""
+    """Deviation of the fixed pattern of a picture (y, x) [count]; 0 if it may be detail."""
     scales = []
     for step in (1, 2):
         rows = image[: -2 * step] - 2.0 * image[step:-step] + image[2 * step :]
@@ -178,11 +168,10 @@ def _pattern(image: Array) -> float:
 
 def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:
     """
-    Mark pixels that are clipped at a level below the end of the raw counts, or frozen for a while.
+    Mark pixels that are clipped below the end of the raw counts, or frozen for a while.
 
-    The counts (band, time, y, x) are raw, where nothing has been rounded yet; samples that are NaN
-    in the corrected dataset, frame by frame, do not count. Frozen pixels are looked for only where
-    the frames of a closed `shutter` were taken out. See `_samples`.
+    Raw counts (band, time, y, x) are not rounded yet. Frames that are NaN in the corrected dataset
+    do not count, and frozen pixels only where frames of a closed `shutter` were taken out.
     """
     saturated, frozen = (np.zeros((raw.sizes["y"], raw.sizes["x"]), dtype=bool) for _ in range(2))
     row = corrected["counts"].isel(y=slice(1)).values  # a frame is measured as a whole
@@ -199,12 +188,10 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
 
 
 def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
-    """Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+    """Clipped and frozen pixels (y, x) of one band, from raw counts (time, y, x) of valid `frames`.
 
-    Judged are the measured frames (time).
-
-    A level on which several pixels have their highest or lowest samples is the camera's: all pixels
-    that reach it are clipped, be it once.
+    A level on which several pixels have their extreme samples is the camera's: all pixels that
+    reach it are clipped.
     """
     image = (movie.sizes["y"], movie.sizes["x"])
     middle = movie.isel(y=image[0] // 2).values
@@ -232,7 +219,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
 
 
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
-    """Positions of the frames of a band that are not NaN."""
+    """Indices of the frames of a band that are not NaN."""
     finite = np.zeros(movie.sizes["time"], dtype=bool)
     for rows in _rows.blocks(movie.shape, _BLOCK):
         finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
@@ -247,21 +234,21 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
 
 
 def _samples(movie: xr.DataArray, rows: slice) -> Single:
-    """Counts of some rows, NaN where they are no measurement."""
+    """Counts of a block of rows, NaN where they are no measurement."""
     counts = movie.isel(y=rows).values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
-    """Pixels whose noise differs from that of their surroundings by more than the threshold."""
+    """Pixels whose noise differs from that around them by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.log(level / usual)  # minus infinity where nothing changes
-    finite = np.isfinite(apart)
+        logarithm = np.log(level / usual)  # minus infinity where nothing changes
+    finite = np.isfinite(logarithm)
     if not finite.any():
         return np.asarray(level == 0)
-    centre = np.median(apart[finite])
-    scale = max(MAD * float(np.median(np.abs(apart[finite] - centre))), _ROUNDING)
-    return np.asarray((np.abs(apart - centre) > threshold * scale) | (level == 0))
+    centre = np.median(logarithm[finite])
+    scale = max(MAD * float(np.median(np.abs(logarithm[finite] - centre))), _ROUNDING)
+    return np.asarray((np.abs(logarithm - centre) > threshold * scale) | (level == 0))
 
 
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
@@ -269,6 +256,7 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
     jumping = np.zeros(limit.shape, dtype=bool)
     for rows in _rows.blocks(movie.shape, _BLOCK):
         # A row more on each side: the neighbours.
+        # Include a row of neighbours on either side.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
         changes = _changes(_samples(movie, slice(top, bottom)), stepped)
         inner = slice(rows.start - top, rows.stop - top)
@@ -279,7 +267,7 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
 
 
 def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
-    """Changes from the last valid sample, by the frame and in all, 0 where new offsets are."""
+    """Changes from the last valid sample, per frame and in total, 0 where offsets are renewed."""
     valid = np.isfinite(signal)
     if valid.all():
         change = np.diff(signal, axis=0)

@@ -1,9 +1,8 @@
-"""Shutter events and repeated frames: a camera delivers an image that it did not take.
+"""Shutter events and lost frames, for which a camera repeats an image.
 
 Every few minutes a microbolometer closes a shutter and renews its offsets (flat-field correction,
-FFC). Its driver repeats the last image meanwhile; afterwards each pixel of the band has an offset
-of its own that differs from the one before. A frame that was lost on the way is repeated, too, but
-once, and the offsets stay.
+FFC). Its driver repeats the last image meanwhile, and then each pixel has a new offset. A lost
+frame is repeated once, and the offsets stay.
 """
 
 from typing import Any, Final
@@ -18,24 +17,24 @@ from dbthermal._coordinates import laid_on
 
 Integers = npt.NDArray[np.int64]
 
-# Fewest pixels that must change in a capture for an unchanged image to be a copy.
-_MINIMUM_PIXELS: Final = 16
-# Copies from which a run is taken for the shutter's; a shorter one is of lost frames. A shutter
-# event that is missed biases the separation, lost frames that are counted as one cost it one degree
-# of freedom a band.
+_MINIMUM_PIXELS: Final = 16  # changing pixels without which an unchanged image is no copy
+# Copies in a row from which the shutter was closed; fewer are lost frames. A missed event biases
+# the separation; lost frames counted as an event cost one degree of freedom a band.
 FEWEST_COPIES: Final = 3
-_SAMPLE = 4096  # about as many pixels, on an even grid, are compared first
-# Most samples of a block of rows that is read at once.
-_BLOCK = 4_000_000
+_SAMPLE = 4096  # pixels on an even grid that are compared first
+_BLOCK = 4_000_000  # samples of a block of rows
 _EVENT = ("band", "first_frame", "frames", "renewed")
 
 
 def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -> xr.Dataset:
     """Find the runs of frames in which a band repeats its image.
 
-    A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
-    compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
-    dataset is never read at once. The search is exact only before anything is interpolated in time.
+    A frame is a copy if no pixel differs from the frame before: some thousands of pixels first,
+    then the whole image in blocks of rows. The search is exact only before anything is interpolated
+    in time.
+
+    TypeError or ValueError if `closed` is no boolean of the frames, or in a band fewer than 16 of
+    the pixels compared ever change.
 
     Parameters
     ----------
@@ -49,16 +48,9 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     Returns
     -------
     Dataset
-        A row for each run, (event): `band`; `first_frame`, position of the first frame that is no
-        measurement, and `frames`, their number; `start` and `stop`, times of the first and the last
-        of them [s]; `renewed`, true where the shutter was closed and the offsets are new, false for
-        a lost frame.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `closed` is no boolean of the frames, or in a band fewer than 16 of the pixels compared
-        ever change.
+        One row for each run, (event): `band`; `first_frame` and `frames`, position of the first
+        copy and their number; `start` and `stop`, times of the first and last copy [s]; `renewed`,
+        true after a closed shutter, whose offsets are new, false for a lost frame.
 
     Examples
     --------
@@ -90,16 +82,17 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
     """Set frames of a closed shutter or a repeated image to NaN, and number the segments.
 
-    A `segment` is the stretch between two renewals of the offsets, at which every pixel of the band
-    makes an offset step of its own, of tens of counts, which no camera reports. It is left in the
-    counts: `separation.solve` keeps it out of the object, by a free step of each pixel and band
-    wherever `segment` changes; in the background it stays. Events of two bands that overlap, or
-    follow without a frame between, are counted as one, so that cameras that fire together cost one
-    step. An event before the first or after the last valid frame makes none.
+    A `segment` is the time between two renewals of the offsets, at which every pixel of the band
+    steps by tens of counts, which no camera reports. The step stays in the counts:
+    `separation.solve` fits it in each pixel and band. Events of two bands that overlap, or follow
+    without a frame between, are one step. An event before the first or after the last valid frame
+    makes none.
 
-    An event costs accuracy, for only the object's smoothness ties the level after it to the one
-    before: beside five functions over 35 s, one step in the middle raises the standard deviation of
-    the smooth part by 1.9, two, at 11 and 24 s, by 2.7.
+    An event costs accuracy: beside five functions over 35 s, one step in the middle raises the
+    standard deviation of the smooth part by 1.9, two, at 11 and 24 s, by 2.7.
+
+    TypeError or ValueError if the counts are whole numbers, which have no NaN, the dataset was
+    marked before, or an event lacks a variable, is of no band or of frames outside the dataset.
 
     Parameters
     ----------
@@ -115,12 +108,6 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
         The dataset with NaN in place of these samples, and `segment` (time), int32 [1]: number of
         renewals of the offsets before the frame. Attributes: ``shutter_events``,
         ``repeated_frames`` (runs that renew nothing) and ``frames_taken_out`` (by band).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
-        event lacks a variable, is of no band or of frames outside the dataset.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:
@@ -131,6 +118,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     marked = np.zeros((counts.sizes["band"], frames), dtype=bool)
     for band, start, stop in zip(bands, first, after, strict=True):
         marked[band, start:stop] = True
+    # Segments begin with the first frame after each renewal.
     renewed = events["renewed"].values.astype(bool)
     within = renewed & (first > 0) & (after < frames)
     changes = _changes(first[within], after[within])
@@ -147,7 +135,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
 
 
 def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
-    """Frames (band, time) in which the shutter is known to be closed."""
+    """Frames (band, time) stated to be taken with the shutter closed."""
     shape = counts.sizes["band"], counts.sizes["time"]
     if closed is None:
         return np.zeros(shape, dtype=bool)
@@ -173,8 +161,9 @@ def _copies(counts: xr.DataArray) -> Mask:
             f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
         )
     copies = np.zeros(counts.sizes["time"], dtype=bool)
+    # Compare the whole image where the sample of pixels repeats.
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
-    if candidates.size:  # the whole of their images
+    if candidates.size:
         copies[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
         after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
@@ -228,7 +217,7 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
 
 
 def _changes(first: Integers, after: Integers) -> Integers:
-    """Fewest frames that mark all events, each between its first and its next real frame."""
+    """Fewest frames that mark all events, each in its event or at its first frame after it."""
     chosen: list[int] = []
     for place in np.argsort(after, kind="stable"):
         if not chosen or first[place] > chosen[-1]:

@@ -25,6 +25,9 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
     does not.
 
+    TypeError or ValueError if there are fewer than two frames, the lag was undone before, the
+    counts are whole numbers, or a time constant is not positive, or above 1 s.
+
     Parameters
     ----------
     corrected : Dataset
@@ -38,12 +41,6 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
         ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
         latter.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not positive, or above 1 s.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -71,17 +68,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 def lag_coefficients(
     time_constant: float | xr.DataArray, counts: xr.DataArray
 ) -> tuple[Array, Array]:
-    r"""Weights (band, time - 1) [1] of the frame before and of the new signal in a pixel that lags.
-
-    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a`, both to full precision.
-
-    Parameters
-    ----------
-    time_constant : float or DataArray
-        Time constant :math:`\tau` [s], positive and at most 1 s, of all bands or (band).
-    counts : DataArray
-        Counts (band, time, ...), whose times are taken.
-    """
+    """Weights (band, time - 1): a = exp(-dt / tau) of the frame before, 1 - a of the signal."""
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
     return np.exp(-ratio), -np.expm1(-ratio)
@@ -102,6 +89,10 @@ def undo_drift(
     / \sqrt{n N}` in N frames with K functions, at the ends: 0.11 counts for 100 pixels of 4 counts
     and 350 frames. A motion in front of the patch, or reflected in it, is taken for drift.
 
+    TypeError or ValueError if the drift was undone before, the reference marks no good pixel,
+    `order` is no whole number from 2 to that of the frames, or a part of the patch is NaN in a
+    frame.
+
     Parameters
     ----------
     corrected : Dataset
@@ -119,12 +110,6 @@ def undo_drift(
     Dataset
         The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
         and the attributes ``drift_order`` and ``drift_pixels``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the drift was undone before, the reference marks no good pixel, `order` is no whole
-        number from 2 to that of the frames, or a part of the patch is NaN in a frame.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
@@ -140,6 +125,7 @@ def undo_drift(
             f"Invalid reference: a part of it is NaN in frame {frame} of band "
             f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
         )
+    # Smooth curve of the patch, segment by segment.
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
     curves = np.stack([_smooth_change(band, segment, order) for band in level])
 

@@ -100,11 +100,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
         Noise-equivalent temperature difference in the first band [K].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the difference is not a positive number, or a band is unknown or named twice.
+        TypeError or ValueError for other bands, or an `netd` that is not positive.
 
     Examples
     --------
@@ -128,10 +124,12 @@ def rank_filters(
 ) -> xr.Dataset:
     """Filters to set beside a band, best conditioned first, by two criteria.
 
-    The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
-    its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
-    The second criterion settles it: the standard deviation of the object temperature from one
-    frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
+    The first criterion is the paper's, the lowest condition number (its section 5 says highest, a
+    slip). The second is the standard deviation of the object temperature from one frame, which
+    includes the noise of a narrow filter. Both are medians over the materials.
+
+    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`
+    and another, or the noise lacks a band, is in another unit, or is not finite and positive.
 
     Parameters
     ----------
@@ -149,12 +147,6 @@ def rank_filters(
         over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
         `lowest_condition_number` and `lowest_std` name the filter of each criterion.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as for `condition_numbers` or has no band `beside` and another, or the
-        noise lacks a band, is in another unit, or is not finite and positive.
-
     Examples
     --------
     >>> from dbthermal.emissivity import embedded_table
@@ -166,6 +158,7 @@ def rank_filters(
     [1.26, 2.34, 1.85, 2.25]
     """
     std = _single_frame_std(table, noise, beside).median("material", skipna=False)
+    # Both criteria over the materials, sorted by the first.
     pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)
     pairs = pairs.rename(second="band").sel(band=std["band"])
     result = xr.Dataset(
@@ -192,7 +185,7 @@ def _emissivities(table: xr.Dataset) -> xr.DataArray:
     return values
 
 
-def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
+def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, camera_band: str) -> xr.DataArray:
     r"""Standard deviation [K] of the object temperature from one frame (material, band).
 
     For each band m beside band 1, emissivities known, in the linear approximation,
@@ -201,15 +194,15 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     """
     values = _emissivities(table)
     names = [str(name) for name in values["band"].values]
-    if beside not in names or len(names) < 2:
-        raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
+    if camera_band not in names or len(names) < 2:
+        raise ValueError(f"Invalid bands {names}. Must hold '{camera_band}' and at least one more.")
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
-    filters = [name for name in names if name != beside]
+    filters = [name for name in names if name != camera_band]
     camera, filtered = (
-        values.sel(band=beside).values[:, np.newaxis],
+        values.sel(band=camera_band).values[:, np.newaxis],
         values.sel(band=filters).values,
     )
-    noises = std[names.index(beside)], std[[names.index(name) for name in filters]]
+    noises = std[names.index(camera_band)], std[[names.index(name) for name in filters]]
     error = np.hypot((1 - filtered) * noises[0], (1 - camera) * noises[1])
     contrast = np.abs(camera - filtered)
     return xr.DataArray(

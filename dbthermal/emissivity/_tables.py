@@ -20,19 +20,16 @@ CAMERA_BAND: Final = "8-14"
 MINIMUM_COVERAGE: Final = 0.98
 """Share of a band's blackbody radiance that a spectrum must cover [1].
 
-Of 993 library spectra 27 stop at 13.86 or 13.9 um, 0.981 to 0.986 of the band 8-14 um at 300 K,
-where what is missing can change the average by 0.019 of its own difference from it; 22 stop at
-12.5 um (0.781), whose average would be that of another band."""
+Library spectra that stop at 13.86 um cover 0.981 of 8-14 um, and the rest can change their average
+by 0.019 of its difference from it; others stop at 12.5 um (0.781)."""
 
 _TABLE = "emissivity_table.csv"
 _MIXTURE = "emissivity_mixture.csv"
-# Share of the materials that are none of the libraries' [1], and what is known of them: mean and
-# standard deviation of an emissivity, and its correlation between two bands.
+# Materials outside the libraries: share [1], mean, standard deviation of their emissivities, and
+# correlation between two bands.
 _OTHERS = (0.05, 0.7, 0.25, 0.9)
-# Step between wavelengths [m] across which a spectrum is not known; libraries have 0.1 um at most.
-_GAP = 1e-6
-# Steps on which Planck's law is integrated beside those of the spectrum, and nodes in each.
-_STEPS = 64
+_GAP = 1e-6  # step of wavelength across which a spectrum is unknown [m]; libraries have 0.1 um
+_STEPS = 64  # of the integral of Planck's law, beside those of the spectrum
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
@@ -47,9 +44,12 @@ def band_table(
 
     .. math:: e_m = \frac{\int_m e(\lambda) L(\lambda, T) d\lambda}{\int_m L(\lambda, T) d\lambda}
 
-    over the band's top hat, the spectrum taken as linear between values that are at most 1 um
-    apart. Where the spectrum does not cover the whole band, or has a wider gap in it, both
-    integrals run over the covered part, whose share is `coverage`; nothing is extrapolated.
+    over the band's top hat, linear between wavelengths at most 1 um apart. Where a spectrum has a
+    gap, or ends, both integrals run over the covered part, whose share is `coverage`.
+
+    KeyError, TypeError or ValueError if there is no spectrum or no band, a band is unknown or
+    repeats, a spectrum is not as `schema` has it or holds NaN, the temperature is outside
+    `bands.TEMPERATURE_RANGE`, or a spectrum covers less of a band than `minimum_coverage`.
 
     Parameters
     ----------
@@ -67,13 +67,6 @@ def band_table(
     Dataset
         Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
         libraries' spectra outside (0, 1] are averaged as they are.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If there is no spectrum or no band, a band is unknown or repeats, a spectrum is not as
-        `schema` has it or holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a
-        spectrum covers less of a band than `minimum_coverage`.
 
     Examples
     --------
@@ -94,6 +87,7 @@ def band_table(
         raise ValueError("Empty spectra. Must hold at least one material.")
     if not 0 < _numbers.real_number("minimum_coverage", minimum_coverage) <= 1:
         raise ValueError(f"Invalid minimum_coverage {minimum_coverage}. Must lie in (0, 1].")
+    # Average each spectrum over each band.
     whole = [float(band.radiance(temperature)) for band in chosen]
     rows = np.empty((2, len(spectra), len(chosen)))
     for row, (material, spectrum) in enumerate(spectra.items()):
@@ -150,10 +144,10 @@ def embedded_table() -> xr.Dataset:
 
 
 def library_mixture(bands: Iterable[str]) -> xr.Dataset:
-    r"""Joint distribution of the band emissivities of materials, where nothing is known of them.
+    r"""Prior of the band emissivities of an unknown material.
 
     A mixture of normal distributions over the 993 spectra of the libraries of `embedded_table`,
-    with a wide component for the one material in twenty that is assumed to be none of theirs,
+    with a wide component for materials outside the libraries, one in twenty,
 
     .. math:: p(e) = \sum_k w_k N(e; \mu_k, C_k)
 
@@ -208,7 +202,7 @@ def _packaged(name: str) -> tuple[list[str], list[texts.Row]]:
 
 
 def chosen_bands(bands: Bands) -> list[Band]:
-    """Bands, each once, from bands or names of `bands.FILTERS`; of a mapping, its values."""
+    """Bands from bands, names of `bands.FILTERS` or the values of a mapping, each once."""
     if isinstance(bands, (str, Band)):
         bands = [bands]
     listed = list(bands.values()) if isinstance(bands, Mapping) else list(bands)
@@ -244,10 +238,7 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
 def _average(
     wavelength: Array, emissivity: Array, band: Band, temperature: float, whole: float
 ) -> tuple[float, float]:
-    """Planck-weighted mean [1] of a piecewise linear spectrum, by Gauss's rule on each piece.
-
-    And the share [1] that it covers of the `whole` blackbody's radiance of the band.
-    """
+    """Planck-weighted mean [1] of a piecewise linear spectrum by Gauss's rule, and its coverage."""
     lower = max(band.lower, float(wavelength[0]))
     upper = min(band.upper, float(wavelength[-1]))
     if upper <= lower:

@@ -1,7 +1,7 @@
-"""Look around in a result, a capture or a store, in JupyterLab: pictures, regions and curves.
+"""Explore a result, a capture or a store in JupyterLab: pictures, regions and curves.
 
-Begin with `explore(result)`. `View` is what it shows, without the browser: the same frames, curves
-of a `Region` and files from Python alone, which "copy as code" writes.
+Begin with `explore(result)`. `View` has the same frames, region curves and files without a browser;
+"copy as code" writes the calls.
 """
 
 from collections.abc import Mapping
@@ -41,12 +41,12 @@ def explore(
     events: Mapping[str, float] = MappingProxyType({}),
     celsius: bool = True,
 ) -> "Explorer":
-    """Look around in a separated scene or a capture, with regions and their curves.
+    """Explore a separated scene or a capture, with regions and their curves.
 
-    Slider, arrow keys or space for the time; wheel and drag for a zoom that all pictures share;
-    rectangle, ellipse and polygon for regions, whose mean, least and greatest values are drawn with
-    the standard deviation of the mean (`View.curve`). What a pixel's status says is hatched. Where
-    no browser is, as in papermill or HTML, a picture stands in its place.
+    Slider, arrow keys or space change the time; wheel and drag zoom all pictures; rectangle,
+    ellipse and polygon make regions, whose mean, least and greatest values are drawn with the
+    standard deviation of the mean (`View.curve`). Flagged pixels are hatched. Without a browser, as
+    in papermill or HTML, a picture takes the place.
 
     nbconvert prefers a widget's saved state, which shows nothing without a kernel, to that picture,
     unless ``--NbConvertBase.display_data_priority="['image/png', 'text/html', 'text/plain']"``.
@@ -68,12 +68,7 @@ def explore(
     Returns
     -------
     Explorer
-        Shown by the notebook as the last value of a cell.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `View`.
+        Shown by the notebook as the last value of a cell. TypeError or ValueError as `View`.
 
     Examples
     --------

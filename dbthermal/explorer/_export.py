@@ -17,6 +17,7 @@ from dbthermal import figures, store
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
+from dbthermal.figures._status import first_reason
 
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
 _MOST_COLUMNS: Final = 3
@@ -65,6 +66,7 @@ def figure(view: View, shown: Shown) -> Figure:
         for place, region in enumerate(shown.regions.values()):
             color = drawing.COLORS[place % len(drawing.COLORS)]
             axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))
+    # Time and origin of the data.
     note = drawing.provenance_note(view.data)
     result.suptitle(f"{view.time[shown.index]:.2f} s{note}", fontsize=10)
     return result
@@ -72,7 +74,7 @@ def figure(view: View, shown: Shown) -> Figure:
 
 def status_legend(view: View) -> tuple[npt.NDArray[np.uint8], list[tuple[str, str, float]]]:
     """Place in the legend of each pixel (y, x), and the legend: words, colour, share."""
-    first = figures.first_reason(xr.DataArray(view.status))
+    first = first_reason(xr.DataArray(view.status))
     texts = {"": ("no flag", "#a8d5b0"), **figures.REASONS}
     names = [name for name in texts if np.any(first == name)]
     codes = np.select([first == name for name in names], range(len(names))).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Films and maps that are shown: one frame at a time, from memory, from a store, or computed."""
+"""Films and maps of a view, read frame by frame from memory, a store, or a computation."""
 
 import os
 from collections.abc import Callable
@@ -26,12 +26,12 @@ class Pane:
     """Picture of one quantity."""
 
     name: str  # in `View.panes`
-    label: str  # words for the title
+    label: str  # title
     units: str  # of the values
     array: xr.DataArray  # values (time, y, x) or (y, x), in memory or lazy
-    absolute: bool = False  # a temperature, also shown in degrees Celsius, not a difference of some
-    std: str = ""  # name of the pane of its standard deviation; empty without one
-    curve: Curve | None = None  # response by which counts are shown as apparent temperatures
+    absolute: bool = False  # temperature, also shown in degrees Celsius; not a difference
+    std: str = ""  # pane of its standard deviation; empty without one
+    curve: Curve | None = None  # response, for counts shown as apparent temperatures
 
     @property
     def kind(self) -> Literal["film", "map", "status"]:
@@ -41,22 +41,18 @@ class Pane:
         return "film" if self.array.ndim == 3 else "map"
 
     def unit(self, *, celsius: bool) -> tuple[str, float]:
-        """Unit in which the values are shown, and what is taken from them for it."""
+        """Unit of the shown values, and the offset that is subtracted."""
         if self.absolute and celsius:
             return "\N{DEGREE SIGN}C", zero_Celsius
         return self.units, 0.0
 
     @cached_property
     def _source(self) -> npt.NDArray[Any]:
-        """Values that are indexed: those in memory, not copied, or those of `stage`."""
+        """Values that are indexed: those in memory, or the copy of `stage`."""
         return self.array.values if self.array.ndim == 3 else self.array.values[None]
 
     def stage(self, progress: Progress | None = None) -> None:
-        """Copy a film that is not in memory into a temporary file without a name, frame by frame.
-
-        A store keeps all of time of a tile of pixels together, so that a frame of its own would be
-        as dear as all of them. Rows are read one block of chunks after the other.
-        """
+        """Copy a film that is not in memory into a temporary file, chunk by chunk."""
         array = self.array
         if "_source" in vars(self) or array.ndim < 3 or array.variable._in_memory:
             return
@@ -82,7 +78,7 @@ class Pane:
     def read(
         self, frames: slice, rows: slice = slice(None), columns: slice = slice(None)
     ) -> Values:
-        """Values (time, y, x) of some frames, of a map its one; float32."""
+        """Values (time, y, x), float32; of a map one frame."""
         self.stage()
         values = self._source[frames if self.array.ndim == 3 else slice(None), rows, columns]
         if self.curve is not None:
@@ -91,7 +87,7 @@ class Pane:
 
 
 def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
-    """Dataset as it is, or the one in a store."""
+    """Dataset, opened if it is the path of a store."""
     if isinstance(data, str | Path):
         return store.open_dataset(data)
     if not isinstance(data, xr.Dataset):
@@ -103,7 +99,7 @@ def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
 
 
 def marks(capture: xr.Dataset, time: Array) -> dict[str, float]:
-    """Shutter events of a capture, and where a run of flagged frames begins, by name [s]."""
+    """Times [s] of shutter events of a capture, and of the first of flagged frames, by name."""
     marked: dict[str, Mask] = {}
     if "segment" in capture:
         marked["shutter event"] = np.asarray(np.diff(capture["segment"].values, prepend=0) > 0)

@@ -12,8 +12,10 @@ from dbthermal._arrays import Array, Mask
 
 Kind = Literal["rectangle", "ellipse", "polygon"]
 
-_LEAST_PAIRS: Final = 12  # of neighbours, that tell what they share
-_MOST_OWN: Final = 2.0  # of a variance
+_LEAST_PAIRS: Final = 12  # pairs of neighbours that give the share of independent errors
+_LARGEST_SHARE: Final = (
+    2.0  # of independent errors in the variance, beyond which it is the material
+)
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
 
 
@@ -28,11 +30,7 @@ class Region:
     points : tuple of (float, float)
         (row, column) of two opposite corners, of an ellipse those of the rectangle around it, or of
         the corners of a polygon in order [pixel]. Pixel (i, j) covers i to i + 1 and j to j + 1.
-
-    Raises
-    ------
-    ValueError
-        If the kind is another one, or the points are too few or not finite.
+        ValueError if they are too few, or not finite.
 
     Examples
     --------
@@ -80,7 +78,7 @@ class Region:
 
 
 def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
-    """Even-odd rule: a ray along the row from a point inside crosses the outline an odd number."""
+    """Even-odd rule: a ray along the row crosses the outline an odd number of times."""
     odd = np.zeros((rows.size, columns.size), dtype=bool)
     for (row, column), (next_row, next_column) in zip(
         corners, np.roll(corners, -1, 0), strict=True
@@ -93,27 +91,25 @@ def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
 
 
 def common_gain(emissivity: Array, covariance: Array) -> Array:
-    r"""Shared deviation of object and background (2, y, x) by emissivities, a contrast of 1 K [1].
+    r"""Common deviation of object and background (2, y, x) by emissivities, for 1 K contrast [1].
 
-    The image formation :math:`e_b x + (1 - e_b) y`, in linearised kelvin, is kept by errors
-    :math:`\delta e` of the emissivities (band, y, x), of a covariance (band, band, y, x), if
+    Errors :math:`\delta e` of the emissivities (band, y, x) with a covariance (band, band, y, x)
+    keep the image formation :math:`e_b x + (1 - e_b) y` if
 
     .. math:: e_b\,\delta x + (1 - e_b)\,\delta y = -(x - y)\,\delta e_b
 
-    which two bands solve exactly and more by least squares, :math:`\delta x = -(x - y)\,g\,
-    \delta e` of variance :math:`v`. What each pixel errs alone parts neighbours i, j, what they
-    share does not: the share :math:`\rho` of the former is in the median over the region, of
-    normal errors,
+    which has, by least squares, the solution :math:`\delta x = -(x - y)\,g\,\delta e` of variance
+    v. Neighbours i, j differ by independent errors alone, whose share :math:`\rho` follows from the
+    median over the region,
 
     .. math:: \operatorname{med} (g e_i - g e_j)^2 / (v_i + v_j) = 0.455 \rho
 
-    which is 0 for pooled or stated emissivities. It is not known, and 0, of few pairs, and of a
-    material that differs from pixel to pixel by more than the deviations allow. Gains are NaN where
-    the emissivities are.
+    It is 0 for pooled or stated emissivities, and taken as 0 for few pairs and for a material that
+    differs between pixels by more than the deviations. NaN where the emissivities are.
     """
     finite = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
-    apart = np.linspace(0.4, 0.6, len(emissivity))[:, np.newaxis, np.newaxis]
-    value = np.where(finite, emissivity, apart)
+    default = np.linspace(0.4, 0.6, len(emissivity))[:, np.newaxis, np.newaxis]
+    value = np.where(finite, emissivity, default)
     system = np.moveaxis(np.stack([value, 1.0 - value], axis=-1), 0, 2)  # (y, x, band, 2)
     inverse = np.linalg.pinv(system)  # (y, x, 2, band)
     variance = np.einsum("yxib,bcyx,yxic->iyx", inverse, covariance, inverse)
@@ -129,16 +125,12 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     residual_share = np.zeros(2)
     if pairs.shape[1] >= _LEAST_PAIRS:
         residual_share = np.median(pairs, axis=1) / chdtri(1, 0.5)
-    shared = np.where(residual_share < _MOST_OWN, 1.0 - np.minimum(residual_share, 1.0), 1.0)
+    shared = np.where(residual_share < _LARGEST_SHARE, 1.0 - np.minimum(residual_share, 1.0), 1.0)
     return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 
 
 def mean_std(std: Array, common: Array) -> Array:
-    """Standard deviation (time) of a mean over pixels, from theirs (time, pixel); see `View.curve`.
-
-    The common part c is at most all of a pixel's s, and all of it where it is NaN. A pixel whose
-    deviation is NaN does not count.
-    """
+    """Standard deviation (time) of a mean over pixels with a common part, see `View.curve`."""
     shared = np.where(np.isfinite(common), np.minimum(common, std), std)
     number = np.maximum(np.isfinite(std).sum(axis=-1), 1)
     independent = np.nansum(std**2 - shared**2, axis=-1) / number**2

@@ -1,4 +1,4 @@
-"""View of a result or a capture: its panes, frames, ranges of colour, curves, and code for them."""
+"""View of a result or a capture: panes, frames, ranges of colour, curves, and code for them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -25,16 +25,15 @@ FILMS: Final = {
     "background_temperature": "reflected temperature",
 }
 _ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
-_SAMPLES: Final = 2**22  # of a region's film that are read at once
-_LOOKED_AT: Final = (12, 40_000)  # frames, and pixels of a frame, of which the range is taken
+_SAMPLES: Final = 2**22  # of a region's film that are read in one pass
+_RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the range of colour
 
 
 class View:
     """Frames, ranges of colour and curves of a result or a capture, as the explorer shows them.
 
-    Films that are not in memory are copied into a temporary file, where the environment variable
-    ``TMPDIR`` says, frame after frame, when they are first read: 4 bytes a pixel and frame on disk,
-    and in memory no more than a row of a store's chunks.
+    Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
+    read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
 
     Parameters
     ----------
@@ -117,7 +116,7 @@ class View:
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
     def _panes(self, *, is_capture: bool) -> Iterator[Pane]:
-        """Yield what can be shown, in the order in which it is."""
+        """Yield the panes, in the order in which they are shown."""
         if self.capture is not None:
             reference = self.data if is_capture else self.data.get("object_temperature")
             yield from self._inputs(self.capture, reference)
@@ -176,26 +175,16 @@ class View:
                 yield Pane(f"input {band}", label, "K", film, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
-        """Pane of a name, read so far that a frame of it is quick; ValueError for another name."""
+        """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
         if name not in self.panes:
             raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
         self.panes[name].stage(self.progress)
         return self.panes[name]
 
     def frame(self, name: str, index: int) -> Values:
-        """Values (y, x) of a pane at a frame, in its units.
+        """Values (y, x) of a pane at a frame, from 0, in its units; of a map at any frame.
 
-        Parameters
-        ----------
-        name : str
-            One of `panes`.
-        index : int
-            Number of the frame, from 0; of no meaning for a map.
-
-        Raises
-        ------
-        ValueError
-            If there is no such pane or frame.
+        ValueError if there is no such pane or frame.
         """
         if not 0 <= index < self.time.size:
             raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
@@ -210,13 +199,10 @@ class View:
         return source["status"].values.astype(np.uint32)
 
     def counted(self, pixels: Pixels = "unflagged") -> Mask:
-        """Mask (y, x) of the pixels that count.
+        """Mask (y, x) of the pixels that count: "unflagged", "measured" or "all".
 
-        Parameters
-        ----------
-        pixels : {"unflagged", "measured", "all"}
-            Those without a flag and those that were completed; those without a flag; every one.
-            Of measured pixels samples that were bridged in time do not count, either.
+        Unflagged are measured and completed ones. Of measured pixels samples that were bridged in
+        time do not count, either.
         """
         if pixels not in get_args(Pixels):
             raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
@@ -226,12 +212,11 @@ class View:
         return good | ((self.status & COMPLETED) != 0) if pixels == "unflagged" else good
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane: all but one in a hundred of its values at either end.
+        """Range of colour of a pane: the 1st and 99th percentile of some measured values.
 
-        Of some frames and pixels, those that are measured if there are any; a deviation begins
-        at 0.
+        Of all values if none is measured; a deviation begins at 0.
         """
-        pane, (frames, pixels) = self.pane(name), _LOOKED_AT
+        pane, (frames, pixels) = self.pane(name), _RANGE
         times = slice(0, None, -(-self.time.size // frames))
         every = slice(0, None, stride(self.shape, pixels))
         values, good = pane.read(times, every, every), self.counted("measured")[every, every]
@@ -246,19 +231,18 @@ class View:
     def curve(self, name: str, region: Region, *, pixels: Pixels = "unflagged") -> xr.Dataset:
         r"""Mean, least and greatest value of a region over time, with the deviation of the mean.
 
-        An error that all pixels share is not lessened by their number (`std`): of object and
-        reflected temperature what the emissivities' deviations give through the image formation,
-        less the part by which neighbours differ; of emissivities, completed pixels and pixels of
-        cameras that stand apart, all of it. What remains each pixel errs alone,
+        A common error is not reduced by the number of pixels (`std`): of object and reflected
+        temperature the error by the emissivities, less the part by which neighbours differ; of
+        emissivities, completed pixels and displaced cameras all of it. The rest is independent,
 
         .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
         Parameters
         ----------
         name : str
-            One of `panes`, but "status".
+            One of `panes`, but "status"; ValueError for another one.
         region : Region
-            Where.
+            Region of the image; ValueError without a pixel.
         pixels : {"unflagged", "measured", "all"}
             Which pixels count; see `counted`.
 
@@ -269,25 +253,18 @@ class View:
             counts, over (time); without it for a map. NaN where no pixel counts. `std` is NaN where
             the result states no deviation.
 
-        Raises
-        ------
-        ValueError
-            If there is no such pane, or no pixel in the region.
-
         Notes
         -----
-        In no deviation are the calibration of the cameras, and what interpolation between pixels
-        makes neighbours share.
-
-        The reflected temperature's is mostly the prior of its own drift
-        (`SubspaceSettings.background_drift`), which all pixels share: where nothing drifts, the
-        mean is much closer.
+        The deviations exclude the calibration of the cameras, and the correlation of neighbours by
+        interpolation. That of the reflected temperature is mostly the prior of its drift
+        (`SubspaceSettings.background_drift`): without a drift the mean is much closer.
         """
         pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
         if not mask.any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
+        # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         where = (mask & self.counted(pixels))[box]
         gain = self._common(pane, box, where)
@@ -297,6 +274,7 @@ class View:
         measured = pixels == "measured"
         chunks = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
+        # Dataset over time, of a map without it.
         units = {"units": pane.units}
         result = xr.Dataset(
             {
@@ -310,12 +288,12 @@ class View:
         return result.assign_coords(time=("time", self.time, schema.COORDINATES["time"].attrs))
 
     def _common(self, pane: Pane, box: tuple[slice, ...], where: Mask) -> Array | None:
-        """Deviation (pixel) by the emissivities for a contrast of 1 K; NaN: all is shared."""
+        """Deviation (pixel) by the emissivities for a contrast of 1 K; None if all is common."""
         data, (rows, columns) = self.data, box
-        apart = data.attrs.get("reflection_shift", "none") != "none"
-        apart |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
+        displaced = data.attrs.get("reflection_shift", "none") != "none"
+        displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
         needed = {*FILMS, "emissivity", "emissivity_std"}
-        if pane.name not in FILMS or apart or not needed <= set(data):
+        if pane.name not in FILMS or displaced or not needed <= set(data):
             return None
         cut = data[[name for name in data if str(name).startswith("emissivity")]]
         cut = cut.isel(y=rows, x=columns)

@@ -63,17 +63,9 @@ class Explorer(anywidget.AnyWidget):
         self.on_msg(self._on_message)
 
     def curves(self, name: str = "") -> xr.Dataset:
-        """Curves over (region, time) of the regions drawn, `View.curve`.
+        """Curves over (region, time) of the regions drawn, in a pane or else the plotted one.
 
-        Parameters
-        ----------
-        name : str
-            One of `view.panes`; the one that is plotted if not given.
-
-        Raises
-        ------
-        ValueError
-            If there is no such pane, or no region.
+        As `View.curve`; ValueError if there is no such pane, or no region.
         """
         name = name or self._state.get("pane") or next(iter(self.view.panes))
         return _export.curves(self.view, name, self.regions, self._state["pixels"])

@@ -15,11 +15,10 @@ from dbthermal.figures._scenes import (
     FilmPanel,
     film,
     reflection_shift,
-    separated_film,
     separated_frames,
     separated_temperatures,
 )
-from dbthermal.figures._status import REASONS, first_reason, status
+from dbthermal.figures._status import REASONS, status
 
 __all__ = [
     "REASONS",
@@ -28,12 +27,10 @@ __all__ = [
     "Panel",
     "drawing",
     "film",
-    "first_reason",
     "gain_offset_maps",
     "plan",
     "reflection_shift",
     "response_fit",
-    "separated_film",
     "separated_frames",
     "separated_temperatures",
     "status",

@@ -1,4 +1,4 @@
-"""Figures of the calibration: gain and offset of the pixels, and response of the bands."""
+"""Figures of the calibration: gain and offset of the pixels, response of the bands."""
 
 import numpy as np
 import xarray as xr

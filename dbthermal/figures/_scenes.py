@@ -50,6 +50,7 @@ def separated_frames(
     aspect = inputs.sizes["y"] / inputs.sizes["x"]
     columns = len(bands) + 2
     figure, axes = canvas(frames, columns, (3.3 * columns, (2.6 * aspect + 0.45) * frames))
+    # One range of colour for all times.
     scales = [limits_of(inputs.sel(band=band)) for band in bands]
     warm, change = limits_of(emission), limits_of(reflection, symmetric=True)
     for index, row in enumerate(axes):
@@ -96,7 +97,9 @@ def separated_temperatures(
     ['emission, 0.0 s', 'reflection less its mean, 0.0 s']
     """
     labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", label)
-    _require_kelvin(apparent, emission, change)
+    names = {"the inputs": apparent, "the emission": emission, "the reflection": change}
+    for name, temperature in names.items():
+        schema.check_numbers(temperature, name, "K")
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
@@ -129,41 +132,6 @@ def reflection_shift(field: xr.Dataset) -> Figure:
         f"Reflection of {bands} in the picture of {reference}" + drawing.provenance_note(field)
     )
     return figure
-
-
-def separated_film(
-    apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
-
-    Parameters
-    ----------
-    apparent, emission, change, title
-        As for `separated_temperatures` [K]; pixels without a value are gray.
-
-    Yields
-    ------
-    ndarray of uint8, shape (rows, columns, 3)
-        As from `film`.
-    """
-    _require_kelvin(apparent, emission, change)
-    emission = laid_on(emission, apparent, "the emission", "the inputs")
-    change = laid_on(change, apparent, "the reflection", "the inputs")
-    names = apparent["band"].values
-    panels = [
-        FilmPanel(apparent.sel(band=band) - zero_Celsius, f"input {band_label(band)}")
-        for band in names
-    ]
-    panels.append(FilmPanel(emission - zero_Celsius, "emission"))
-    panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
-    yield from film(panels, title=title + drawing.provenance_note(apparent))
-
-
-def _require_kelvin(*temperatures: xr.DataArray) -> None:
-    """Refuse inputs, emission or reflection in another unit than kelvin."""
-    labels = ("the inputs", "the emission", "the reflection")
-    for temperature, label in zip(temperatures, labels, strict=True):
-        schema.check_numbers(temperature, label, "K")
 
 
 @dataclass(frozen=True)

@@ -52,12 +52,8 @@ def status(result: xr.Dataset) -> Figure:
     Parameters
     ----------
     result : Dataset
-        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
-
-    Raises
-    ------
-    ValueError
-        If a bit is not one of `schema.Status`.
+        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`; ValueError
+        for another bit.
 
     Examples
     --------
@@ -67,6 +63,7 @@ def status(result: xr.Dataset) -> Figure:
     >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
     ['75.0 %  good', '25.0 %  dead pixel']
     """
+    # Colour of each pixel's first flag.
     first = first_reason(result["status"])
     shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
     shown = {name: share for name, share in shares.items() if share > 0}
@@ -80,6 +77,7 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
+    # Legend with shares.
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
         for name, share in shown.items()
@@ -96,13 +94,7 @@ def status(result: xr.Dataset) -> Figure:
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
-    """Name of the most decisive flag of each pixel; empty without a flag.
-
-    Parameters
-    ----------
-    flags : DataArray
-        Status (y, x), see `schema.Status`.
-    """
+    """Name of the most decisive flag of each pixel of a `status`; empty without a flag."""
     bits = flags.values.astype(np.uint32)  # of older results they are of 16 bit
     unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
     if unknown:

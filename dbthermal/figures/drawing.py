@@ -11,27 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-__all__ = [
-    "COLORS",
-    "MARKERS",
-    "band_label",
-    "canvas",
-    "draw_image",
-    "limits_of",
-    "marked_line",
-    "percent",
-    "plain_decades",
-    "plain_ticks",
-    "provenance_note",
-]
+__all__ = ["COLORS", "band_label", "canvas", "draw_image", "limits_of", "provenance_note"]
 __dir__ = __all__.copy
 
 COLORS: Final = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7")
 """Colours of the bands, in their order, told apart by the colour-blind (Wong 2011,
 doi:10.1038/nmeth.1618)."""
 
-MARKERS: Final = "osD^vPX*"
-"""Markers of lines, in their order."""
+MARKERS: Final = "osD^vPX*"  # of lines, in their order
 
 
 def canvas(
@@ -137,51 +124,25 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
 
 
 def marked_line(index: int) -> dict[str, Any]:
-    """Style of one of several lines with markers, for matplotlib.
-
-    Parameters
-    ----------
-    index : int
-        Number of the line; colours and markers begin anew behind their last.
-    """
+    """Style of one of several lines with markers, by its number."""
     color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
     return {"color": color, "marker": marker, "markersize": 4, "linewidth": 1}
 
 
 def plain_ticks(axis: Axes, places: xr.DataArray) -> None:
-    """Ticks at some places of a logarithmic horizontal axis, as plain numbers, and a grid.
-
-    Parameters
-    ----------
-    axis : Axes
-        Where to draw.
-    places : DataArray
-        Places of the ticks, in the unit of the axis.
-    """
+    """Ticks at some places of a logarithmic horizontal axis, as plain numbers, and a grid."""
     axis.set_xticks(places.values, [f"{place:g}" for place in places.values], fontsize=8)
     axis.set_xticks([], minor=True)
     axis.grid(visible=True, which="major", color="0.9")
 
 
 def plain_decades(axis: Axes) -> None:
-    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers.
-
-    Parameters
-    ----------
-    axis : Axes
-        Where to draw.
-    """
+    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers."""
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.yaxis.set_minor_locator(NullLocator())
 
 
 def percent(share: float) -> str:
-    """Share in percent as text; less than 0.1 % is not rounded to zero.
-
-    Parameters
-    ----------
-    share : float
-        Share [1], of one.
-    """
+    """Share [1] in percent as text; less than 0.1 % is not rounded to zero."""
     return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

@@ -6,74 +6,17 @@ The image formation is that of Narayanan et al. (2026), doi:10.48550/arXiv.2509.
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal._numbers import POSITIVE, real_number, real_numbers, whole_number
+from dbthermal._numbers import real_number, whole_number
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
-# Standard deviation of a uniform number, over the width of its interval.
-_UNIFORM: Final = 1.0 / np.sqrt(12.0)
+_UNIFORM: Final = 1.0 / np.sqrt(12.0)  # standard deviation of a uniform number over its range
 _LEAST_STD: Final = 1e-9  # of an emissivity that is not known exactly [1]
-
-
-def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
-    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
-
-    Parameters
-    ----------
-    emissivity : array_like, shape (2, ...)
-        Emissivities [1].
-
-    Examples
-    --------
-    >>> reflection_ratio([0.86, 0.72]).round(3).item()  # plate glass in 8-14 um and 9.5 um
-    2.0
-    """
-    first, second = np.asarray(emissivity, dtype=np.float64)
-    return np.asarray((1.0 - second) / (1.0 - first))
-
-
-def ratio_variance_bound(
-    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
-) -> Array:
-    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
-
-    .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
-              {\sum_t [(1 - e_1) P y(t)]^2}
-
-    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
-
-    Parameters
-    ----------
-    emissivity, noise : tuple of float
-        Emissivities [1] of the two bands, and standard deviations of their noise [K]; TypeError or
-        ValueError for other than two numbers, in [0, 1] and positive.
-    background : ndarray, shape (time, ...)
-        Background temperature [K].
-    functions : ndarray, shape (time, order)
-        Orthonormal functions that span the smooth subspace.
-
-    Examples
-    --------
-    Plate glass before a background that changes by 3 K every five seconds:
-
-    >>> background = 295.0 + 3.0 * (np.arange(200) // 50 % 2)  # K, 10 frames/s
-    >>> functions, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 200), 5))
-    >>> variance = ratio_variance_bound((0.86, 0.72), (0.03, 0.35), background, functions)
-    >>> np.sqrt(variance).round(2).item()
-    0.15
-    """
-    ratio = float(reflection_ratio(real_numbers("emissivity", emissivity, (0.0, 1.0), (2,))))
-    real_numbers("noise [K]", noise, POSITIVE, (2,))
-    background, functions = real_numbers("background", background), real_numbers("basis", functions)
-    rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
-    energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
-    return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)
 
 
 def bounds(
@@ -88,9 +31,13 @@ def bounds(
     r"""Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
     The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
-    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a known smooth
-    subspace of polynomials of time; y, one number a frame, eliminated as by variable projection
-    [2]_, and in the frames at rest one number for all of them. Response and noise are known.
+    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a smooth subspace of
+    polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
+    frames at rest one number for all. Response and noise are known.
+
+    TypeError or ValueError if an input is not as described, there is one band only, an emissivity
+    lies outside (0, 1), a temperature outside the response's range, or no smooth subspace holds the
+    object.
 
     Parameters
     ----------
@@ -122,16 +69,10 @@ def bounds(
         ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
         (time, y, x).
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, there is one band only, an emissivity lies outside (0, 1),
-        a temperature outside the response's range, or no smooth subspace holds the object.
-
     Notes
     -----
-    For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
-    of `ratio_variance_bound`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
+    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
     alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
     curvature of the exact response determines them without, but hardly, and the bound of the ratio
     is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
@@ -165,6 +106,7 @@ def bounds(
     for name in TEMPERATURES:
         for curve in curves:
             require_range(getattr(truth, name), curve, name)
+    # Noise in kelvin, and the smooth subspace of each pixel.
     noise = responses.noise(response, names) / [curve.reference_slope for curve in curves]
     reference = int(np.argmin(noise))
     if order is None:
@@ -172,6 +114,7 @@ def bounds(
     else:
         order = whole_number("order", order, (1, truth.time.size))
         orders = np.full(truth.object_temperature.shape[1], order)
+    # Deviations from the Fisher information at the smooth truth.
     sensitivity = truth.smoothed(orders).sensitivity(curves, noise)
     stds = deviations(sensitivity, truth.time, orders, reference, emissivity_std=emissivity_std)
     maps = {

@@ -25,17 +25,12 @@ TEMPERATURES: Final = ("object_temperature", "background_temperature")
 QUANTITIES: Final = (*TEMPERATURES, "emissivity", "reflection_ratio")
 """Quantities that have a bound; those of the bands behind the temperatures, which have frames."""
 
-# Energy of the object outside its smooth subspace that is negligible, in units of the noise's
-# variance, and the largest subspace that is tried.
-_NEGLIGIBLE: Final = 0.1
-_HIGHEST_ORDER: Final = 30
-# Information in a direction, relative to that on its parameters were each the only unknown, below
-# which it is rounding: a deviation a million times larger is no information on any quantity here.
+_NEGLIGIBLE: Final = 0.1  # energy outside the smooth subspace, over the noise's variance
+_HIGHEST_ORDER: Final = 30  # largest subspace that is tried
+# Information below which it is rounding, over that of each parameter as the only unknown.
 _ROUNDING: Final = 1e-12
-# Squared share of a quantity's gradient along such directions, above which it depends on them.
-_DEPENDENT: Final = 1e-8
-# Pixels at once: their working memory, some 200 kB each at 350 frames, stays below 100 MB.
-_PIXELS: Final = 512
+_DEPENDENT: Final = 1e-8  # squared share of a gradient along directions without information
+_PIXELS: Final = 512  # at once, in less than 100 MB at 350 frames
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ class Sensitivity:
     resting: Mask  # frames with the background at its resting level (time, pixel)
 
     def select(self, pixels: Indices) -> "Sensitivity":
-        """The same for some of the pixels."""
+        """Sensitivity of some of the pixels."""
         return Sensitivity(*(getattr(self, field.name)[..., pixels] for field in fields(self)))
 
     def projection(self) -> Array:
@@ -104,7 +99,7 @@ class Truth:
         )
 
     def smoothed(self, order: Indices) -> "Truth":
-        """The same with the object projected onto each pixel's smooth subspace."""
+        """Truth with the object projected onto each pixel's smooth subspace."""
         smoothed = self.object_temperature.copy()
         for count in np.unique(order):
             functions = smooth.polynomial_basis(self.time, int(count))
@@ -234,10 +229,7 @@ class FisherInverse:
     information: Array  # along them (pixel, direction) [1]
 
     def variance(self, gradient: Array) -> Array:
-        """Smallest variance (pixel, quantity) for gradients (pixel or 1, quantity, unknown).
-
-        Infinite where a quantity depends on a direction without information.
-        """
+        """Smallest variance (pixel, quantity) for gradients; infinite without information."""
         along = ((gradient * self.scale[:, np.newaxis]) @ self.directions) ** 2
         blind = self.information <= _ROUNDING
         dependent = along @ blind[..., np.newaxis] > _DEPENDENT * along.sum(axis=-1, keepdims=True)

@@ -12,10 +12,8 @@ from dbthermal import _numbers, bands, mixing, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
-# Entry of a material without a best filter: none of them determines its temperature.
-_NO_FILTER: Final = "none"
-# Time constant of the object's warming, as a share of the capture.
-_TIME_CONSTANT: Final = 1.0 / 3.0
+_NO_FILTER: Final = "none"  # entry of a material whose temperature no filter determines
+_TIME_CONSTANT: Final = 1.0 / 3.0  # of the object's warming, as a share of the capture
 _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 
 
@@ -23,8 +21,11 @@ _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 class CaptureDesign:
     """Capture conditions: a warming object before a background of regular pulses.
 
-    The object's time constant is a third of the capture. The background is warmer for the end of
-    each period, as if someone stood there, and rests before.
+    The object's time constant is a third of the capture. The background rests, and is warmer at the
+    end of each period.
+
+    TypeError or ValueError if one is not finite, or not positive (all but `span` and `amplitude`),
+    a pulse is longer than the period, or there are fewer than two frames or more than 100 000.
 
     Attributes
     ----------
@@ -40,12 +41,6 @@ class CaptureDesign:
         Height of a pulse [K].
     period, duration : float
         From pulse to pulse, and of one pulse [s].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If one is not finite, or not positive (all but `span` and `amplitude`), a pulse is
-        longer than the period, or there are fewer than two frames or more than 100 000.
     """
 
     seconds: float = 35.0
@@ -81,9 +76,12 @@ def plan(
 ) -> xr.Dataset:
     r"""Expected accuracy of one pixel for each material and filter, and the best filter.
 
-    The Cramer-Rao bound of `bounds` for a designed capture, with the response of Planck's law over
-    each band. Those of n pixels of one material share their ratios and emissivities, whose
-    deviations fall as :math:`1 / \sqrt{n}`.
+    The Cramer-Rao bound of `bounds` for a designed capture, with Planck's law over each band. The
+    emissivity errors of n pixels of one material fall as :math:`1 / \sqrt{n}`.
+
+    KeyError, TypeError or ValueError if table or noise are not as `schema` has them, a band is
+    unknown, an emissivity lies outside (0, 1), or the band `beside` or as many others as used
+    together are missing.
 
     Parameters
     ----------
@@ -103,19 +101,12 @@ def plan(
     Returns
     -------
     Dataset
-        Over (material, filter), the filters of a combination joined by " + ":
-        `object_temperature_std`, `background_temperature_std` [K], root mean square over time, and
-        `condition_number` [1]. Over (material, filter, band): `emissivity_std` and
-        `reflection_ratio_std` [1], over the band always recorded; NaN for a band outside the
-        combination. `best` (material): the filter of the smallest object deviation, "none" where
-        each is above that of a uniform number within the capture's range of temperatures. `noise`
-        (band) [K], and the design's numbers as attributes.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If table or noise are not as `schema` has them, a band is unknown, an emissivity
-        lies outside (0, 1), or the band `beside` or as many others as used together are missing.
+        Over (material, filter), combinations joined by " + ": `object_temperature_std`,
+        `background_temperature_std` [K], root mean square over time, and `condition_number` [1].
+        Over (material, filter, band): `emissivity_std`, and `reflection_ratio_std` over the band
+        `beside` [1]; NaN for a band outside the combination. `best` (material): the filter of the
+        smallest object deviation, "none" if all are above that of a uniform number within the
+        capture's temperatures. `noise` (band) [K], and the design's numbers as attributes.
 
     Examples
     --------
@@ -132,11 +123,13 @@ def plan(
     names = [str(name) for name in table["band"].values]
     if beside not in names:
         raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
+    # Combinations of filters beside the band that is always recorded.
     filters = [place for place, name in enumerate(names) if name != beside]
     together = _numbers.whole_number("together", together, (1, len(filters)))
     sets = [[names.index(beside), *chosen] for chosen in combinations(filters, together)]
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     bodies = [TopHat(bands.get(name), temperature) for name in names]
+    # Deviations of each combination for every material.
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     cases = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -145,6 +138,7 @@ def plan(
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
+    # Best filter of each material, if it says more than the range of temperatures.
     uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
     best = [
         labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER

@@ -17,6 +17,7 @@ from dbthermal._text import missing_library
 
 try:
     from jinja2 import Environment, select_autoescape
+    from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 except ImportError as error:
     raise ImportError(missing_library(error.name, "report")) from error
@@ -67,18 +68,12 @@ def save_page(
         title=title,
         origin=origin,
         sections=list(sections),
-        numbers=embedded_json(numbers),
+        numbers=htmlsafe_json_dumps(numbers, allow_nan=False, sort_keys=True),
         provenance=json.dumps(provenance, indent=2, sort_keys=True),
     )
     if Path(path).suffix != ".html":
         raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
     store.save_text(page, path, provenance)
-
-
-def embedded_json(content: Mapping[str, Any]) -> Markup:
-    """JSON that stays inside its ``<script>`` element, whatever the strings in it are."""
-    plain = json.dumps(content, allow_nan=False, sort_keys=True)
-    return Markup(plain.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, names: int = 1) -> Markup:
@@ -163,4 +158,4 @@ def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:
         '<div class="readout" data-part="readout"></div><canvas data-part="picture"></canvas>'
         '<canvas data-part="curve"></canvas><p>{}</p>'
         '<script type="application/json">{}</script><script>{}</script></div>'
-    ).format(text, embedded_json(film), Markup(script))
+    ).format(text, htmlsafe_json_dumps(film, allow_nan=False, sort_keys=True), Markup(script))

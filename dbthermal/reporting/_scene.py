@@ -123,12 +123,14 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
             "rectangle", ((0, 0), (view.shape[0], view.shape[1]))
         )
     }
+    # Curves of every region in every pane.
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
         name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
         for name, region in chosen.items()
     }
     table_ = emissivity.embedded_table() if materials is None else materials
+    # Numbers of the scene, which the page holds as JSON.
     (rows, columns), frames = view.shape, int(view.time.size)
     seconds = float(view.time[-1] - view.time[0])
     sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
@@ -139,6 +141,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         "validity": _validity(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
+    # Film, viewer, and the sections of the page.
     film = video(view, title, codec, celsius=celsius)
     sections = [
         Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),

@@ -1,4 +1,4 @@
-"""A simulated rig: response from Planck's law, fixed pattern, noise, 16-bit counts."""
+"""Simulated cameras: response by Planck's law, fixed pattern, noise, 16-bit counts."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,8 +19,8 @@ _SLOPE_TEMPERATURE: Final = 300.0
 class Rig:
     """Simulated cameras, one a band: response, noise and fixed pattern.
 
-    The defaults are round figures for the camera of the paper, a 16-bit 640x512 microbolometer.
-    Behind a filter the counts shrink with the band's share of dB/dT; their noise stays.
+    By default about the camera of the paper, a 16-bit 640x512 microbolometer. Behind a filter the
+    counts shrink with the band's share of dB/dT; their noise stays.
 
     Attributes
     ----------
@@ -145,6 +145,7 @@ def observe(
     emitted = _blackbody(response, scene["object_temperature"])
     reflected = _blackbody(response, background)
     schema.band_positions(scene, names, "the scene")
+    # Mix emission and reflection in counts, and add noise.
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
         emissivity = scene["emissivity"].sel(band=name).values
@@ -179,6 +180,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
     """
     size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
+    # Random gains and offsets with a vignette, relative to the live pixels.
     vignette = rows**2 + columns**2
     dead = rng.random(size) < rig.bad_fraction
     gain = rig.gain_std * (rng.standard_normal(size) - vignette)
@@ -268,57 +270,6 @@ def blackbody_movies(
     coords = {"band": list(rig.bands), "temperature": ("temperature", temperatures, {"units": "K"})}
     variables = schema.variables("blackbody_movies", {"counts": movies})
     return xr.Dataset(variables, coords, {"origin": "simulated"})
-
-
-def contact_measurements(
-    response: xr.Dataset,
-    emissivity: xr.DataArray,
-    object_temperature: np.ndarray,
-    background_temperature: np.ndarray,
-    stds: tuple[float, float],
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
-
-    ValueError if a temperature lies outside the response, or the emissivity lacks a band.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
-    """
-    names = [str(name) for name in response["band"].values]
-    places = schema.band_positions(emissivity, names, "the emissivity")
-    true = {
-        "object_temperature": object_temperature,
-        "background_temperature": background_temperature,
-    }
-    emitted, reflected = (
-        np.stack(_blackbody(response, xr.DataArray(level, dims="measurement", name="temperature")))
-        for level in true.values()
-    )
-    clean = mixing.leaving(emissivity.values[places][:, np.newaxis], emitted, reflected)
-    noise = responses.noise(response, names)[:, np.newaxis] * rng.standard_normal(clean.shape)
-    read = {
-        name: ("measurement", level + rng.normal(0, std, len(level)), {"units": "K"})
-        for (name, level), std in zip(true.items(), stds, strict=True)
-    }
-    counts = (("band", "measurement"), clean + noise, {"units": "count"})
-    return xr.Dataset({"counts": counts, **read}, {"band": names}, {"origin": "simulated"})
 
 
 def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Scenes with known truth: an object that changes smoothly before a background that does not."""
+"""Simulated scenes: an object that changes smoothly before a background that does not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -185,7 +185,7 @@ def independent_pixels(
     stop: float,
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
-    """Scene one row high of many pixels of one material, each with its own heating and background.
+    """Scene of one row of pixels of one material, each with its own heating and background.
 
     Parameters
     ----------
@@ -220,10 +220,10 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """Simulated twin of a plate heated in its middle that reflects people who walk by.
+    """Plate, heated in its middle, that reflects people who walk by.
 
-    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
-    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
+    at a steady pace.
 
     Parameters
     ----------
@@ -266,10 +266,12 @@ def walkers(
     rows, columns = np.meshgrid(
         np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"
     )
+    # Object: heated in its middle.
     profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
     curve = heating(time, 0.0, hottest - level, time_constant)
     warm = level + curve[:, np.newaxis, np.newaxis] * profile
     cold = np.full(warm.shape, level)
+    # Background: each person crosses the view once.
     starts = (
         time[0] + (time[-1] - time[0]) * (np.arange(crossings) + rng.random(crossings)) / crossings
     )
@@ -286,7 +288,7 @@ def walkers(
 
 
 def increasing(times: npt.ArrayLike, name: str) -> Array:
-    """Checked times (time,) [s]: two or more, finite, increasing; `name` is for the ValueError."""
+    """Checked times (time,) [s] of a named thing: two or more, finite, increasing."""
     array = _numbers.real_numbers(f"times [s] of {name}", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")

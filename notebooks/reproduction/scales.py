@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import limits, schema
+from dbthermal import _smooth as smooth
+from dbthermal import schema
 from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
@@ -157,7 +158,7 @@ def uncalibrated_reflection(
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
-    functions, _ = np.linalg.qr(weight * limits.polynomial_basis(signal["time"].values, order))
+    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, order))
     rapid = weight * values
     rapid -= [functions @ (functions.T @ part) for part in rapid]
     quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)

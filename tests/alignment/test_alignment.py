@@ -12,7 +12,8 @@ from scipy.interpolate import BarycentricInterpolator
 
 from dbthermal import separation, simulation
 from dbthermal.alignment import align, exposure_times, fill_times, time_offset
-from dbthermal.simulation import Background, Rig, expose
+from dbthermal.simulation import Background, Rig
+from reproduction.disturbances import expose
 
 RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, schema, simulation, store
-from reproduction import twins
+from reproduction import disturbances, twins
 from reproduction.experiments import capture_of
 from reproduction.experiments.pictures import Picture, smooth_shift
 
@@ -90,7 +90,7 @@ def test_a_band_between_its_frames() -> None:
     rng, picture = np.random.default_rng(13), Picture(shape=(40, 56), walkers=5)
     true = smooth_shift(picture.shape, 2.4, 1.2)
     scene = picture.draw(np.arange(720) / 40.0, GLASS, rng, true)
-    seen = simulation.expose(scene, RESPONSE, rng, every=2, offsets=(0, 1), frames=359)
+    seen = disturbances.expose(scene, RESPONSE, rng, every=2, offsets=(0, 1), frames=359)
     seen = seen.drop_vars("exposure_time")
     found = alignment.align(seen).attrs["time_offset"][1]
     assert found == pytest.approx(0.025, abs=0.0025)  # 0.05 of a frame [s]

@@ -10,6 +10,7 @@ from captures import emissivity_of
 from dbthermal import alignment, schema, simulation
 from dbthermal.correction import correct_capture
 from dbthermal.simulation import Rig
+from reproduction import disturbances
 from reproduction.experiments import whole
 
 pytest.importorskip("cv2")
@@ -197,7 +198,7 @@ def test_the_offset_is_that_of_registered_views() -> None:
     wide = simulation.walkers(fine, (32, 40), emissivity_of(0.86, 0.72), rng)
     seen = [wide.isel(y=slice(4, 28), x=slice(4, 36)), wide.isel(y=slice(2, 26), x=slice(7, 39))]
     parts = [
-        simulation.expose(
+        disturbances.expose(
             view.drop_vars(["y", "x"], errors="ignore"),
             response.isel(band=[band]),
             rng,

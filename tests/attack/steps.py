@@ -13,6 +13,7 @@ from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick
 from dbthermal import calibration, correction, emissivity, limits, metrics, separation, simulation
 from dbthermal import response as responses
+from reproduction.contact import contact_measurements
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ def _steps() -> Mapping[str, Step]:
     fit = correction.fit_correction(frames).assign_coords(place)
     rest = xr.DataArray(np.arange(192).reshape(shape) < 64, place, ("y", "x"))
     warm, cold, std = 300 + 3 * np.arange(8.0), np.full(8, 280.0), (0.1, 0.1)
-    bench = simulation.contact_measurements(curves, pair, warm, cold, std, rng)
-    foil = simulation.contact_measurements(curves, 0 * pair, warm, cold, std, rng)["counts"]
+    bench = contact_measurements(curves, pair, warm, cold, std, rng)
+    foil = contact_measurements(curves, 0 * pair, warm, cold, std, rng)["counts"]
     reflector = bench.drop_vars("background_temperature").assign(reflected_counts=foil)
     fixed = {"response": curves, "reading_std": std}
     result = separation.solve(corrected, curves)

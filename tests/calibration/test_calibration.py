@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dbthermal import bands, calibration, response, schema, simulation
+from dbthermal import bands, calibration, response, schema
+from reproduction.contact import contact_measurements
 
 Floats = NDArray[np.float64]
 Change = Callable[[xr.DataArray], xr.DataArray]
@@ -197,7 +198,7 @@ def readings(
     of: xr.Dataset, rng: np.random.Generator, stds: tuple[float, float] = STDS
 ) -> xr.Dataset:
     """Eight measurements of glass."""
-    return simulation.contact_measurements(of, GLASS, WARM, COLD, stds, rng)
+    return contact_measurements(of, GLASS, WARM, COLD, stds, rng)
 
 
 @pytest.fixture

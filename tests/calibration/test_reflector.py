@@ -11,7 +11,8 @@ from captures import emissivity_of
 
 from dbthermal import calibration, response
 from dbthermal.calibration import Bias
-from dbthermal.simulation import Rig, contact_measurements
+from dbthermal.simulation import Rig
+from reproduction.contact import contact_measurements
 from reproduction.experiments.bench import (
     OBJECTS,
     Bench,

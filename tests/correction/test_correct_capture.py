@@ -11,6 +11,7 @@ from captures import drift
 from dbthermal import schema, simulation
 from dbthermal.correction import blackbody_statistics, correct_capture, fit_correction
 from dbthermal.schema import Status
+from reproduction import disturbances
 
 SHAPE, FRAMES, RATE = (24, 30), 240, 60.0  # pixels; frames at so many a second [Hz]
 NOISE, LAG = 2.0, 0.012  # [count], [s]
@@ -38,11 +39,11 @@ def recorded() -> Recorded:
     clean = simulation.observe(scene, rig.response(), rng)
     clean["counts"] = clean["counts"].where(~PATCH, 17000.0).transpose("band", "time", "y", "x")
     # In the order of the instrument: thermal lag, read-out noise, drift, bad pixels, shutter.
-    seen = simulation.lag(clean, LAG)
+    seen = disturbances.lag(clean, LAG)
     noise = rng.normal(0.0, NOISE, seen["counts"].shape).astype(np.float32)
     seen = drift(seen.assign(counts=seen["counts"] + noise), 60.0)
-    seen = simulation.spoil_pixels(seen, 0.01, rng)
-    seen = simulation.fire_shutter(seen, SHUTTER, rng, duration=0.2)
+    seen = disturbances.spoil_pixels(seen, 0.01, rng)
+    seen = disturbances.fire_shutter(seen, SHUTTER, rng, duration=0.2)
     detector = simulation.pattern(rig, SHAPE, rng)
     movies = simulation.blackbody_movies(
         simulation.Rig(), np.array([285.0, 300.0, 315.0, 330.0]), 60, detector, rng

@@ -23,7 +23,7 @@ from dbthermal.correction import (
 )
 from dbthermal.schema import Status
 from dbthermal.simulation import Background
-from reproduction import experiments
+from reproduction import disturbances, experiments
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def rows(events: xr.Dataset) -> list[tuple[str, int, int, bool]]:
 def test_shutter_events_are_found(clean: xr.Dataset) -> None:
     """Each shutter event of each camera is found with all of its frames, without false ones."""
     rng = np.random.default_rng(2)
-    capture = simulation.fire_shutter(clean, [8.0, 20.04], rng, duration=0.55)
-    capture = simulation.fire_shutter(capture, 30.0, rng, bands=("9.5",))
+    capture = disturbances.fire_shutter(clean, [8.0, 20.04], rng, duration=0.55)
+    capture = disturbances.fire_shutter(capture, 30.0, rng, bands=("9.5",))
     before, events = capture.copy(deep=True), find_shutter(capture)
     both = [(band, first, 5, True) for first in (81, 201) for band in RIG.bands]
     assert rows(events) == [*both, ("9.5", 301, 5, True)]
@@ -73,7 +73,7 @@ def test_clean_capture_has_no_event(seed: int) -> None:
 
 def test_repeated_frames_are_found(clean: xr.Dataset) -> None:
     """All of the frames that a driver repeats are found; a lost one starts no segment."""
-    capture = simulation.lose_frames(clean, 0.05, np.random.default_rng(3))
+    capture = disturbances.lose_frames(clean, 0.05, np.random.default_rng(3))
     marked = mark_shutter(capture)
     found = np.isnan(marked["counts"].values).all(axis=(2, 3))
     np.testing.assert_array_equal(found, capture["repeated"])
@@ -182,9 +182,9 @@ def test_separation_stands_a_shutter_and_lost_frames(nuisance: str) -> None:
     )
     capture = simulation.observe(scene, RIG.response(), rng)
     if nuisance == "shutter":
-        spoilt = simulation.fire_shutter(capture, 17.0, rng, offset_std=40.0)
+        spoilt = disturbances.fire_shutter(capture, 17.0, rng, offset_std=40.0)
     else:
-        spoilt = simulation.lose_frames(capture, 0.05, rng)
+        spoilt = disturbances.lose_frames(capture, 0.05, rng)
     results = [separation.solve(one, RIG.response()) for one in (capture, mark_shutter(spoilt))]
     plain, marked = (experiments.score(scene, one)["object_temperature_rmse"] for one in results)
     assert float(marked) <= 1.2 * float(plain)
@@ -219,7 +219,7 @@ def test_common_drift_is_undone() -> None:
 def test_drift_leaves_the_steps() -> None:
     """Each segment is undone by itself; frames taken out stay out, and steps stay in."""
     drifting = drift(still(count=300), 50.0)
-    stepped = simulation.fire_shutter(drifting, 15.0, np.random.default_rng(1))
+    stepped = disturbances.fire_shutter(drifting, 15.0, np.random.default_rng(1))
     marked = mark_shutter(stepped)
     undone = undo_drift(marked, patch(), order=2)
     gone = np.isnan(undone["drift"])
@@ -289,7 +289,7 @@ def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed
     scene = movie(np.random.default_rng(seed).uniform(15000.0, 20000.0, time.size), time)
     # By name and not by place.
     constant = xr.DataArray(list(constants[::-1]), {"band": list(RIG.bands[::-1])}, "band")
-    undone = undo_lag(simulation.lag(scene, constant), constant)
+    undone = undo_lag(disturbances.lag(scene, constant), constant)
     off = (undone["counts"] - scene["counts"])[:, 1:]
     np.testing.assert_allclose(off, 0.0, rtol=0, atol=1e-5)  # [count]
     assert np.isnan(undone["counts"][:, 0]).all()
@@ -333,10 +333,10 @@ def test_bad_pixels_are_found(seed: int) -> None:
     """Noisy, blinking and stuck pixels are marked; walkers and edges of materials are not."""
     capture = walkers(seed)
     false = float((mark_bad(capture)["status"] != 0).mean())
-    spoiled = simulation.spoil_pixels(capture, 0.005, np.random.default_rng(seed))
+    spoiled = disturbances.spoil_pixels(capture, 0.005, np.random.default_rng(seed))
     marked = mark_bad(spoiled)["status"].values == DEAD
     kinds = spoiled["spoiled"].max("band").values
-    rates = [float(marked[kinds == kind].mean()) for kind in range(len(simulation.SPOILED))]
+    rates = [float(marked[kinds == kind].mean()) for kind in range(len(disturbances.SPOILED))]
     assert false < 1e-4
     assert rates[0] < 5e-4
     assert min(rates[1:]) >= 0.95
@@ -351,7 +351,7 @@ def test_fast_frames_are_no_bad_pixels() -> None:
 @pytest.mark.filterwarnings("ignore:Fixed pattern")  # of offsets that the shutter renewed
 def test_shutter_makes_no_bad_pixel() -> None:
     """New offsets after a known shutter event are not marked as blinking pixels."""
-    capture = simulation.fire_shutter(walkers(1), 17.0, np.random.default_rng(4))
+    capture = disturbances.fire_shutter(walkers(1), 17.0, np.random.default_rng(4))
     assert float((mark_bad(capture)["status"] != 0).mean()) > 0.01
     marked = mark_bad(mark_shutter(capture))
     assert not marked["status"].any()
@@ -384,7 +384,7 @@ def holes(kind: str, seed: int = 3) -> npt.NDArray[np.bool_]:
 def test_holes_do_not_hide_bad_pixels(kind: str) -> None:
     """Bad pixels are found, and few others, where up to 40 %, rows or every other frame lack."""
     capture = walkers(0)
-    spoiled = simulation.spoil_pixels(capture, 0.005, np.random.default_rng(0))
+    spoiled = disturbances.spoil_pixels(capture, 0.005, np.random.default_rng(0))
     valid = ~holes(kind)
     found = [mark_bad(one.assign(counts=one["counts"].where(valid))) for one in (capture, spoiled)]
     judged = valid.sum(axis=1).min(axis=0) >= 16

@@ -101,8 +101,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], tuple[str, ...]]] = {
 
 def test_every_figure_is_tested() -> None:
     """The table of figures above holds every public figure."""
-    elsewhere = {"FilmPanel", "LiveFigure", "Panel", "REASONS", "drawing", "film", "first_reason"}
-    elsewhere |= {"separated_film"}
+    elsewhere = {"FilmPanel", "LiveFigure", "Panel", "REASONS", "drawing", "film"}
     assert {*figures.__all__} - elsewhere == DRAWN.keys()
 
 
@@ -130,18 +129,6 @@ def test_celsius_on_the_axes() -> None:
     image = draw_temperatures().axes[0].images[0].get_array()
     apparent = array("band time y x", 2, 2, 5, 6)[0, 0] - 273.15
     np.testing.assert_allclose(np.asarray(image), apparent, rtol=0, atol=1e-9)
-
-
-def test_film() -> None:
-    """A frame a time, of even size, that says what the data are and changes only where it may."""
-    movie = array("time y x", 2, 5, 6)
-    apparent = array("band time y x", 2, 2, 5, 6, origin="simulated")
-    frames = list(figures.separated_film(apparent, movie, movie - 300, title="scene"))
-    assert len(frames) == 2
-    assert all(frame.dtype == np.uint8 and frame.shape == frames[0].shape for frame in frames)
-    assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
-    changed = np.any(frames[0] != frames[1], axis=-1)
-    assert 0.05 < changed.mean() < 0.6  # the images and the time, not the frame around them
 
 
 def test_bad_pixels_are_marked() -> None:
@@ -206,9 +193,5 @@ def test_temperatures_in_another_unit_are_refused() -> None:
     """Data in degrees Celsius are not drawn as if they were kelvins."""
     movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
     inputs = array("band time y x", 2, 2, 5, 6)
-    for call in (
-        lambda: figures.separated_temperatures(inputs, movie, movie, title="scene"),
-        lambda: next(figures.separated_film(inputs, movie, movie, title="scene")),
-    ):
-        with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-            call()
+    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
+        figures.separated_temperatures(inputs, movie, movie, title="scene")

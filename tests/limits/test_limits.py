@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from dbthermal import emissivity, limits, mixing, simulation
 from dbthermal import response as responses
 from dbthermal.simulation import Background, Rig
+from reproduction.closed_form import ratio_variance_bound, reflection_ratio
 
 RIG = Rig()
 THREE = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
@@ -42,9 +43,7 @@ def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> No
     scene = scene_of(0.86, 0.72, **background)
     found = limits.bounds(scene, RIG.response(), order=6, **NOTHING)["reflection_ratio_std"]
     cold = scene["background_temperature"].values[:, 0]
-    variance = limits.ratio_variance_bound(
-        (0.86, 0.72), linear_noise(RIG), cold, polynomials(TIME, 6)
-    )
+    variance = ratio_variance_bound((0.86, 0.72), linear_noise(RIG), cold, polynomials(TIME, 6))
     np.testing.assert_allclose(found[1, 0], np.sqrt(variance), rtol=1e-7)
     assert np.all(found[0] == 0)  # the quieter band over itself
 
@@ -54,7 +53,7 @@ def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
     rng = np.random.default_rng(0)
     time, noise, pair = np.arange(40.0), (0.05, 0.3), (0.86, 0.72)
     background, functions = rng.normal(0, 3, 40), polynomials(time, 4)
-    ratio = float(limits.reflection_ratio(pair))
+    ratio = float(reflection_ratio(pair))
     # Unknowns: the ratio, four coefficients of each band's smooth part, one reflection a frame.
     reflection = (1 - pair[0]) * background
     identity, zero = np.eye(40), np.zeros((40, 4))
@@ -63,7 +62,7 @@ def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
     jacobian = np.vstack([first, second])
     # One combination of smooth part and reflection is shared: the pseudoinverse leaves it out.
     expected = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10)[0, 0]
-    found = limits.ratio_variance_bound(pair, noise, background, functions)
+    found = ratio_variance_bound(pair, noise, background, functions)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

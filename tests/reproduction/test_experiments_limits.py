@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import limits as bounds
 from dbthermal import simulation
+from dbthermal._smooth import polynomial_basis
 from dbthermal.simulation import Rig
+from reproduction.closed_form import ratio_variance_bound
 from reproduction.experiments import cases, limits, nuisances
 
 GLASS, PAIR = [0.86, 0.72], ["8-14", "9.5"]
@@ -44,8 +45,8 @@ def test_slope_is_the_closed_form() -> None:
     time = np.arange(350) / 10.0
     truth, _, _ = cases.simulate(case, Rig(noise=noise), time, size, 4)
     cold = truth["background_temperature"].values[:, 0]
-    smooth = [bounds.polynomial_basis(time, order) for order in range(3, 13)]
-    orders = [np.sqrt(bounds.ratio_variance_bound((0.86, 0.72), noise, cold, f)) for f in smooth]
+    smooth = [polynomial_basis(time, order) for order in range(3, 13)]
+    orders = [np.sqrt(ratio_variance_bound((0.86, 0.72), noise, cold, f)) for f in smooth]
     apart = np.abs(np.array(orders) / measured["reflection_ratio_bound"].values[1] - 1)
     np.testing.assert_allclose(apart.min(axis=0), 0, rtol=0, atol=1e-6)
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from dbthermal import bands, response, schema, simulation
 from dbthermal.simulation import Background, Rig, capture, heating, observe
+from reproduction import disturbances
 
 TIME = np.arange(120) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
@@ -291,7 +292,7 @@ def test_impossible_scene(warm: float, cold: float, scale: float, message: str) 
 def test_lag_is_that_of_a_small_body() -> None:
     """A step is followed as 1 - exp(-t / tau), however the frames are spaced."""
     time = np.array([0.0, 0.004, 0.010, 0.011, 0.030])
-    seen = simulation.lag(movie(np.array([0.0, 1.0, 1.0, 1.0, 1.0]), time), 0.010)["counts"]
+    seen = disturbances.lag(movie(np.array([0.0, 1.0, 1.0, 1.0, 1.0]), time), 0.010)["counts"]
     np.testing.assert_allclose(seen[0, :, 0, 0], -np.expm1(-time / 0.010), rtol=0, atol=1e-12)
 
 
@@ -312,7 +313,7 @@ def test_simulated_nuisances_refuse_nonsense(
 ) -> None:
     """Shares, times and bands outside their range raise a ValueError."""
     with pytest.raises(ValueError, match=message):
-        getattr(simulation, name)(still(), *arguments, **options)
+        getattr(disturbances, name)(still(), *arguments, **options)
 
 
 @pytest.mark.parametrize(
@@ -322,4 +323,4 @@ def test_simulated_nuisances_refuse_nonsense(
 def test_whole_numbers_are_refused(name: str, arguments: Any) -> None:
     """Integer counts raise an error: a lagging pixel of 1000 counts would wrap to 57,580."""
     with pytest.raises(TypeError, match="uint16 of 'counts'"):
-        getattr(simulation, name)(still().astype(np.uint16), *arguments)
+        getattr(disturbances, name)(still().astype(np.uint16), *arguments)

@@ -134,7 +134,7 @@ def ratios(model: Model, work: Work) -> Ratio:
     With S the background's energy in the first band, n = N - K degrees of freedom, and
     :math:`|v|^2 = \sum \kappa_m^2 / s_m^2`, the variance of the ratios is that of eq. 4 with
     :math:`\sigma^2 = 1 / S + n / (S^2 |v|^2)` (Fuller 1987, doi:10.1002/9780470316665). The first
-    term alone is the Cramer-Rao bound; see `limits.ratio_variance_bound`.
+    term alone is the Cramer-Rao bound; see `limits.bounds`.
     """
     noise, material, ratio, axis = model.noise, work.material, work.ratio, work.axis
     bands, orders, frames = noise.size, len(work.scatter), work.first.size

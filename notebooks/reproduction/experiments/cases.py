@@ -9,8 +9,10 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import limits, separation, simulation
+from dbthermal import _smooth as smooth
+from dbthermal import separation, simulation
 from dbthermal.simulation import Background, Rig
+from reproduction import closed_form, disturbances
 
 Array = npt.NDArray[np.float64]
 Case = Mapping[str, Any]
@@ -87,15 +89,15 @@ def efficiency(
 
     Robust standard deviation over the pixels of a scene of one material. The noise is that of the
     two bands' signals [K], the order the size of the smooth subspace of
-    `limits.ratio_variance_bound`.
+    `closed_form.ratio_variance_bound`.
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
-    functions = limits.polynomial_basis(truth["time"].values, order)
+    functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
-    bound = np.sqrt(limits.ratio_variance_bound(pair, noise, background, functions))
-    ratio = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))
-    scaled = (ratio - limits.reflection_ratio(emissivity)) / bound
+    bound = np.sqrt(closed_form.ratio_variance_bound(pair, noise, background, functions))
+    ratio = closed_form.reflection_ratio(result["emissivity"].values.reshape(2, -1))
+    scaled = (ratio - closed_form.reflection_ratio(emissivity)) / bound
     scaled = scaled[np.isfinite(scaled)]
     return float(np.diff(np.quantile(scaled, [0.1587, 0.8413]))[0] / 2)
 
@@ -154,7 +156,7 @@ def simulate(
     if not later:
         return scene, simulation.observe(scene, response, rng), response
     frames, starts = time.size, [0, *[later] * (len(rig.bands) - 1)]
-    seen = simulation.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
+    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
     first = scene.isel(time=slice(0, (frames - 1) * STEPS + 1, STEPS))
     return first, seen.drop_vars("exposure_time"), response
 

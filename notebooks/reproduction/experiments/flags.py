@@ -11,6 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from dbthermal import correction, separation, simulation
 from dbthermal.schema import Status
+from reproduction import disturbances
 from reproduction.experiments import cases, stress
 from reproduction.experiments.pictures import Picture, smooth_shift
 
@@ -152,7 +153,7 @@ def _pictured(
         lost[:, :, ::2] = False
         capture = capture.assign(counts=capture["counts"].where(~lost))
     if "bad" in case:
-        capture = simulation.spoil_pixels(capture, case["bad"], rng)
+        capture = disturbances.spoil_pixels(capture, case["bad"], rng)
         spoiled = np.asarray((capture["spoiled"] > 0).any("band"))
         return drawn, separation.solve(correction.mark_bad(capture), response), spoiled
     if shift is None:

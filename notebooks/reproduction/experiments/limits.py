@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from dbthermal import alignment, limits, separation
 from dbthermal.simulation import Rig
+from reproduction import closed_form
 from reproduction.experiments import cases, stress
 
 KNOWING: Final = ("nothing", "slope", "rest")
@@ -47,7 +48,7 @@ def near_bound(
     - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
       At low noise it is loose, for the data tell the emissivities, and with them the level of
       the background and the ratio of the bands' slopes there, which this bound does not know;
-    - "slope": the closed form `limits.ratio_variance_bound`, one free number a frame, but the
+    - "slope": the closed form `closed_form.ratio_variance_bound`, one free number a frame, but the
       slopes are known: of the three the one that fits the reflection ratio. It says nothing of the
       object;
     - "rest": `limits.bounds` that know in which frames the background rests, which the method does
@@ -148,7 +149,7 @@ def pooled(
     linear = _as_line(response, rig)
     bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
-    ratio, parts = limits.reflection_ratio(list(emissivity)).item(), []
+    ratio, parts = closed_form.reflection_ratio(list(emissivity)).item(), []
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)

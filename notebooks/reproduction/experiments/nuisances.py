@@ -11,6 +11,7 @@ import xarray as xr
 from dbthermal import alignment, separation, simulation
 from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
+from reproduction import disturbances
 from reproduction.experiments.cases import STEPS
 from reproduction.experiments.limits import on_clock
 from reproduction.experiments.stress import INTERVAL
@@ -76,7 +77,7 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
     rng, response = np.random.default_rng(seed), Rig().response()
     scene = kind.scene(rng, later=later, steps=STEPS)
     captures = [
-        simulation.expose(
+        disturbances.expose(
             scene,
             response,
             np.random.default_rng(seed + 1),
@@ -109,10 +110,10 @@ def disturbed(
     capture = simulation.observe(scene, response, rng)
     spoiled = capture
     if "lost frames" in name:
-        spoiled = simulation.lose_frames(spoiled, nuisance["share"], rng).drop_vars("repeated")
+        spoiled = disturbances.lose_frames(spoiled, nuisance["share"], rng).drop_vars("repeated")
     if "shutter" in name:
         last = float(capture["time"][-1])
-        spoiled = simulation.fire_shutter(spoiled, last * np.array(nuisance["shutter"]), rng)
+        spoiled = disturbances.fire_shutter(spoiled, last * np.array(nuisance["shutter"]), rng)
     return _compare(scene, (spoiled, mark_shutter(spoiled), capture), response, TREATMENTS)
 
 

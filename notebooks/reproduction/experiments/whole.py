@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from dbthermal import correction, simulation
 from dbthermal.calibration import fit_response
 from dbthermal.simulation import Rig
+from reproduction import disturbances
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 from reproduction.experiments.stress import INTERVAL
@@ -64,7 +65,7 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     heated = xr.DataArray(1.0 + _UNEVEN * detail / detail.std(), dims=("y", "x"))
     scene["object_temperature"] = ROOM + (scene["object_temperature"] - ROOM) * heated
     response = rig.response()
-    seen = simulation.expose(
+    seen = disturbances.expose(
         scene, response, rng, every=_STEPS, offsets=(0, late), frames=count
     ).drop_vars("exposure_time")
     # The first view begins at the first whole pixel that the second has, too.
@@ -80,10 +81,10 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         y=slice(top, top + shape[0]),
         x=slice(left, left + shape[1]),
     ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
-    seen = simulation.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
+    seen = disturbances.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
-    seen = simulation.fire_shutter(seen, last * np.array(shutter), rng)
-    seen = simulation.lose_frames(seen, lost[0], rng).drop_vars("repeated")
+    seen = disturbances.fire_shutter(seen, last * np.array(shutter), rng)
+    seen = disturbances.lose_frames(seen, lost[0], rng).drop_vars("repeated")
     detector = simulation.pattern(rig, (shape[0], shape[1]), rng)
     kelvin = np.linspace(rig.lowest + 10.0, rig.highest - 5.0, steps)
     one_place = truth.assign(background_temperature=truth["background_temperature"].isel(band=0))

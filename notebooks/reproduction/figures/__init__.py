@@ -1,11 +1,6 @@
 """Figures of the experiments: accuracy, filters, limits, comparisons, nuisances, twins."""
 
-from reproduction.figures.accuracy import (
-    accuracy,
-    error_bar_calibration,
-    truth_and_estimate,
-    validity,
-)
+from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
 from reproduction.figures.comparison import (
     compared_reflections,
     descents,
@@ -15,7 +10,7 @@ from reproduction.figures.comparison import (
     reductions,
     sensitivity,
 )
-from reproduction.figures.emissivities import emissivity_bars, emissivity_by_contact
+from reproduction.figures.emissivity import emissivity_bars, emissivity_by_contact
 from reproduction.figures.filters import condition_matrix
 from reproduction.figures.limits import (
     error_over_bands,
@@ -24,6 +19,7 @@ from reproduction.figures.limits import (
     pooling,
 )
 from reproduction.figures.nuisances import disturbances, offsets, parallax
+from reproduction.figures.scenes import separated_film, truth_and_estimate
 from reproduction.figures.twins import error_maps, thermocouples
 
 __all__ = [
@@ -47,6 +43,7 @@ __all__ = [
     "pooling",
     "reductions",
     "sensitivity",
+    "separated_film",
     "thermocouples",
     "truth_and_estimate",
     "validity",

@@ -8,11 +8,9 @@ import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.constants import zero_Celsius
 
-from dbthermal import schema
-from dbthermal._coordinates import laid_on
-from dbthermal.figures import REASONS, first_reason
+from dbthermal.figures import REASONS
+from dbthermal.figures._status import first_reason
 from dbthermal.figures.drawing import COLORS, band_label, canvas, percent, provenance_note
 
 _RIGHT: Final = "#a8d5b0"
@@ -156,37 +154,3 @@ def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
     axis.set_title(f"arrow: below {_LOWEST:.0f} %", loc="left", fontsize=8, color="0.4")
     axis.grid(visible=True, axis="y", color="0.93")
     axis.set_axisbelow(True)
-
-
-def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
-    """Truth against estimate over time at one pixel, with two standard deviations.
-
-    Object above, background below.
-
-    Parameters
-    ----------
-    truth : Dataset
-        Scene with `object_temperature`, `background_temperature` (time, y, x) [K].
-    result : Dataset
-        From `separation.solve`.
-    pixel : tuple of int
-        Row and column.
-    """
-    names = ("object_temperature", "background_temperature")
-    for dataset, label in ((truth, "the truth"), (result, "the result")):
-        schema.check(dataset, "separated", names, label)
-    figure, axes = canvas(2, 1, (7.4, 5.6))
-    truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
-    place = {"y": pixel[0], "x": pixel[1]}
-    true, estimate = truth.isel(place), result.isel(place)
-    for axis, name in zip(axes[:, 0], names, strict=True):
-        value, std = estimate[name] - zero_Celsius, estimate[f"{name}_std"]
-        time = estimate["time"]
-        axis.fill_between(time, value - 2 * std, value + 2 * std, color=COLORS[0], alpha=0.25)
-        axis.plot(time, value, color=COLORS[0], linewidth=1)
-        axis.plot(true["time"], true[name] - zero_Celsius, "--", color="black", linewidth=1)
-        axis.set(ylabel=name.replace("_", " ") + " [\N{DEGREE SIGN}C]")
-    axes[0, 0].legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
-    axes[-1, 0].set_xlabel("time [s]")
-    figure.suptitle(f"Truth and estimate at pixel {pixel}" + provenance_note(truth))
-    return figure

@@ -1,4 +1,4 @@
-"""Nuisances of real cameras added to a perfect capture: one function each, with its truth."""
+"""Disturbances of real cameras, added one by one to a perfect capture, each with its truth."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -9,14 +9,13 @@ import xarray as xr
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array
-from dbthermal.correction import lag_coefficients
-from dbthermal.simulation._rig import observe
+from dbthermal.correction._temporal import lag_coefficients
+from dbthermal.simulation import observe
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""
 
-# Of bad pixels: noise and step [count], and mean time between steps [s].
-_NOISE, _STEP, _DWELL = 15.0, 60.0, 3.0
+_NOISE, _STEP, _DWELL = 15.0, 60.0, 3.0  # of bad pixels: noise and step [count], dwell time [s]
 
 
 def expose(
@@ -28,9 +27,9 @@ def expose(
     offsets: Sequence[int],
     frames: int,
 ) -> xr.Dataset:
-    r"""Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
+    r"""Capture of bands that are exposed at different times, with time stamps.
 
-    The scene is on a fine clock; frame n of band m is exposed at its step :math:`o_m + n \, q_m`.
+    The scene has a fine clock; frame n of band m is exposed at its step :math:`o_m + n \, q_m`.
 
     Parameters
     ----------
@@ -73,21 +72,21 @@ def expose(
             f"and lie in [0, {last}], the steps of the scene."
         )
     stamps = scene["time"].values[steps]
-    parts = [
+    bands_exposed = [
         observe(scene.isel(time=row), response.isel(band=[place]), rng).assign_coords(
             time=("time", stamps[0], scene["time"].attrs)
         )
         for place, row in enumerate(steps)
     ]
-    together = xr.concat(parts, dim="band", combine_attrs="override")
+    together = xr.concat(bands_exposed, dim="band", combine_attrs="override")
     exposed = schema.variables("corrected", {"exposure_time": stamps})
     return schema.check(together.assign(exposed), "corrected")
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """Lose frames at random: each is replaced by the one before, as by a driver that stamps none.
+    """Replace lost frames at random by the one before, as a driver does that stamps none.
 
-    The result has no `exposure_time`, and `repeated` (band, time), bool, beside the counts.
+    The result has no `exposure_time`, but `repeated` (band, time), bool.
 
     Parameters
     ----------
@@ -174,10 +173,8 @@ def fire_shutter(
 def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
-    Noise of 15 counts is added to a noisy pixel; a blinking one steps by 60, every 3 s on average
-    and once at least.
-
-    The result has `spoiled` (band, y, x), int8, the position in `SPOILED`, beside the counts.
+    Noisy pixels have 15 counts more noise; blinking ones step by 60, every 3 s on average and at
+    least once. The result has `spoiled` (band, y, x), int8, the position in `SPOILED`.
 
     Parameters
     ----------
@@ -246,12 +243,12 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 
 
 def _floating(corrected: xr.Dataset) -> xr.DataArray:
-    """Copy of the counts of a capture, which whole numbers would round and wrap around."""
+    """Floating copy of the counts of a capture."""
     return schema.check_corrected(corrected)["counts"].copy(deep=True)
 
 
 def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
-    """Random telegraph signal (time) of 0 and 1 that changes at least once, at a mean dwell [s]."""
+    """Random telegraph signal (time) of 0 and 1 with a mean dwell time [s] and at least a step."""
     chance = -np.expm1(-np.diff(time) / dwell)
     steps = np.flatnonzero(rng.random(chance.size) < chance)
     if steps.size == 0:

@@ -1,4 +1,4 @@
-"""Figures of band emissivities: of a library, and of the bench."""
+"""Figures of band emissivities, from a table and by contact."""
 
 from typing import Any
 
