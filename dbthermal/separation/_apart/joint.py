@@ -133,12 +133,15 @@ class Joint:
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
-        signals, weights, changes = self.signals[..., pixels], self.frames.weights, []
+        weights, changes = self.frames.weights, []
+        # Nodes at which the change is needed: of a rapid film, those frames alone.
+        nodes = frames if weights is None else slice(None)
+        signals = self.signals[:, nodes][..., pixels]
         bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
         for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
             change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
             change = np.nan_to_num(share.astype(np.float32) * change)
-            changes.append(change[frames] if weights is None else weights[frames] @ change)
+            changes.append(change if weights is None else weights[frames] @ change)
         return np.asarray(changes)
 
     def finish(self, result: xr.Dataset) -> None:
