@@ -247,8 +247,31 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
 
 
 def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """All steps: a pixel keeps its division of the time from a pass before, unless it fails."""
+    functions, kept = _functions(tile), tile.division
+    places = np.flatnonzero(() if kept is None else kept.any(axis=0))
+    if kept is None or places.size == 0:
+        return _searched(tile, functions, settings)
+    chosen, first = tile.select_pixels(places), kept[:, places]
+    estimate = _report(chosen, _divided(chosen, first, functions, settings))
+    sound = estimate.status == 0
+    estimate = _finished(chosen, estimate, first, functions, settings)
+    # A flag asks for the search.
+    searched = np.ones(kept.shape[1], dtype=bool)
+    searched[places[sound]] = False
+    if not searched.any():
+        return estimate
+    result = _searched(tile.select_pixels(searched), functions, settings)
+    result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
+    if result.division is None:
+        result = replace(result, division=np.zeros_like(kept))
+    result.replace_pixels(places[sound], estimate.select_pixels(sound))
+    return result
+
+
+def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
-    functions, noise = _functions(tile), np.array(tile.noise)
+    noise = np.array(tile.noise)
     solution = _solve(tile, functions, settings)
     used = solution.order + functions.steps
     asked = pieces.asked(
@@ -295,24 +318,38 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         best.replace_pixels(places, resolved)
         cost[places] = candidate.cost[places]
         first[:, places] = candidate.first[:, places]
-    divided = np.asarray(first.any(axis=0))
-    surveyed = divided.copy()
-    if suspects.material is not None:  # one with its emissivity is not asked for a scatter
-        surveyed &= np.isnan(suspects.material.noise_variance)
-    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
-        chosen = suspects.select_pixels(surveyed)
-        more = _report(chosen, _divided(chosen, first[:, surveyed], functions, settings, number))
-        best.replace_scatter(place, surveyed, more)
-    jumping = divided & pieces.sudden(
-        best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
-    )
-    status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
+    best = _finished(suspects, best, first, functions, settings)
     # A delay of the bands asks for a piece at each change of the background, which hide it.
     asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first.sum(axis=0) > _MOST_PIECES
-    status |= np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
+    status = best.status | np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
+    first[:, hidden | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
+    result = replace(result, division=np.zeros((tile.time.size, asked.size), dtype=bool))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
+
+
+def _finished(
+    tile: Tile,
+    estimate: Estimate,
+    first: Mask,
+    functions: smooth.Subspace,
+    settings: SubspaceSettings,
+) -> Estimate:
+    """Estimate with its division, a survey by more functions of the pieces, and flags of jumps."""
+    divided = np.asarray(first.any(axis=0))
+    surveyed = divided & tile.surveyed
+    if tile.material is not None:  # one with its emissivity is not asked for a scatter
+        surveyed &= np.isnan(tile.material.noise_variance)
+    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
+        chosen = tile.select_pixels(surveyed)
+        more = _report(chosen, _divided(chosen, first[:, surveyed], functions, settings, number))
+        estimate.replace_scatter(place, surveyed, more)
+    jumping = divided & pieces.sudden(
+        estimate.object_temperature, _AS_GIVEN * estimate.object_temperature_std, tile.time
+    )
+    status = estimate.status | status_bits({Status.OBJECT_JUMP: jumping})
+    return replace(estimate, status=status, division=first)
 
 
 def _divided(
