@@ -133,16 +133,17 @@ class Joint:
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
-        weights, changes = self.frames.weights, []
-        # Nodes at which the change is needed: of a rapid film, those frames alone.
-        nodes = frames if weights is None else slice(None)
-        signals = self.signals[:, nodes][..., pixels]
-        bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
-        for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
-            change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
-            change = np.nan_to_num(share.astype(np.float32) * change)
-            changes.append(change if weights is None else weights[frames] @ change)
-        return np.asarray(changes)
+        weights = self.frames.weights
+        # Of a rapid film the frames that are needed, else all nodes.
+        signals = self.signals[:, frames if weights is None else slice(None)]
+        changes = system.changes(self.inputs, signals, pixels, self.emissivity)
+        return changes if weights is None else weights[frames] @ changes
+
+    def start(self, frames: Whole, pixels: Whole) -> Floats | None:
+        """Signals (pixel, frame) [K] of x(r) at some frames; None unless all of them are nodes."""
+        if not np.isin(frames, self.frames.nodes).all():
+            return None
+        return self.signals[0, np.searchsorted(self.frames.nodes, frames)][:, pixels].T
 
     def finish(self, result: xr.Dataset) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
@@ -222,15 +223,14 @@ def solve(
         ) -> tuple[Floats, Floats, Floats]:
             """Object at both places and the last step (solved, frame) [K] of some frames."""
             combination, guess = target(at)
+            if start is None and before is not None:
+                start = before.start(at, places)
             guess = guess if start is None else np.where(np.isfinite(start), start, guess)
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
                 return equations.packed.solve(combination, guess, change.at(at))
 
         # The object at both places at a few frames: does its gradient matter?
-        start = None
-        if sampled is frames.nodes and before is not None:
-            start = before.signals[0][:, places].T
-        at_r, at_p, step = objects_at(sampled, equations, start)
+        at_r, at_p, step = objects_at(sampled, equations)
         second = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
         share = np.abs(second[:, np.newaxis] * (at_p - at_r)) / size[:, np.newaxis]
         if not _most(share) > _MATTERS:
