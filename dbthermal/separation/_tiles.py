@@ -252,11 +252,12 @@ class Estimate(Pixels):
         }
         return replace(self, emissivity_covariance=covariance, **parts)
 
-    def replace_scatter(self, order: int, selected: Mask, part: "Estimate") -> None:
-        """Replace a scatter of the survey by the first one of a part (pixel), in place."""
-        if self.survey is not None and part.survey is not None:
-            self.survey.scatter[order][..., selected] = part.survey.scatter[0]
-            self.survey.frames[order][selected] = part.survey.frames[0]
+    def replace_scatter(self, order: int, selected: Mask, scatter: Array, frames: Array) -> None:
+        """Replace a scatter of a sound survey, and its degrees of freedom (pixel), in place."""
+        if self.survey is not None:
+            sound = self.survey.frames[0, selected] > 0
+            self.survey.scatter[order][..., selected] = np.where(sound, scatter, 0.0)
+            self.survey.frames[order, selected] = np.where(sound, frames, 0.0)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
