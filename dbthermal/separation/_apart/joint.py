@@ -99,6 +99,8 @@ class Frames:
         off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
         if _most(off) < _NO_MATTER:
             return cls(nodes, weights, smooth=True)
+        if time.size <= 3 * _STRIDE:  # less than four nodes
+            return cls(every, None, smooth=False)
         nodes = np.append(every[:-1:_STRIDE], every[-1])
         cubic, between = _cubic(time, nodes), np.setdiff1d(sampled, nodes)
         off = np.abs(cubic[between] @ film[nodes] - film[between]) / std[between]
@@ -136,7 +138,9 @@ def _cubic(time: Floats, nodes: Whole) -> csr_array:
         for other in np.delete(np.arange(4), node):
             distance = place[:, node] - place[:, other]
             weights[:, node] *= (time - place[:, other]) / distance
-    return csr_array((weights.ravel(), four.ravel(), 4 * np.arange(time.size + 1)))
+    result = csr_array((weights.ravel(), four.ravel(), 4 * np.arange(time.size + 1)))
+    result.eliminate_zeros()
+    return result
 
 
 def looked_at(frames: int) -> Whole:
@@ -168,12 +172,6 @@ class Joint:
         if weights is None:
             return changes
         return np.stack([weights @ change for change in changes])
-
-    def start(self, frames: Whole, pixels: Whole) -> Floats | None:
-        """Signals (pixel, frame) [K] of x(r) at some frames; None unless all of them are nodes."""
-        if not np.isin(frames, self.frames.nodes).all():
-            return None
-        return self.signals[0, np.searchsorted(self.frames.nodes, frames)][:, pixels].T
 
     def finish(self, result: xr.Dataset) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
@@ -253,14 +251,15 @@ def solve(
         ) -> tuple[Floats, Floats, Floats]:
             """Object at both places and the last step (solved, frame) [K] of some frames."""
             combination, guess = target(at)
-            if start is None and before is not None:
-                start = before.start(at, places)
             guess = guess if start is None else np.where(np.isfinite(start), start, guess)
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
                 return equations.packed.solve(combination, guess, change.at(at))
 
         # The object at both places at a few frames: does its gradient matter?
-        at_r, at_p, step = objects_at(sampled, equations)
+        start = None
+        if sampled is frames.nodes and before is not None and before.frames.smooth:
+            start = before.signals[0][:, places].T
+        at_r, at_p, step = objects_at(sampled, equations, start)
         second = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
         share = np.abs(second[:, np.newaxis] * (at_p - at_r)) / size[:, np.newaxis]
         if not _most(share) > _MATTERS:
