@@ -21,12 +21,11 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
-from scipy.sparse import csr_array
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import copied, release
@@ -56,9 +55,6 @@ _MOST: Final = 0.99
 # no matter that a film is not smooth.
 _NODES: Final = 2
 _NO_MATTER: Final = 0.1
-# Frames from node to node of a rapid film, and the share of the samples that they repeat: at fronts
-# of 2 to 6 s at 10 Hz to 0.04 of a deviation, 99 of 100 to 0.7, for they jump between pieces.
-_STRIDE, _MOSTLY = 3, 0.9
 # Draws of noise by which the deviations are propagated, and the variance over that of a pixel alone
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
@@ -67,11 +63,15 @@ _GROWN: Final = 1e3
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames at which a film is solved: a few of one that is smooth, else many or all."""
+    """Frames at which a film is solved: a few of one that is smooth, else all."""
 
     nodes: Whole  # (node)
-    weights: Floats | csr_array | None  # of the nodes in each frame (frame, node); None of all
-    smooth: bool  # a few functions of time tell all
+    weights: Floats | None  # of the nodes in each frame (frame, node); None of all frames
+
+    @property
+    def smooth(self) -> bool:
+        """The film changes smoothly: a few frames tell all."""
+        return self.weights is not None
 
     @classmethod
     @np.errstate(invalid="ignore", divide="ignore")
@@ -80,8 +80,7 @@ class Frames:
 
         Polynomials through nodes that lie close together near the ends, as Chebyshev's do, repeat a
         film that is one of them. Where they are off by more than a share of its deviation, in more
-        than a few of the samples, the object changes rapidly: then evenly spaced nodes, if cubic
-        polynomials through four of them repeat most samples as well, but for jumps.
+        than a few of the samples, the object changes rapidly.
         """
         film, std = (
             result[name].values.reshape(result.sizes["time"], -1)
@@ -94,53 +93,20 @@ class Frames:
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
         weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
         sampled = looked_at(time.size)
-        if nodes.size == time.size:
-            return cls(nodes, None, smooth=False)
         off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
-        if _most(off) < _NO_MATTER:
-            return cls(nodes, weights, smooth=True)
-        if time.size <= 3 * _STRIDE:  # less than four nodes
-            return cls(every, None, smooth=False)
-        nodes = np.append(every[:-1:_STRIDE], every[-1])
-        cubic, between = _cubic(time, nodes), np.setdiff1d(sampled, nodes)
-        off = np.abs(cubic[between] @ film[nodes] - film[between]) / std[between]
-        if _most(off, _MOSTLY) < _NO_MATTER:
-            return cls(nodes, cubic, smooth=False)
-        return cls(every, None, smooth=False)
-
-    def around(self, frames: slice | Whole) -> tuple[slice | Whole, Any]:
-        """Nodes that tell some frames, and their weights in each (frame, node), None of all."""
-        if self.weights is None:
-            return frames, None
-        weights = self.weights[frames]
-        if isinstance(weights, np.ndarray) or weights.shape[0] >= self.nodes.size:
-            return slice(None), weights
-        used = np.unique(weights.indices)
-        return used, weights[:, used]
+        if nodes.size == time.size or not _most(off) < _NO_MATTER:
+            return cls(every, None)
+        return cls(nodes, weights)
 
     def parts(self) -> list[slice]:
         """Nodes that are solved together."""
         return [slice(at, at + _FRAMES) for at in range(0, self.nodes.size, _FRAMES)]
 
 
-def _most(values: Floats, share: float = _MOST) -> float:
+def _most(values: Floats) -> float:
     """Value that all but a few of those that are numbers do not exceed; NaN of none."""
     numbers = values[np.isfinite(values)]
-    return float(np.quantile(numbers, share)) if numbers.size else np.nan
-
-
-def _cubic(time: Floats, nodes: Whole) -> csr_array:
-    """Weights of nodes in each frame (frame, node): of the cubic polynomial through four nodes."""
-    first = np.clip(np.searchsorted(nodes, np.arange(time.size), "right") - 2, 0, nodes.size - 4)
-    four = first[:, np.newaxis] + np.arange(4)
-    place, weights = time[nodes[four]], np.ones(four.shape, np.float32)
-    for node in range(4):
-        for other in np.delete(np.arange(4), node):
-            distance = place[:, node] - place[:, other]
-            weights[:, node] *= (time - place[:, other]) / distance
-    result = csr_array((weights.ravel(), four.ravel(), 4 * np.arange(time.size + 1)))
-    result.eliminate_zeros()
-    return result
+    return float(np.quantile(numbers, _MOST)) if numbers.size else np.nan
 
 
 def looked_at(frames: int) -> Whole:
@@ -167,11 +133,11 @@ class Joint:
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
-        nodes, weights = self.frames.around(frames)
-        changes = system.changes(self.inputs, self.signals[:, nodes], pixels, self.emissivity)
-        if weights is None:
-            return changes
-        return np.stack([weights @ change for change in changes])
+        weights = self.frames.weights
+        # Of a rapid film the frames that are needed, else all nodes.
+        signals = self.signals[:, frames if weights is None else slice(None)]
+        changes = system.changes(self.inputs, signals, pixels, self.emissivity)
+        return changes if weights is None else weights[frames] @ changes
 
     def finish(self, result: xr.Dataset) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
