@@ -406,34 +406,3 @@ def solve_parts(
         **dict(zip(FILMS, films, strict=True)),
     }
     return Solution(**named)
-
-
-def outside(
-    signals: Array, noise: tuple[float, ...], parts: Iterable[tuple[Whole, smooth.Subspace]]
-) -> tuple[Array, Array]:
-    """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
-
-    Of signals (pixel, band, time) [K], whitened.
-    """
-    pixels, bands, frames = signals.shape
-    scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
-    for places, own in parts:
-        columns = np.ascontiguousarray(own.functions.T)
-        _outside(columns, own.spans, signals, places, np.empty((bands, len(columns))), scatter)
-        freedom[places] = frames - len(columns)
-    whitened = scatter.transpose(1, 2, 0) / np.multiply.outer(noise, noise)[..., np.newaxis]
-    return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
-
-
-@kernels.entered
-def _outside(
-    columns: Array, spans: Whole, signals: Array, places: Whole, held: Array, scatter: Array
-) -> None:
-    """Products of signals (pixel, band, time) outside columns (column, time), in place."""
-    for p in range(places.size):
-        here = signals[places[p]]
-        for m in range(len(here)):
-            kernels.projected(columns, spans, len(columns), here[m], held[m])
-            for n in range(m + 1):
-                product = kernels.dot(here[m], here[n]) - kernels.dot(held[m], held[n])
-                scatter[places[p], m, n] = scatter[places[p], n, m] = product

@@ -299,7 +299,8 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
         replace(candidate, cost=candidate.cost + further * candidate.functions)
         for candidate in divisions
     ]
-    cost = energy + (pieces.COST + further) * count  # of one smooth curve
+    smoothly = energy + (pieces.COST + further) * count  # of one smooth curve
+    cost = smoothly.copy()
     lowest = np.min([cost, *(candidate.cost for candidate in divisions)], axis=0)
     for candidate in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
@@ -324,7 +325,9 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
     asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first.sum(axis=0) > _MOST_PIECES
     status = best.status | np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
-    first[:, hidden | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
+    # Pieces that are beyond doubt, and have no flag, are kept for the next pass.
+    doubtful = hidden | (smoothly < cost + _LIKELY)
+    first[:, doubtful | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
     result = replace(result, division=np.zeros((tile.time.size, asked.size), dtype=bool))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
@@ -340,7 +343,7 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
         straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
         parts = _parts(tile, first[:, surveyed], functions, number)
-        estimate.replace_scatter(place, surveyed, *fused.outside(straight, tile.noise, parts))
+        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, tile.noise, parts))
     jumping = divided & pieces.sudden(
         estimate.object_temperature, _AS_GIVEN * estimate.object_temperature_std, tile.time
     )
@@ -363,7 +366,10 @@ def _parts(
     tile: Tile, first: Mask, functions: smooth.Subspace, number: int = smooth.PIECE_ORDER
 ) -> Iterator[tuple[Whole, smooth.Subspace]]:
     """Yield pixels whose pieces begin with the same frames (time, pixel), and their functions."""
-    for places in pieces.alike(first):
+    alike: dict[bytes, list[int]] = {}
+    for place, begins in enumerate(first.T):
+        alike.setdefault(begins.tobytes(), []).append(place)
+    for places in map(np.array, alike.values()):
         begins, rising = first[:, places[0]], functions.rising
         yield (
             places,
