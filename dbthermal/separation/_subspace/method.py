@@ -299,8 +299,7 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
         replace(candidate, cost=candidate.cost + further * candidate.functions)
         for candidate in divisions
     ]
-    smoothly = energy + (pieces.COST + further) * count  # of one smooth curve
-    cost = smoothly.copy()
+    cost = energy + (pieces.COST + further) * count  # of one smooth curve
     lowest = np.min([cost, *(candidate.cost for candidate in divisions)], axis=0)
     for candidate in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
@@ -325,9 +324,8 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
     asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first.sum(axis=0) > _MOST_PIECES
     status = best.status | np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
-    # Pieces that are beyond doubt, and have no flag, are kept for the next pass.
-    doubtful = hidden | (smoothly < cost + _LIKELY)
-    first[:, doubtful | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
+    # Pieces without a flag are kept for the next pass.
+    first[:, hidden | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
     result = replace(result, division=np.zeros((tile.time.size, asked.size), dtype=bool))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
