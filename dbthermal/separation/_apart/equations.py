@@ -243,7 +243,7 @@ def bends(curves: tuple[Curve, ...]) -> Floats:
 
 
 @compiled
-def _changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result: Floats) -> None:
+def changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result: Floats) -> None:
     """Shares (pixel) of the change of u_m, of u_1 at both places (2, node, pixel), in place."""
     for t in range(result.shape[0]):
         for p in range(pixels.size):
@@ -253,17 +253,6 @@ def _changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, resul
                 of_r, of_p = of_r * at_r + bend[degree], of_p * at_p + bend[degree]
             change = shares[p] * (change + of_p - of_r)
             result[t, p] = 0.0 if np.isnan(change) else change
-
-
-def changes(
-    inputs: Inputs, signals: Floats, pixels: Whole, emissivity: Floats
-) -> npt.NDArray[np.float32]:
-    """Signals (band - 1, node, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
-    every = bends(tuple(inputs.curves[band] for band in inputs.bands))
-    result = np.empty((len(every), signals.shape[1], pixels.size), np.float32)
-    for film, shares, bend in zip(result, emissivity[1:, pixels], every, strict=True):
-        _changes(signals, pixels, shares, bend, film)
-    return result
 
 
 def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats, Mask]:

@@ -136,7 +136,10 @@ class Joint:
         weights = self.frames.weights
         # Of a rapid film the frames that are needed, else all nodes.
         signals = self.signals[:, frames if weights is None else slice(None)]
-        changes = system.changes(self.inputs, signals, pixels, self.emissivity)
+        bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
+        changes = np.empty((len(bends), signals.shape[1], pixels.size), np.float32)
+        for film, share, bend in zip(changes, self.emissivity[1:, pixels], bends, strict=True):
+            system.changes(signals, pixels, share, bend, film)
         return changes if weights is None else weights[frames] @ changes
 
     def finish(self, result: xr.Dataset) -> None:
