@@ -262,8 +262,11 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
     searched[places[sound]] = False
     if not searched.any():
         return estimate
-    result = _searched(tile.select_pixels(searched), functions, settings)
-    result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
+    if 2 * np.count_nonzero(searched) > searched.size:  # to select most of a tile takes longer
+        result = _searched(tile, functions, settings)
+    else:
+        result = _searched(tile.select_pixels(searched), functions, settings)
+        result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
     if result.division is None:
         result = replace(result, division=np.zeros_like(kept))
     result.replace_pixels(places[sound], estimate.select_pixels(sound))
