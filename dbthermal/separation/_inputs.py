@@ -101,6 +101,7 @@ class Inputs:
     emissivity_covariance: Array | None  # (band, band, y, x) [1]
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
+    division: npt.NDArray[np.uint8]  # of the time, by the pass before, packed (frame / 8, pixel)
     difference: Callable[[slice, slice | Labels], npt.NDArray[Any]] | None = None  # `joint.Joint`
 
     @property
@@ -199,6 +200,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         emissivity_covariance=covariance,
         labels=None if pool is None else numbered(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, order[0]),
+        division=np.zeros(
+            (-(-capture.sizes["time"] // 8), capture["y"].size * capture["x"].size), np.uint8
+        ),
     )
 
 

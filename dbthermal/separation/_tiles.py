@@ -141,6 +141,8 @@ class Tile:
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    division: Mask | None = None  # frames with which pieces of time begin, if kept (time, pixel)
+    surveyed: bool = True  # the estimate's survey is needed
 
     @property
     def reference(self) -> float:
@@ -169,13 +171,14 @@ class Tile:
         """Return the tile with the selected frames (time) alone."""
         segment = None if self.segment is None else self.segment[selected]
         signals = select(self.signals, selected, axis=1)
-        return replace(self, signals=signals, time=self.time[selected], segment=segment)
+        time = self.time[selected]
+        return replace(self, signals=signals, time=time, segment=segment, division=None)
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         arrays: dict[str, Any] = {
             name: None if getattr(self, name) is None else select(getattr(self, name), selected)
-            for name in ("emissivity", "emissivity_covariance")
+            for name in ("emissivity", "emissivity_covariance", "division")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = select(self.signals, selected)
@@ -198,6 +201,7 @@ class Estimate(Pixels):
     reflection_ratio_std: Array | None = None
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
     survey: Survey | None = None  # for the material, of a method that pools
+    division: Mask | None = None  # frames with which pieces of time begin (time, pixel)
 
     @classmethod
     def without_std(
@@ -240,11 +244,12 @@ class Estimate(Pixels):
         }
         return replace(self, emissivity_covariance=covariance, **arrays)
 
-    def replace_scatter(self, order: int, selected: Mask, estimate: "Estimate") -> None:
-        """Replace a scatter of the survey by the first of another estimate, in place."""
-        if self.survey is not None and estimate.survey is not None:
-            self.survey.scatter[order][..., selected] = estimate.survey.scatter[0]
-            self.survey.frames[order][selected] = estimate.survey.frames[0]
+    def replace_scatter(self, order: int, selected: Mask, scatter: Array, frames: Array) -> None:
+        """Replace a scatter of a sound survey, and its degrees of freedom (pixel), in place."""
+        if self.survey is not None:
+            sound = self.survey.frames[0, selected] > 0
+            self.survey.scatter[order][..., selected] = np.where(sound, scatter, 0.0)
+            self.survey.frames[order, selected] = np.where(sound, frames, 0.0)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
@@ -257,7 +262,7 @@ class Estimate(Pixels):
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name in ("status", "survey", *not_estimated) or name.endswith(
+            if name in ("status", "survey", "division", *not_estimated) or name.endswith(
                 ("_std", "_covariance")
             ):
                 continue
@@ -383,6 +388,9 @@ def cut(
         else:
             sets = list(quality.frame_sets(usable, status))
         tile = _tile(inputs, counts, time, window, segment, selected)
+        needed = displacement is None or wanted is not None
+        division = _unpacked(inputs.division[:, places], time.size)
+        tile = replace(tile, surveyed=needed, division=division)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
@@ -399,6 +407,11 @@ def cut(
                 piece for section in sections for piece in of_one_noise(*section, gain, most)
             ]
         yield Cut(window, places, status, valid, sections)
+
+
+def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:
+    """Frames with which the pieces of the time begin (time, pixel); None if none are kept."""
+    return np.unpackbits(division, axis=0, count=frames).view(bool) if division.any() else None
 
 
 def _tile(

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from numpy.testing import assert_allclose
 
 from dbthermal import separation, simulation
+from dbthermal.schema import Status
+from dbthermal.separation._inputs import check
+from dbthermal.separation._solve import get_method, separated
 from reproduction.experiments.pictures import Picture
 
 TIME = np.arange(300) / 10.0
@@ -63,6 +67,21 @@ def test_a_kinked_rise_is_followed() -> None:
     """A front of kinked rises of 0.3 to 3 s: most pixels without a flag, true intervals."""
     rng = np.random.default_rng(1)
     assert_followed("kink", heated("kink", rng), rng)
+
+
+def test_pieces_are_kept_for_the_next_pass() -> None:
+    """A second pass takes the pieces of the first, and tells the same; a flag asks anew."""
+    rng = np.random.default_rng(1)
+    capture = simulation.observe(heated("kink", rng), RIG.response(), rng)
+    inputs = check(capture, RIG.response(), get_method("subspace"))
+    first, _ = separated(inputs)
+    kept = inputs.division.any(axis=0).reshape(first["status"].shape)
+    jump = np.uint32(Status.OBJECT_JUMP)
+    assert kept.mean() > 0.5
+    assert not np.any(first["status"].values[kept] & ~jump)
+    second, _ = separated(inputs)
+    for name in ("object_temperature", "object_temperature_std", "status"):
+        assert_allclose(second[name], first[name], rtol=0, atol=1e-3)  # K, and bits
 
 
 def switched(rng: np.random.Generator, pair: tuple[float, float], rate: float) -> xr.Dataset:

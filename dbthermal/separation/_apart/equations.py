@@ -348,13 +348,17 @@ def bends(curves: tuple[Curve, ...]) -> Floats:
     return result
 
 
-def other_band(bend: Floats, signal: Floats) -> Floats:
-    """Signal u_m(x) [K] of u_1(x), by the polynomial of their difference."""
-    result = np.full_like(signal, bend[-1])
-    for coefficient in bend[-2::-1]:
-        result *= signal
-        result += signal.dtype.type(coefficient)
-    return result + signal
+@compiled
+def changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result: Floats) -> None:
+    """Shares (pixel) of the change of u_m, of u_1 at both places (2, node, pixel), in place."""
+    for t in range(result.shape[0]):
+        for p in range(pixels.size):
+            at_r, at_p = np.float64(signals[0, t, pixels[p]]), np.float64(signals[1, t, pixels[p]])
+            change, of_r, of_p = at_p - at_r, 0.0, 0.0
+            for degree in range(bend.size - 1, -1, -1):
+                of_r, of_p = of_r * at_r + bend[degree], of_p * at_p + bend[degree]
+            change = shares[p] * (change + of_p - of_r)
+            result[t, p] = 0.0 if np.isnan(change) else change
 
 
 def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats, Mask]:

@@ -133,13 +133,14 @@ class Joint:
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
         """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
-        signals, weights, changes = self.signals[..., pixels], self.frames.weights, []
+        weights = self.frames.weights
+        # Of a rapid film the frames that are needed, else all nodes.
+        signals = self.signals[:, frames if weights is None else slice(None)]
         bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
-        for share, bend in zip(self.emissivity[1:, pixels], bends, strict=True):
-            change = system.other_band(bend, signals[1]) - system.other_band(bend, signals[0])
-            change = np.nan_to_num(share.astype(np.float32) * change)
-            changes.append(change[frames] if weights is None else weights[frames] @ change)
-        return np.asarray(changes)
+        changes = np.empty((len(bends), signals.shape[1], pixels.size), np.float32)
+        for film, share, bend in zip(changes, self.emissivity[1:, pixels], bends, strict=True):
+            system.changes(signals, pixels, share, bend, film)
+        return changes if weights is None else weights[frames] @ changes
 
     def finish(self, result: xr.Dataset) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
@@ -225,7 +226,7 @@ def solve(
 
         # The object at both places at a few frames: does its gradient matter?
         start = None
-        if sampled is frames.nodes and before is not None:
+        if sampled is frames.nodes and before is not None and before.frames.smooth:
             start = before.signals[0][:, places].T
         at_r, at_p, step = objects_at(sampled, equations, start)
         second = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)

@@ -32,6 +32,7 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
     displacement = inputs.displacement
     assert displacement is not None
     separate_pixels(inputs, None)
+    inputs.division[:] = 0  # it holds what each camera sees to rise
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
     if inputs.method.pools and displacement.moves:

@@ -51,6 +51,7 @@ formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
 import importlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Final
@@ -59,7 +60,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import require_device, select
+from dbthermal._arrays import Array, require_device, select
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
@@ -71,7 +72,7 @@ from dbthermal.separation._subspace import (
     reflection_ratio,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import Estimate, Mask, Tile
+from dbthermal.separation._tiles import Estimate, Mask, Tile, Whole
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -247,8 +248,34 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
 
 
 def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """All steps: a pixel keeps its division of the time from a pass before, unless it fails."""
+    functions, kept = _functions(tile), tile.division
+    places = np.flatnonzero(() if kept is None else kept.any(axis=0))
+    if kept is None or places.size == 0:
+        return _searched(tile, functions, settings)
+    chosen, first = tile.select_pixels(places), kept[:, places]
+    estimate = _report(chosen, _divided(chosen, first, functions, settings))
+    sound = estimate.status == 0
+    estimate = _finished(chosen, estimate, first, functions)
+    # A flag asks for the search.
+    searched = np.ones(kept.shape[1], dtype=bool)
+    searched[places[sound]] = False
+    if not searched.any():
+        return estimate
+    if 2 * np.count_nonzero(searched) > searched.size:  # to select most of a tile takes longer
+        result = _searched(tile, functions, settings)
+    else:
+        result = _searched(tile.select_pixels(searched), functions, settings)
+        result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
+    if result.division is None:
+        result = replace(result, division=np.zeros_like(kept))
+    result.replace_pixels(places[sound], estimate.select_pixels(sound))
+    return result
+
+
+def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
-    functions, noise = _functions(tile), np.array(tile.noise)
+    noise = np.array(tile.noise)
     solution = _solve(tile, functions, settings)
     used = solution.order + functions.steps
     asked = pieces.asked(
@@ -295,44 +322,74 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         best.replace_pixels(places, resolved)
         cost[places] = candidate.cost[places]
         first[:, places] = candidate.first[:, places]
-    divided = np.asarray(first.any(axis=0))
-    surveyed = divided.copy()
-    if suspects.material is not None:  # one with its emissivity is not asked for a scatter
-        surveyed &= np.isnan(suspects.material.noise_variance)
-    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
-        chosen = suspects.select_pixels(surveyed)
-        more = _report(chosen, _divided(chosen, first[:, surveyed], functions, settings, number))
-        best.replace_scatter(place, surveyed, more)
-    jumping = divided & pieces.sudden(
-        best.object_temperature, _AS_GIVEN * best.object_temperature_std, tile.time
-    )
-    status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
+    best = _finished(suspects, best, first, functions)
     # A delay of the bands asks for a piece at each change of the background, which hide it.
     asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first.sum(axis=0) > _MOST_PIECES
-    status |= np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
+    status = best.status | np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
+    # Pieces without a flag are kept for the next pass.
+    first[:, hidden | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
+    result = replace(result, division=np.zeros((tile.time.size, asked.size), dtype=bool))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
 
 
+def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Subspace) -> Estimate:
+    """Estimate with its division, a survey by more functions of the pieces, and flags of jumps."""
+    divided = np.asarray(first.any(axis=0))
+    surveyed = divided & tile.surveyed
+    if tile.material is not None:  # one with its emissivity is not asked for a scatter
+        surveyed &= np.isnan(tile.material.noise_variance)
+    if surveyed.any():
+        straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))
+    for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
+        parts = _parts(tile, first[:, surveyed], functions, number)
+        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, tile.noise, parts))
+    jumping = divided & pieces.sudden(
+        estimate.object_temperature, _AS_GIVEN * estimate.object_temperature_std, tile.time
+    )
+    status = estimate.status | status_bits({Status.OBJECT_JUMP: jumping})
+    return replace(estimate, status=status, division=first)
+
+
+def _straight(tile: Tile, estimate: Estimate) -> Array:
+    """Signals (pixel, band, time) [K] less the bend of the background (eq. 11)."""
+    signals, emissivity = tile.signals.copy(), estimate.emissivity
+    first = tile.blackbody(0, estimate.background_temperature)
+    physical = np.all((emissivity > 0) & (emissivity < 1), axis=0)
+    for band in range(1, len(signals)):
+        bend = tile.blackbody(band, estimate.background_temperature) - first
+        signals[band] -= np.where(physical, np.nan_to_num((1.0 - emissivity[band]) * bend), 0.0)
+    return np.ascontiguousarray(signals.transpose(2, 0, 1))
+
+
+def _parts(
+    tile: Tile, first: Mask, functions: smooth.Subspace, number: int = smooth.PIECE_ORDER
+) -> Iterator[tuple[Whole, smooth.Subspace]]:
+    """Yield pixels whose pieces begin with the same frames (time, pixel), and their functions."""
+    alike: dict[bytes, list[int]] = {}
+    for place, begins in enumerate(first.T):
+        alike.setdefault(begins.tobytes(), []).append(place)
+    for places in map(np.array, alike.values()):
+        begins, rising = first[:, places[0]], functions.rising
+        yield (
+            places,
+            smooth.piecewise(tile.time, begins, rising, segment=tile.segment, number=number),
+        )
+
+
 def _divided(
-    tile: Tile,
-    first: Mask,
-    functions: smooth.Subspace,
-    settings: SubspaceSettings,
-    number: int = smooth.PIECE_ORDER,
+    tile: Tile, first: Mask, functions: smooth.Subspace, settings: SubspaceSettings
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
-
-    def pieces_of(begins: Mask) -> smooth.Subspace:
-        rising, segment = functions.rising, tile.segment
-        return smooth.piecewise(tile.time, begins, rising, segment=segment, number=number)
-
-    groups = pieces.alike(first)
-    parts = ((places, pieces_of(first[:, places[0]])) for places in groups)
+    parts = _parts(tile, first, functions)
     if settings.device is None:
         return fused.solve_parts(tile, functions, parts, settings.background_drift)
-    per_pixel = [_solve(tile.select_pixels(places), own, settings) for places, own in parts]
+    groups, every = zip(*parts, strict=True)
+    per_pixel = [
+        _solve(tile.select_pixels(places), own, settings)
+        for places, own in zip(groups, every, strict=True)
+    ]
     return per_pixel[0].join(per_pixel[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 

@@ -3,6 +3,7 @@
 Which are best is found in `division`.
 """
 
+from collections.abc import Iterable
 from functools import lru_cache
 from itertools import pairwise
 from typing import Final
@@ -11,7 +12,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace import reflection_ratio, residuals
+from dbthermal.separation._subspace import kernels, reflection_ratio, residuals
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 # Functions of a piece by which the division is chosen. One more is fitted: what the choice leaves
@@ -89,14 +90,6 @@ def _bases(times: Array, bounds: Whole) -> list[Array]:
     return bases
 
 
-def alike(first: Mask) -> list[Whole]:
-    """Pixels whose pieces begin with the same frames (time, pixel), together."""
-    groups: dict[bytes, list[int]] = {}
-    for place, begins in enumerate(first.T):
-        groups.setdefault(begins.tobytes(), []).append(place)
-    return [np.array(places) for places in groups.values()]
-
-
 @lru_cache(maxsize=4096)
 def functions(time: bytes, segment: bytes | None) -> tuple[Array, int]:
     """Functions of a piece (time, function), orthonormal, and how many are used to choose it."""
@@ -143,6 +136,37 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
         least = np.minimum(halves, cost)
     smoothly = (left**2).sum(axis=0) + COST * used
     return np.asarray((smoothly > least[0] + _MARGIN * COST) & (halves[0] < cost[0] + TIE))
+
+
+def outside(
+    signals: Array, noise: tuple[float, ...], parts: Iterable[tuple[Whole, smooth.Subspace]]
+) -> tuple[Array, Array]:
+    """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
+
+    Of signals (pixel, band, time) [K], whitened.
+    """
+    pixels, bands, frames = signals.shape
+    scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
+    for places, own in parts:
+        columns = np.ascontiguousarray(own.functions.T)
+        _outside(columns, own.spans, signals, places, np.empty((bands, len(columns))), scatter)
+        freedom[places] = frames - len(columns)
+    whitened = scatter.transpose(1, 2, 0) / np.multiply.outer(noise, noise)[..., np.newaxis]
+    return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
+
+
+@kernels.entered
+def _outside(
+    columns: Array, spans: Whole, signals: Array, places: Whole, held: Array, scatter: Array
+) -> None:
+    """Products of signals (pixel, band, time) outside columns (column, time), in place."""
+    for p in range(places.size):
+        here = signals[places[p]]
+        for m in range(len(here)):
+            kernels.projected(columns, spans, len(columns), here[m], held[m])
+            for n in range(m + 1):
+                product = kernels.dot(here[m], here[n]) - kernels.dot(held[m], held[n])
+                scatter[places[p], m, n] = scatter[places[p], n, m] = product
 
 
 def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
