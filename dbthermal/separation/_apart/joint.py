@@ -31,7 +31,7 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
-from dbthermal.separation._apart import neighbours
+from dbthermal.separation._apart import neighbours, relaxation
 from dbthermal.separation._apart.equations import Floats, Mask, Whole
 from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._inputs import Inputs
@@ -139,7 +139,7 @@ class Joint:
         bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
         changes = np.empty((len(bends), signals.shape[1], pixels.size), np.float32)
         for film, share, bend in zip(changes, self.emissivity[1:, pixels], bends, strict=True):
-            system.changes(signals, pixels, share, bend, film)
+            relaxation.changes(signals, pixels, share, bend, film)
         return changes if weights is None else weights[frames] @ changes
 
     def finish(self, result: xr.Dataset) -> None:
@@ -284,7 +284,7 @@ def _spread(
     unsettled = np.zeros(shape[1], dtype=bool)
     for nodes, (*pair, step) in solutions:
         signals[:, nodes, places] = np.swapaxes(pair, 1, 2)
-        unsettled[places] |= step > 10.0 * system.CONVERGED
+        unsettled[places] |= step > 10.0 * relaxation.CONVERGED
     signals[np.abs(signals) > USELESS] = np.nan
     return signals, unsettled
 
