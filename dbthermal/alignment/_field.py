@@ -68,8 +68,8 @@ class Spline:
         """Second differences of the nodes: down, right, and twice the mixed one."""
         (row, *rows), (column, *columns) = self._differences
         mixed = np.sqrt(2.0) * np.kron(rows[0], columns[0])
-        parts = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
-        return sparse.csr_array(np.concatenate(parts))
+        terms = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
+        return sparse.csr_array(np.concatenate(terms))
 
     @cached_property
     def before(self) -> Array:
@@ -115,18 +115,18 @@ class Spline:
         ]
 
     def fitted(
-        self, data: Information, centres: list[Array], around: "Field | None" = None
+        self, data: Information, centres: list[Array], guess: "Field | None" = None
     ) -> "Field":
         """Field of information at places, which is on steps from another field, or from 0."""
         rows, columns = self.values(centres)
         matrix = _normal(data.tensor, rows, columns)
-        target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
+        target = np.concatenate([(rows.T @ array @ columns).ravel() for array in data.gradient])
         bends = self.bending
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
-        if around is not None:
-            target += matrix @ around.nodes
-            steps = _STEPS[1:2] if around.settled else _STEPS
-            sharp, trials = around.sharpness, around.penalty * steps
+        if guess is not None:
+            target += matrix @ guess.nodes
+            steps = _STEPS[1:2] if guess.settled else _STEPS
+            sharp, trials = guess.sharpness, guess.penalty * steps
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
@@ -135,13 +135,13 @@ class Spline:
             trial_factor = self.factored(matrix + before)
             trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
             if trials.size > 1:
-                logs = [np.log(part[0]).sum() for part in (self.factored(before), trial_factor)]
+                logs = [np.log(array[0]).sum() for array in (self.factored(before), trial_factor)]
                 likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
-        squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
+        squares = np.stack([(bends @ array) ** 2 for array in np.split(nodes, 2)])
         sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        settled = around is not None and penalty == around.penalty
+        settled = guess is not None and penalty == guess.penalty
         return Field(self, nodes, factor, float(penalty), sharp, settled)
 
 
@@ -159,23 +159,23 @@ class Field:
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""
         rows, columns = self.spline.values(centres)
-        parts = self.nodes.reshape(2, *self.spline.nodes)
-        return np.stack([rows @ part @ columns.T for part in parts])
+        nodes = self.nodes.reshape(2, *self.spline.nodes)
+        return np.stack([rows @ plane @ columns.T for plane in nodes])
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance (node, node) [pixel^2]."""
         return self.spline.solved(self.factor, np.eye(self.nodes.size))
 
-    def disagreement(self, data: Information, centres: list[Array], other: "Field") -> float:
+    def disagreement(self, data: Information, centres: list[Array], field: "Field") -> float:
         """Chi-square of another field by the data of this one, over what chance makes of it."""
         matrix = _normal(data.tensor, *self.spline.values(centres))
-        off = other.nodes - self.nodes
+        off = field.nodes - self.nodes
         return float(off @ matrix @ off / np.sum(self.covariance * matrix))
 
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
-        rows, columns = (_pairs(part) for part in self.spline.values(centres))
+        rows, columns = (_pairs(pair) for pair in self.spline.values(centres))
         height, width = self.spline.nodes
         blocks = self.covariance.reshape(2, height, width, 2, height, width)
         parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
@@ -198,7 +198,7 @@ def _pairs(values: Array) -> Array:
 def _normal(tensor: Array, rows: Array, columns: Array) -> Array:
     """Normal matrix of the nodes, of rows and then of columns, from the tensors of the pixels."""
     (height, width), blocks = (rows.shape[1], columns.shape[1]), []
-    for part in tensor:
-        sums = (_pairs(rows).T @ part @ _pairs(columns)).reshape(height, height, width, width)
+    for block in tensor:
+        sums = (_pairs(rows).T @ block @ _pairs(columns)).reshape(height, height, width, width)
         blocks.append(sums.transpose(0, 2, 1, 3).reshape(height * width, -1))
     return np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])

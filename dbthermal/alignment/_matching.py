@@ -70,11 +70,13 @@ class Movies:
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = binned(valid.astype(np.float64), factor) > 0.5
-        some = tuple(part[:: max(1, part.size // _NOISE_PIXELS)] for part in np.nonzero(mostly))
-        if some[0].size:
+        sample = tuple(
+            index[:: max(1, index.size // _NOISE_PIXELS)] for index in np.nonzero(mostly)
+        )
+        if sample[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
-            usual = [MAD * np.median(np.abs(movie[some])) for movie in movies]
+            usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
         return cls(
             splines(movies[0], BLUR),
@@ -97,7 +99,7 @@ class Movies:
 
 
 def _whole_pixels(
-    first: Movie, others: list[Movie], freedom: float, reach: tuple[int, int]
+    first: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
     """
     Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
@@ -107,17 +109,17 @@ def _whole_pixels(
     """
     height, width = first.shape[:2]
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
-    energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *others)]
+    energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *movies)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
         rows = slice(down, down + height)
         gain = np.zeros((height, width, 2 * reach[1] + 1))
-        for part in others:
-            pairs = padded[rows] @ part.transpose(0, 2, 1)
+        for movie in movies:
+            pairs = padded[rows] @ movie.transpose(0, 2, 1)
             cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(gain.shape[2])], -1)
             gain += np.maximum(blurred(cross, WINDOW), 0.0) ** 2
-        there = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
-        gain /= np.maximum(blurred(np.stack(there, axis=-1), WINDOW), freedom)
+        shifted = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
+        gain /= np.maximum(blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
         right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
@@ -152,12 +154,12 @@ def _information(movies: Movies, shift: Array) -> Information:
     total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
     moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
-    for parts, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(parts, 2, 0)
-        auto, both = np.moveaxis(blurred(parts[..., [0, 3]], WINDOW), 2, 0)
+    for sums, level in zip(moments, movies.noise[1:], strict=True):
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
+        auto, terms = np.moveaxis(blurred(sums[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
-        ratio = both / np.maximum(auto, 0.1 * number * noise**2)
+        ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
@@ -167,8 +169,8 @@ def _information(movies: Movies, shift: Array) -> Information:
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        both = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
-        total += weight[..., np.newaxis] * both
+        terms = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
+        total += weight[..., np.newaxis] * terms
     total = np.moveaxis(blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
@@ -180,8 +182,8 @@ def _information(movies: Movies, shift: Array) -> Information:
 
 def eigenvalues(tensor: Array) -> tuple[Array, Array]:
     """Larger and smaller eigenvalue (y, x) of tensors (3, y, x)."""
-    down, both, right = tensor
-    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), both)
+    down, mixed, right = tensor
+    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), mixed)
     return middle + root, middle - root
 
 
@@ -199,12 +201,12 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
         # Changes as large as there are seldom are cut: an object's, if rapid.
-        part = blurred(film, BLUR)
-        usual = np.quantile(np.abs(part), _USUAL, axis=-1, keepdims=True)
-        part /= np.sqrt(1.0 + (part / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
-        pictures.append(part)
+        picture = blurred(film, BLUR)
+        usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
+        picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
+        pictures.append(picture)
     functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
-    pictures = [np.asarray(part @ functions, np.float32) for part in pictures]
+    pictures = [np.asarray(picture @ functions, np.float32) for picture in pictures]
     freedom *= functions.shape[1] / functions.shape[0]
     rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
     share *= movies.valid
@@ -264,8 +266,8 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
     totals = np.zeros((4, *movies.shape))
-    for part, level in zip(sums, movies.noise[1:], strict=True):
-        windows = blurred(part, WINDOW)
+    for array, level in zip(sums, movies.noise[1:], strict=True):
+        windows = blurred(array, WINDOW)
         equations = normal_equations(windows, less)
         # The shift of each window is eliminated.
         tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
@@ -273,14 +275,14 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
         seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
-        moved, both, other = (windows[..., place] for place in (0, 4, 14))
-        alike = np.maximum(both, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
-        totals += np.where(used, np.stack([late, seen, alike, other]), 0.0) / level**2
+        moved, common, second = (windows[..., place] for place in (0, 4, 14))
+        alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
+        totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
     of_parts = [
-        np.add.reduceat(np.add.reduceat(part, starts[0], axis=0), starts[1], axis=1)
-        for part in (gradient, information)
+        np.add.reduceat(np.add.reduceat(array, starts[0], axis=0), starts[1], axis=1)
+        for array in (gradient, information)
     ]
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])

@@ -82,8 +82,10 @@ class Scale:
             return np.asarray(self.noise * _noise_factor(corrected))
         signals = sample(corrected)
         frames = np.all(np.isfinite(signals), axis=(0, 2))
-        parts = [signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)]
-        return noises.estimate_bands(parts, corrected["time"].values[frames])
+        scaled = [
+            signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)
+        ]
+        return noises.estimate_bands(scaled, corrected["time"].values[frames])
 
 
 def _noise_factor(corrected: xr.Dataset) -> Array:
@@ -137,8 +139,8 @@ class Capture:
             films = films if whole else films[:, self.frames]
             flat = films.astype(np.float32, copy=False).reshape(*films.shape[:2], -1)
             filled, shares = zip(*(bridged(flat[band]) for band in self.bands), strict=True)
-            few = (np.min(shares, axis=0) >= 1.0 - _MISSING).reshape(films.shape[2:])
-            yield rows, [film.reshape(films.shape[1:]) for film in filled], few
+            complete = (np.min(shares, axis=0) >= 1.0 - _MISSING).reshape(films.shape[2:])
+            yield rows, [film.reshape(films.shape[1:]) for film in filled], complete
 
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
@@ -152,9 +154,9 @@ class Capture:
     def functions(self, signals: Movie, period: float) -> Movie:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
-        some = signals.reshape(-1, signals.shape[-1])
-        some = some[:: max(1, len(some) // (_FOR_EACH * _PLANES))]
-        functions = rapid(smooth.leading(rapid(some, smoothing), _PLANES).T, smoothing).T
+        sample = signals.reshape(-1, signals.shape[-1])
+        sample = sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))]
+        functions = rapid(smooth.leading(rapid(sample, smoothing), _PLANES).T, smoothing).T
         return np.ascontiguousarray(functions, np.float32)
 
     def planes(self, functions: list[Movie]) -> list[list[Movie]]:
@@ -170,22 +172,22 @@ class Capture:
                 ~self.valid, return_distances=False, return_indices=True
             )
             result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
-        ends = np.cumsum([part.shape[1] for part in functions])
-        return [list(part) for part in np.split(result, ends[:-1], axis=3)]
+        ends = np.cumsum([array.shape[1] for array in functions])
+        return [list(array) for array in np.split(result, ends[:-1], axis=3)]
 
     def binned(self, factor: int) -> tuple[list[Movie], Mask]:
         """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
-        valid, parts = self.valid.copy(), []
-        for rows, films, few in self.blocks(max(1, _ROWS // factor) * factor):
-            valid[rows] &= few
+        valid, blocks = self.valid.copy(), []
+        for rows, films, complete in self.blocks(max(1, _ROWS // factor) * factor):
+            valid[rows] &= complete
             used = valid[rows, :, np.newaxis]
             share = np.maximum(binned(used.astype(np.float64), factor), factor**-2)
             signals = [np.moveaxis(film, 0, -1) for film in films]
             if not used.all():
                 signals = [np.where(used, signal, np.float32(0.0)) for signal in signals]
             scale = (self.slopes[:, None, None, None] * share).astype(np.float32)
-            parts.append(np.stack([binned(signal, factor) for signal in signals]) / scale)
-        return list(np.concatenate(parts, axis=1)), valid
+            blocks.append(np.stack([binned(signal, factor) for signal in signals]) / scale)
+        return list(np.concatenate(blocks, axis=1)), valid
 
 
 def freedom(functions: Movie) -> float:
@@ -232,9 +234,9 @@ def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
     """Frames in which most of the pixels that every band ever measures are measured."""
     step = stride(counts.shape[2:], _PIXELS)
-    some = schema.measured(counts[:, :, ::step, ::step].values)
-    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
-    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
+    valid = schema.measured(counts[:, :, ::step, ::step].values)
+    ever = valid.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = valid[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(valid.shape[1])
     used = np.flatnonzero(share > _COMMON)
     if used.size < noises.MINIMUM_FRAMES:
         raise ValueError(
@@ -302,7 +304,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
         film[:, ~schema.measured(film).all(axis=0)] = np.nan  # of both the same samples
         flat = film.reshape(2, time.size, -1)
-        (first, share), (second, _) = (bridged(part) for part in flat)
+        (first, share), (second, _) = (bridged(block) for block in flat)
         used = share > _COMMON_SAMPLES * share.max()
         whole = np.where(used, np.stack([first, second]), np.float32(0.0))
         return np.asarray(whole.reshape(film.shape) / slopes, np.float32)
@@ -311,12 +313,14 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     height, width = rows.stop - rows.start, columns.stop - columns.start
     step = stride((height, width), _RAPID_PIXELS)
     grid = slice(rows.start, rows.stop, step), slice(columns.start, columns.stop, step)
-    some = films(*grid)[0].reshape(time.size, -1).T.astype(np.float64)
+    signals = films(*grid)[0].reshape(time.size, -1).T.astype(np.float64)
     segment = schema.segments(corrected)[frames]
     orders = min(_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
-    functions = [smooth.leading(some - some @ part @ part.T, _RAPID_PLANES) for part in curves]
-    rates = [np.gradient(part, axis=0).T @ part for part in functions]
+    functions = [
+        smooth.leading(signals - signals @ block @ block.T, _RAPID_PLANES) for block in curves
+    ]
+    rates = [np.gradient(block, axis=0).T @ block for block in functions]
 
     # Sums over the windows of rows of windows.
     side = int(np.clip(min(height, width) // _ALONG, *_SIDES))
@@ -328,12 +332,12 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     for top in tops:
         film = films(slice(top, top + side), columns)
         places = np.indices(film.shape[2:]).astype(np.float64)
-        for part, function, rate in zip(sums, functions, rates, strict=True):
+        for block, function, rate in zip(sums, functions, rates, strict=True):
             planes = np.tensordot(film, function.astype(np.float32), (1, 0))
             first, second = splines(planes[0], _BLUR), blurred(planes[1], _BLUR)
             pairs = products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
             within = (slice(left, left + side) for left in lefts - columns.start)
-            part.extend(pairs[window].sum(axis=0) for window in within)
+            block.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
     level, slope, result = noise[bands[0]] ** 2 / (4.0 * np.pi * _BLUR**2), 0.5 / _BLUR**2, []
     for windows, rate in zip(sums, rates, strict=True):

@@ -124,11 +124,11 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
 
 def seen_apart(field: xr.Dataset) -> bool:
     """Say that the cameras stand apart: along an axis their shift is more than its deviation."""
-    known = field["known"].values
-    if not known.any():
+    resolved = field["known"].values
+    if not resolved.any():
         return False
-    both = (np.abs(field[name].values[:, known]) for name in ("shift", "shift_std"))
-    shift, std = (np.median(part, axis=1) for part in both)
+    sizes = (np.abs(field[name].values[:, resolved]) for name in ("shift", "shift_std"))
+    shift, std = (np.median(array, axis=1) for array in sizes)
     return bool(np.any(shift > np.maximum(_SIGMAS * std, _LEAST_SHIFT)))
 
 
@@ -147,7 +147,7 @@ def _coarse(
         tried[period] = capture.functions(signals[0], period)
         functions = tried[period][:, :_FEW]
         white, freedom = planes.white(frames, period), planes.freedom(functions)
-        pictures = [part @ functions for part in signals]
+        pictures = [signal @ functions for signal in signals]
         level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
@@ -160,7 +160,7 @@ def _coarse(
                 factor=factor * half,
             )
             smoothing = capture.smoothing(period)
-            films = [planes.rapid(binned(part, half), smoothing) for part in signals]
+            films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
                 begin = matching.start(rough, films, white, spline)
             except ValueError as error:  # slower changes may tell more
@@ -171,12 +171,12 @@ def _coarse(
         resolved, squares = _resolved(data, factor), _squares(data, factor)
         variance = _variances(field, level, resolved, squares)
         size = 0.25 * np.log(variance).sum(axis=0)
-        gain, apart = np.inf, 0.0
+        gain, distance = np.inf, 0.0
         if before is not None:
             gain = np.mean((sizes - size)[earlier])
             # A field of slower changes must fit the data of the more robust one.
-            apart = begin.disagreement(before, level.centres(), field)
-        if resolved.any() and gain > np.log(_MORE) and apart < _AGREE:
+            distance = begin.disagreement(before, level.centres(), field)
+        if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
             before, earlier, sizes = data, resolved, size
             result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
@@ -209,8 +209,8 @@ def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> A
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
     sums = [
-        gaussian_filter(part * resolved, _WIDE / level.factor, axes=(-2, -1))
-        for part in (squares, np.ones(resolved.shape))
+        gaussian_filter(array * resolved, _WIDE / level.factor, axes=(-2, -1))
+        for array in (squares, np.ones(resolved.shape))
     ]
     chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
@@ -224,18 +224,18 @@ def _result(
     centres = [np.arange(size, dtype=np.float64) for size in shape]
     shift = field.on(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
-    known = _resolved(data) & reached
-    distance = np.asarray(distance_transform_edt(~known))
-    near = (distance <= _NEAR * min(shape)) & reached & known.any()
+    measured = _resolved(data) & reached
+    distance = np.asarray(distance_transform_edt(~measured))
+    near = (distance <= _NEAR * min(shape)) & reached & measured.any()
     # Away from where it is known the field may change as much as it does there.
-    slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, known]
-    growth = np.multiply.outer(slopes.sum(axis=1) / max(1, known.sum()), distance**2)
+    slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, measured]
+    growth = np.multiply.outer(slopes.sum(axis=1) / max(1, measured.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)
     names = [str(name) for name in corrected["band"].values[capture.bands]]
     values = {
         "shift": np.where(near, shift, np.nan).astype(np.float32),
         "shift_std": np.where(near, std, np.nan).astype(np.float32),
-        "known": known,
+        "known": measured,
     }
     places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}
     result = xr.Dataset(

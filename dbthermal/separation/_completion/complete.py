@@ -129,8 +129,8 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     (0, True)
     """
     require_workers(workers)
-    beside = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
-    return filled(_checked(result, corrected).copy(deep=True), corrected, response, beside, workers)
+    scope = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
+    return filled(_checked(result, corrected).copy(deep=True), corrected, response, scope, workers)
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,8 @@ def filled(
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_complete_rows, scene, result, lacking), inputs.blocks))
         frames = np.array([np.isfinite(frame).any() for frame in result[FILMS[0]].values])
-        parts = threads.map(partial(_bridge_rows, result, frames, lacking), inputs.blocks)
-        number = np.concatenate(list(parts))
+        counts = threads.map(partial(_bridge_rows, result, frames, lacking), inputs.blocks)
+        number = np.concatenate(list(counts))
     variable = schema.OPTIONAL["separated"]["bridged"]
     result["bridged"] = (variable.dims, lacking, variable.attrs)
     result["status"].attrs.update(schema.status_attrs())
@@ -224,8 +224,8 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: sli
     if not pixels.any():
         return
     lines = np.flatnonzero(pixels.any(axis=1))
-    part = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
-    tile, valid = scene.tile(part, pixels[lines].ravel())
+    block = scene.inputs.capture.isel(y=rows).load().isel(y=lines)
+    tile, valid = scene.tile(block, pixels[lines].ravel())
     places = np.flatnonzero(pixels) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
         wanted = np.arange(start, min(start + tiles.PIXELS, places.size))
@@ -241,26 +241,30 @@ def _complete_pixels(
     """Complete pixels by their numbers in the image, in place."""
     y, x = np.divmod(places, completed.sizes["x"])
     # A frame that was lost is no sample to complete: many captures lack some.
-    parts = [completed[name].values[:, y, x] for name in (*FILMS, *MAPS, f"{FILMS[0]}_std")]
-    wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in parts[:2]], axis=0)
-    wanted |= np.any([np.isnan(part).any(axis=0) for part in parts[2:4]], axis=0)
+    arrays = [completed[name].values[:, y, x] for name in (*FILMS, *MAPS, f"{FILMS[0]}_std")]
+    wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in arrays[:2]], axis=0)
+    wanted |= np.any([np.isnan(part).any(axis=0) for part in arrays[2:4]], axis=0)
     wanted &= valid.any(axis=0)
-    measured = np.array([parts[0], parts[-1]], dtype=np.float64)
+    measured = np.array([arrays[0], arrays[-1]], dtype=np.float64)
     sources = np.where(wanted, scene.source[places], -1)
     for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
-        here = sources == source
-        if not here.any():
+        chosen = sources == source
+        if not chosen.any():
             continue
-        part = tile.select_pixels(here)
-        static, variance = scenes.solve_statics(scene, part, valid[:, here], source, places[here])
+        part = tile.select_pixels(chosen)
+        static, variance = scenes.solve_statics(
+            scene, part, valid[:, chosen], source, places[chosen]
+        )
         if source == scenes.MATERIAL:
-            kept = ~scenes.contradicted(scene, static, places[here])
-            sources[here] = np.where(kept, source, scenes.PRIOR)
-            here = sources == source
+            kept = ~scenes.contradicted(scene, static, places[chosen])
+            sources[chosen] = np.where(kept, source, scenes.PRIOR)
+            chosen = sources == source
             static, part = static.select_pixels(kept), part.select_pixels(kept)
             variance = variance[kept]
-        values = scenes.solve(scene, part, valid[:, here], static, variance, measured[..., here])
-        _fill(scene, completed, places[here], values, source)
+        values = scenes.solve(
+            scene, part, valid[:, chosen], static, variance, measured[..., chosen]
+        )
+        _fill(scene, completed, places[chosen], values, source)
 
 
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
@@ -270,11 +274,11 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     curve = scene.inputs.curves[scene.inputs.bands[0]]
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
-        both = (name, f"{name}_std")
-        new = [values[part][order] if name in MAPS else values[part] for part in both]
+        names = (name, f"{name}_std")
+        new = [values[part][order] if name in MAPS else values[part] for part in names]
         limits = (curve.lowest, curve.highest) if name == FILMS[0] else (-np.inf, np.inf)
         _take(
-            *(completed[part].values for part in both),
+            *(completed[part].values for part in names),
             *(np.asfortranarray(part) for part in new),
             np.stack([y, x], axis=-1),
             limits,
@@ -324,7 +328,7 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
     time = completed["time"].values[frames].astype(np.float64)
     number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
     for name in FILMS:
-        films = [completed[one].values for one in (name, f"{name}_std")]
+        films = [completed[variable].values for variable in (name, f"{name}_std")]
         gaps = np.isnan(films[0][frames, rows]).sum(axis=0)
         y, x = np.nonzero((gaps > 0) & (gaps < time.size))
         place = (np.flatnonzero(frames)[:, np.newaxis], rows.start + y, x)
@@ -337,8 +341,8 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
     bridged, status = lacking[:, rows], completed["status"].values[rows]
     bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
     bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0
-    many = bridged.mean(axis=0) >= quality.MOST_BRIDGED
-    status |= many * np.uint32(Status.COMPLETED_FRAMES)
+    mostly = bridged.mean(axis=0) >= quality.MOST_BRIDGED
+    status |= mostly * np.uint32(Status.COMPLETED_FRAMES)
     if "bridged" in completed:
         bridged |= completed["bridged"].values[:, rows]
     release()

@@ -52,8 +52,10 @@ class Level:
 
     def at(self, places: Whole) -> "Level":
         """Return the level of some pixels, each of its own."""
-        parts = (np.asarray(part, dtype=np.float64) for part in (self.signal, self.std))
-        signal, std = (part[places] if part.ndim else np.full(places.size, part) for part in parts)
+        arrays = (np.asarray(array, dtype=np.float64) for array in (self.signal, self.std))
+        signal, std = (
+            array[places] if array.ndim else np.full(places.size, array) for array in arrays
+        )
         return Level(signal, std, self.fluctuation)
 
 
@@ -83,18 +85,18 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     """Posterior of the emissivities and of the background's level, steps 1 and 2."""
     grid = prior.grid()  # (grid, pixel)
     (points, pixels), size = grid.shape, len(tile.noise) + 1
-    levels = np.stack([np.broadcast_to(part, pixels) for part in (level.signal, level.std)])
-    parts = (grid, prior.mean, prior.covariance, levels, *vars(data).values())
+    levels = np.stack([np.broadcast_to(array, pixels) for array in (level.signal, level.std)])
+    arrays = (grid, prior.mean, prior.covariance, levels, *vars(data).values())
     share, means = np.empty((pixels, points)), np.empty((pixels, 2, size))
     spreads = np.empty((pixels, 2, size, size))
     _moments(
         frames.response_tables(tile),
         np.log(prior.weight),
-        tuple(np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in parts),
+        tuple(np.ascontiguousarray(np.moveaxis(array, -1, 0)) for array in arrays),
         (share, means, spreads),
     )
     (plain, mean), (covariance, spread) = (
-        np.ascontiguousarray(np.moveaxis(part, 0, -1)) for part in (means, spreads)
+        np.ascontiguousarray(np.moveaxis(array, 0, -1)) for array in (means, spreads)
     )
     # The blackest emissivity that is as improbable; the grid rises.
     above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
@@ -117,10 +119,10 @@ def _crossing(grid: Array, falling: Array, level: float) -> Array:
     """Place (pixel) on a grid (grid, pixel) at which a function that falls along it has a value."""
     after = np.clip((falling > level).sum(axis=0), 1, len(grid) - 1)
     (low, high), (more, less) = (
-        np.take_along_axis(part, np.stack([after - 1, after]), 0) for part in (grid, falling)
+        np.take_along_axis(share, np.stack([after - 1, after]), 0) for share in (grid, falling)
     )
-    part = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
-    return np.asarray(low + part * (high - low))
+    share = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
+    return np.asarray(low + share * (high - low))
 
 
 @compiled
@@ -137,16 +139,16 @@ def _moments(
     its deviation, and the parts of its `Curve`.
     """
     grids, means, covariances, levels, nodes, information, linear = knowledge
-    points, parts, others = grids.shape[1], weight.size, means.shape[2] - 1
+    points, components, second = grids.shape[1], weight.size, means.shape[2] - 1
     # Prior and posterior of (grid, component), logarithms at first, and the precisions of c.
-    density, posterior = np.empty((points, parts)), np.empty((points, parts))
-    stiff = np.empty((points, parts))
+    density, posterior = np.empty((points, components)), np.empty((points, components))
+    stiff = np.empty((points, components))
     # Mean and precision of the other emissivities before, and of the components as one.
-    normal, whole = np.empty((points, parts, 2, others)), np.empty((points, 2, others))
+    normal, whole = np.empty((points, components, 2, second)), np.empty((points, 2, second))
     # Mean of (e, c); slopes of the others with c, and their variances at a value of it.
-    values = np.empty((points, parts, others + 2))
-    slope, loose = np.empty((points, parts, others)), np.empty((points, parts, others))
-    place, likelihood = np.empty((points, others + 2)), np.empty((points, others, 6))
+    values = np.empty((points, components, second + 2))
+    slope, loose = np.empty((points, components, second)), np.empty((points, components, second))
+    place, likelihood = np.empty((points, second + 2)), np.empty((points, second, 6))
     spare = np.empty((5, 5 * points))
     for p in range(len(grids)):
         mean, covariance = means[p], covariances[p]
@@ -155,8 +157,8 @@ def _moments(
         # About the best values at each point of the grid, with the components taken as one, by
         # the method of Gauss and Newton.
         for g in range(points):
-            place[g, 0], place[g, 1 + others] = grids[p, g], levels[p, 0]
-            place[g, 1 : 1 + others] = whole[g, 0]
+            place[g, 0], place[g, 1 + second] = grids[p, g], levels[p, 0]
+            place[g, 1 : 1 + second] = whole[g, 0]
         curve, settled = (nodes[p], information[p], linear[p]), False
         for step in range(_STEPS + 1):
             _quadratic(tables, curve, place, spare, likelihood)
@@ -200,8 +202,8 @@ def _condition(
             for m in range(mean.shape[1] - 1):
                 slope = covariance[k, 1 + m, 0] / variance
                 normal[g, k, 0, m] = mean[k, 1 + m] + slope * off[k]
-                rest = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
-                normal[g, k, 1, m] = 1.0 / max(rest, 1e-8)
+                spread = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
+                normal[g, k, 1, m] = 1.0 / max(spread, 1e-8)
         share = np.exp(log - log.max())
         share /= share.sum()
         for m in range(mean.shape[1] - 1):
@@ -262,15 +264,15 @@ def _quadratic(
                 base[i] = emitted[5 * g + 4] - of_c[i] * place[g, -1]
             value, by_e, by_c, ee, ec, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for i in range(4):
-                here, here_e, here_c = 0.0, 0.0, 0.0  # H times its parts
+                hb, he, hc = 0.0, 0.0, 0.0  # H times its parts
                 for j in range(4):
-                    here += information[i, j] * base[j]
-                    here_e += information[i, j] * of_e[j]
-                    here_c += information[i, j] * of_c[j]
-                value += base[i] * (linear[i] - 0.5 * here)
-                by_e += of_e[i] * (linear[i] - here)
-                by_c += of_c[i] * (linear[i] - here)
-                ee, ec, cc = ee + of_e[i] * here_e, ec + of_e[i] * here_c, cc + of_c[i] * here_c
+                    hb += information[i, j] * base[j]
+                    he += information[i, j] * of_e[j]
+                    hc += information[i, j] * of_c[j]
+                value += base[i] * (linear[i] - 0.5 * hb)
+                by_e += of_e[i] * (linear[i] - hb)
+                by_c += of_c[i] * (linear[i] - hb)
+                ee, ec, cc = ee + of_e[i] * he, ec + of_e[i] * hc, cc + of_c[i] * hc
             result = likelihood[g, m]
             result[0], result[1], result[2] = value, by_e, by_c
             result[3], result[4], result[5] = ee, ec, cc
@@ -325,7 +327,7 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
     """Mean and covariance of (e, c), or of (1 / e_1, e_m / e_1, c), over grid and components."""
     weights, values, slope, loose, stiff = terms
     size = mean.size
-    part, direction = np.empty(size), np.ones(size)
+    offset, direction = np.empty(size), np.ones(size)
     mean[:], spread[:], direction[0] = 0.0, 0.0, 0.0
     for second in range(2):
         for g, k in np.ndindex(weights.shape):
@@ -333,10 +335,10 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
             if weight == 0.0:
                 continue
             for i in range(size):
-                part[i] = values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
-            part[0] = (scale if relative else values[g, k, 0]) - mean[0] * second
+                offset[i] = values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
+            offset[0] = (scale if relative else values[g, k, 0]) - mean[0] * second
             if second == 0:
-                mean += weight * part
+                mean += weight * offset
                 continue
             # Given e_1, c has the variance 1 / stiff, of which e_m follows a share.
             for m in range(size - 2):
@@ -344,7 +346,7 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
                 spread[1 + m, 1 + m] += weight * loose[g, k, m] * scale**2
             for i in range(size):
                 for j in range(size):
-                    moved = part[i] * part[j] + direction[i] * direction[j] / stiff[g, k]
+                    moved = offset[i] * offset[j] + direction[i] * direction[j] / stiff[g, k]
                     spread[i, j] += weight * moved
 
 

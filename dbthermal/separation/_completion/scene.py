@@ -70,10 +70,10 @@ class Scene:
         value, covariance = self.emissivity[:, places], self.covariance[..., places]
         return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
 
-    def tile(self, part: xr.Dataset, selected: Mask | slice = slice(None)) -> tuple[Tile, Mask]:
+    def tile(self, block: xr.Dataset, selected: Mask | slice = slice(None)) -> tuple[Tile, Mask]:
         """Tile of the selected pixels of a part of the capture, and valid samples (time, pixel)."""
         inputs = self.inputs
-        counts, valid, status = quality.read(part, most_missing=1.0)
+        counts, valid, status = quality.read(block, most_missing=1.0)
         valid = valid & ((status & _UNUSABLE) == 0)
         counts, valid = counts[..., selected], valid[:, selected]
         curves = tuple(inputs.curves[band] for band in inputs.bands)
@@ -81,7 +81,7 @@ class Scene:
         signals = [curve.linearise(counts[band]) - curve.reference for band, curve in pairs]
         return Tile(
             signals=np.where(valid, signals, 0.0),
-            time=part["time"].values.astype(np.float64),
+            time=block["time"].values.astype(np.float64),
             curves=curves,
             noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
             shape=(1, valid.shape[1]),
@@ -102,18 +102,18 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
     bands = inputs.bands
     value, shared = (_flat(variable["emissivity"])[bands] for variable in (result, pooled))
     covariance, shared_covariance = (_covariance(variable, bands) for variable in (result, pooled))
-    known = np.all((value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0), axis=0)
-    source = np.where(known, OWN, PRIOR)
+    sound = np.all((value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0), axis=0)
+    source = np.where(sound, OWN, PRIOR)
     labels = np.full(source.size, -1) if inputs.labels is None else inputs.labels
     measured = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
     for label in np.unique(labels[measured & (labels >= 0)]):
-        places, wanted = measured & (labels == label), ~known & (labels == label)
+        places, wanted = measured & (labels == label), ~sound & (labels == label)
         if places.sum() < _FEWEST:
             continue
         value[:, wanted] = np.median(shared[:, places], axis=-1)[..., np.newaxis]
         # Those of the label that were not pooled tell how much its pixels differ.
-        around = np.median(shared_covariance[..., places], axis=-1) + np.cov(shared[:, places])
-        covariance[..., wanted] = around[..., np.newaxis]
+        spread = np.median(shared_covariance[..., places], axis=-1) + np.cov(shared[:, places])
+        covariance[..., wanted] = spread[..., np.newaxis]
         source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
     pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
@@ -187,8 +187,8 @@ def solve_statics(
         # Of cameras apart, what the first band shows of its own background is no emission.
         stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
         # A change f of it alone bends the others by (1 - e_m) f; at one place by (1 - e_m / e_1) f.
-        own = 1.0 if scene.apart else prior.mean[:, :1]
-        bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / own) ** 2, 1))
+        factor = 1.0 if scene.apart else prior.mean[:, :1]
+        bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / factor) ** 2, 1))
         bend = bend * level.fluctuation
         data = curves.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level)
@@ -205,8 +205,8 @@ def solve(
     (2, time, pixel) [K], NaN elsewhere.
     """
     with np.errstate(all="ignore"):
-        parts = static.point, static.level, variance, static.covariance
-        statics = frames.solve(tile, *parts, apart=scene.apart)
+        constants = static.point, static.level, variance, static.covariance
+        statics = frames.solve(tile, *constants, apart=scene.apart)
         signal, left = windows.smooth(statics.signal, statics.white, valid, tile.time)
         background, spread = statics.background, statics.background_variance
         if (selected := np.isfinite(measured[0]).any(axis=0)).any():
@@ -214,11 +214,11 @@ def solve(
                 static.select_pixels(selected),
                 (measured[..., selected], valid[:, selected]),
             )
-            known = part.emissivity, part.level, variance[selected], part.covariance
-            behind = frames.background(tile.select_pixels(selected), *samples, *known)
+            of_selected = part.emissivity, part.level, variance[selected], part.covariance
+            behind = frames.background(tile.select_pixels(selected), *samples, *of_selected)
             seen = np.isfinite(behind).all(axis=0)
-            for film, own in zip((background, spread), behind, strict=True):
-                film[:, selected] = np.where(seen, own, film[:, selected])
+            for film, estimate in zip((background, spread), behind, strict=True):
+                film[:, selected] = np.where(seen, estimate, film[:, selected])
         values: Values = {}
         films = (signal, left + statics.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
@@ -250,17 +250,17 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     """
     tile, valid, places = sample
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
-    parts, counted = [], []
+    estimates, counted = [], []
     for source in np.unique(sources[sources >= 0]):
-        here = sources == source
-        counted.append(np.full(here.sum(), 1.0 if source == OWN else 1.0 / here.sum()))
-        part = tile.select_pixels(here), valid[:, here], int(source), places[here]
+        of_source = sources == source
+        counted.append(np.full(of_source.sum(), 1.0 if source == OWN else 1.0 / of_source.sum()))
+        part = tile.select_pixels(of_source), valid[:, of_source], int(source), places[of_source]
         static, fluctuation = solve_statics(scene, *part)
-        before = np.square(scene.level.at(places[here]).std)
-        parts.append([static.level, static.covariance[-1, -1], before, fluctuation])
-    if not parts:
+        before = np.square(scene.level.at(places[of_source]).std)
+        estimates.append([static.level, static.covariance[-1, -1], before, fluctuation])
+    if not estimates:
         return scene.level
-    mean, after, before, fluctuation = np.concatenate(parts, axis=1)
+    mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
     # Their mean, for those that are completed may be any of them: most of a scene may be at rest.
     level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _LEAST[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.

@@ -72,8 +72,8 @@ class Left:
         """Sums over squares of the image with so many pixels along a side."""
         rows, columns = (place // side for place in places)
         group = np.unique(rows * (1 + columns.max()) + columns, return_inverse=True)[1]
-        parts = self.residual, self.cost.square, self.cost.linear, self.cost.variance
-        residual, *cost = (np.bincount(group, one).astype(np.float64) for one in parts)
+        arrays = self.residual, self.cost.square, self.cost.linear, self.cost.variance
+        residual, *cost = (np.bincount(group, array).astype(np.float64) for array in arrays)
         return Left(residual, Cost(*cost))
 
 
@@ -87,14 +87,14 @@ class Gradient:
     left: tuple[Left, ...]  # in single pixels, and in squares of some
 
 
-def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
+def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
     """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit.
 
     And of one for which there are four pixels to a coefficient at least.
     """
     fits, pixels = [], cost.square.size
     for degree in range(limit + 2):
-        functions = _powers(known, known, degree)
+        functions = _powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
         if scarce or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
@@ -118,18 +118,18 @@ def fit(known: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradie
         if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > highest:
             chosen, highest = degree, gain - 2.0 * terms
     _, _, coefficients, residual = fits[chosen]
-    value = _powers(asked, known, chosen) @ coefficients
+    value = _powers(asked, measured, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
     more = min(chosen + 1, len(fits) - 1) if chosen else 0
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
-    at = _powers(asked, known, more)
+    at = _powers(asked, measured, more)
     left, side = Left(residual, cost), round(np.sqrt(_TOGETHER * asked[0].size / pixels))
     return Gradient(
         chosen,
         value,
         np.einsum("pi,ij,pj->p", at, covariance, at),
-        (left, left.over_squares(known, max(side, 1))),
+        (left, left.over_squares(measured, max(side, 1))),
     )
 
 
@@ -140,7 +140,7 @@ def spreads(fits: list[Gradient]) -> list[float]:
     mean and the deviation of a normal distribution; that of a material is the posterior's mean.
     """
     scales = [_spreads([fit.left[scale] for fit in fits]) for scale in range(2)]
-    return [max(both) for both in zip(*scales, strict=True)]
+    return [max(pair) for pair in zip(*scales, strict=True)]
 
 
 def _spreads(fits: list[Left]) -> list[float]:
@@ -197,11 +197,11 @@ def _covariance(functions: Array, inverse: Array, variance: Array) -> Array:
     return inverse @ (functions.T @ (variance[:, np.newaxis] * functions)) @ inverse
 
 
-def _powers(places: Places, known: Places, degree: int) -> Array:
+def _powers(places: Places, measured: Places, degree: int) -> Array:
     """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
     # Far from the origin, in pixels, high powers would be alike but for rounding.
     y, x = (
         (coordinate - those.mean()) / max(float(np.ptp(those)) / 2.0, 1.0)
-        for coordinate, those in zip(places, known, strict=True)
+        for coordinate, those in zip(places, measured, strict=True)
     )
     return np.stack([y**i * x ** (k - i) for k in range(degree + 1) for i in range(k + 1)], axis=1)

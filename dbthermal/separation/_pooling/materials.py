@@ -177,20 +177,20 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     every = np.arange(cells.max() + 1)[np.newaxis]
     pooled = Regions(cells, ratios, _ERROR_RATE).pooled(every)
-    means, variances, known = (part[:, 0] for part in pooled)
+    means, variances, stated = (array[:, 0] for array in pooled)
 
-    def distance(others: Labels) -> Array:
+    def distance(regions: Labels) -> Array:
         """Squares of deviations (y, x) by which the own ratios differ from those of cells."""
-        total = ratios.variances + variances[:, others]
-        square = np.sum((ratios.values - means[:, others]) ** 2 / total, axis=0)
-        return np.where(np.all(known[:, others], axis=0), square, np.nan)
+        total = ratios.variances + variances[:, regions]
+        square = np.sum((ratios.values - means[:, regions]) ** 2 / total, axis=0)
+        return np.where(np.all(stated[:, regions], axis=0), square, np.nan)
 
-    to_region, stays, around = (distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1))
+    to_region, stays, padded = (distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1))
     height, width = cells.shape
     for y, x in product(range(3), repeat=2):
-        neighbour = around[y : y + height, x : x + width]
-        apart = (distance(neighbour) > to_region + _TELLING) | ~known[0, neighbour]
-        stays &= (neighbour == cells) | (neighbour == 0) | ((to_region < _TELLING) & apart)
+        neighbour = padded[y : y + height, x : x + width]
+        differs = (distance(neighbour) > to_region + _TELLING) | ~stated[0, neighbour]
+        stays &= (neighbour == cells) | (neighbour == 0) | ((to_region < _TELLING) & differs)
     return labels.where(stays, NONE)
 
 
@@ -219,8 +219,8 @@ def joined(
     bands, noise = _bands(per_pixel, response)
     variance = ratio_variance(pooled.ratio, pooled.inverse_energy + pooled.spread, noise)
     emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
-    parts = pooled.ratio[1:], variance[1:], *emissivity
-    features = _both(*(part.reshape(-1, *cells.shape) for part in parts))
+    arrays = pooled.ratio[1:], variance[1:], *emissivity
+    features = _both(*(array.reshape(-1, *cells.shape) for array in arrays))
     merged = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
     merged.join_alike(pairs, _RESOLUTION)
@@ -239,11 +239,11 @@ def joined(
                 )
                 for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
             )
-            here = merged.roots()[cells[window]]
-            sides = here == first, here == second
-            ratios, both = (part.window(window) for part in maps)
-            if region_merging.alike(*sides, ratios, both) and region_merging.continuous(
-                *sides, both, _RESOLUTION, _SPACINGS[0]
+            roots = merged.roots()[cells[window]]
+            sides = roots == first, roots == second
+            ratios, feature_pair = (array.window(window) for array in maps)
+            if region_merging.alike(*sides, ratios, feature_pair) and region_merging.continuous(
+                *sides, feature_pair, _RESOLUTION, _SPACINGS[0]
             ):
                 merged.join(first, second)
                 grown = True
@@ -286,10 +286,10 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
         result[name].values.astype(np.float64)
         for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
     )
-    others, first = bands[1:], bands[:1]
-    variances = ratio_std[others] ** 2, emissivity_std[first] ** 2
-    both = _both(ratio[others], variances[0], emissivity[first], variances[1])
-    return Features(*(part[: len(others)] for part in vars(both).values())), both
+    second_bands, first = bands[1:], bands[:1]
+    variances = ratio_std[second_bands] ** 2, emissivity_std[first] ** 2
+    features = _both(ratio[second_bands], variances[0], emissivity[first], variances[1])
+    return Features(*(array[: len(second_bands)] for array in vars(features).values())), features
 
 
 def _both(ratio: Array, variance: Array, emissivity: Array, of_emissivity: Array) -> Features:
@@ -332,10 +332,12 @@ def _links(
     values, noise, steps = emitted.reshape(shape), variances.reshape(shape), np.empty(len(pairs))
     for index, pair in enumerate(pairs):
         first, second = (places[cell] for cell in pair)
-        both = np.concatenate([first, second])
-        least = _LEAST_STEP * np.abs(np.mean(change.ravel()[both]))
-        where = np.divmod(both, cells.shape[1])
-        steps[index] = step(where, values[:, both], noise[:, both].mean(axis=1), first.size, least)
+        pixels = np.concatenate([first, second])
+        least = _LEAST_STEP * np.abs(np.mean(change.ravel()[pixels]))
+        where = np.divmod(pixels, cells.shape[1])
+        steps[index] = step(
+            where, values[:, pixels], noise[:, pixels].mean(axis=1), first.size, least
+        )
     unbroken = steps < chdtri(len(emitted), _STEP_RATE)
     return pairs[unbroken], steps[unbroken]
 

@@ -50,7 +50,7 @@ _FRAMES: Final = 64  # that tell how much an object differs, about
 
 
 def materials(
-    inputs: Inputs, survey: Surveyor, surveys: Survey | None, known: Material | None = None
+    inputs: Inputs, survey: Surveyor, surveys: Survey | None, stated: Material | None = None
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
@@ -63,28 +63,28 @@ def materials(
     selected, unknown = select(labels), np.full(labels.size, np.nan)
     places = np.flatnonzero(selected)
     if surveys is None:
-        before = None if known is None else replace(known, noise_variance=unknown)
+        before = None if stated is None else replace(stated, noise_variance=unknown)
         surveys = survey(inputs, before, selected)
-    alone = surveys.select_pixels(places)
-    if not np.any(alone.frames[0] > 0):
+    per_pixel = surveys.select_pixels(places)
+    if not np.any(per_pixel.frames[0] > 0):
         return None
     image = Image(labels, places, inputs.capture.sizes["x"])
-    material = estimate(image, labels[places], alone, noise, known)
+    material = estimate(image, labels[places], per_pixel, noise, stated)
     count = int(labels.max()) + 1
     sound, valid = (
         total(labels[places], 1.0 * values, count)
-        for values in (alone.frames[0] > 0, np.isfinite(alone.emissivity))
+        for values in (per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity))
     )
     asked = (valid <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
-    if known is not None or not np.any(asked):
+    if stated is not None or not np.any(asked):
         return material
     selected[places] = asked
     # The emissivity is a guess, of constant objects alone.
     more = survey(inputs, replace(material, noise_variance=unknown), selected).select_pixels(
         selected
     )
-    alone.replace_pixels(asked, more)
-    return estimate(image, labels[places], alone, noise, known)
+    per_pixel.replace_pixels(asked, more)
+    return estimate(image, labels[places], per_pixel, noise, stated)
 
 
 def select(labels: Labels) -> Mask:
@@ -101,7 +101,7 @@ def select(labels: Labels) -> Mask:
 
 
 def estimate(
-    image: Image, labels: Labels, survey: Survey, noise: Array, known: Material | None = None
+    image: Image, labels: Labels, survey: Survey, noise: Array, material: Material | None = None
 ) -> Material:
     r"""Ratios and emissivity at all pixels, from surveyed ones of given labels (surveyed,).
 
@@ -115,13 +115,13 @@ def estimate(
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1
         ratio_set, used, most = _sound(labels, count, survey, noise)
-        if known is None:
+        if material is None:
             common, used = _common(image, labels, (ratio_set, used, most), survey, noise)
         else:
-            stated = np.isfinite(known.ratio[-1])
-            ratio = np.where(stated, known.ratio, image.expand(ratio_set.ratio))
-            variance = np.where(stated, known.inverse_energy, image.expand(ratio_set.variance))
-            common = Common(ratio, variance, known.spread)
+            stated = np.isfinite(material.ratio[-1])
+            ratio = np.where(stated, material.ratio, image.expand(ratio_set.ratio))
+            variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
+            common = Common(ratio, variance, material.spread)
         return _material(image, common, used, survey)
 
 
@@ -244,7 +244,7 @@ def regrouped(
 
 
 def hold(
-    alone: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, apart: bool = True
+    per_pixel: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, apart: bool = True
 ) -> None:
     """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
 
@@ -260,24 +260,24 @@ def hold(
     that tells nothing alone, by as much as around. At one place this does not hold for a material
     most of whose moving pixels are gray alone: its others are selected by their noise.
     """
-    sound, valid = (result["status"].values == 0 for result in (alone, pooled))
+    sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
     stay = sound & (~valid | (labels.values < 0))
     if apart:
-        ratios = [result["reflection_ratio_std"].values for result in (pooled, alone)]
+        ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
         stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
     gray, gray_alone, still = (
         (result["status"].values & np.uint32(flag)) != 0
         for result, flag in (
             (pooled, Status.GRAY),
-            (alone, Status.GRAY),
-            (alone, Status.NO_BACKGROUND_MOTION),
+            (per_pixel, Status.GRAY),
+            (per_pixel, Status.NO_BACKGROUND_MOTION),
         )
     )
     stay |= _share(labels.values, gray) > _MOSTLY
-    common, single = sound & valid & ~stay, alone["object_temperature_std"].values
+    common, single = sound & valid & ~stay, per_pixel["object_temperature_std"].values
     if not apart:
         common &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
-    films = [result["object_temperature"].values for result in (pooled, alone)]
+    films = [result["object_temperature"].values for result in (pooled, per_pixel)]
     square, variance = np.zeros((2, *common.shape))
     every = slice(None, None, max(1, len(single) // _FRAMES))
     for row, columns in enumerate(sound & valid):
@@ -294,7 +294,7 @@ def hold(
     factor, film = square * common, pooled["object_temperature_std"].values
     maps = [
         (pooled[name].values, variable.values)
-        for name, variable in alone.items()
+        for name, variable in per_pixel.items()
         if "x" in variable.dims
     ]
     wider = (factor > 0) | (constant > 0)
@@ -326,6 +326,6 @@ def _border(labels: Array) -> Mask:
 def _around(values: Array, counted: Mask) -> Array:
     """Mean (y, x) of the known pixels around."""
     sums = [
-        gaussian_filter(part, _AROUND) for part in (np.where(counted, values, 0.0), counted * 1.0)
+        gaussian_filter(array, _AROUND) for array in (np.where(counted, values, 0.0), counted * 1.0)
     ]
     return np.asarray(sums[0] / np.maximum(sums[1], _SOME))

@@ -83,7 +83,7 @@ class Division:
         return pieces.FUNCTIONS * self.first.sum(axis=0)
 
 
-def divide(white: Array, time: Array, segment: Whole | None, known: Array) -> list[Division]:
+def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> list[Division]:
     """
     Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
 
@@ -92,7 +92,7 @@ def divide(white: Array, time: Array, segment: Whole | None, known: Array) -> li
     """
     tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = white.shape[1:]
-    count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(known).any())
+    count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(stated).any())
     scratch = Scratch(
         white=np.empty((max(_BLOCK, _TURNED // frames), 2, frames)),
         across=np.empty(frames),
@@ -114,21 +114,21 @@ def divide(white: Array, time: Array, segment: Whole | None, known: Array) -> li
         begins=np.empty((pieces.AXES, frames), dtype=bool),
     )
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
-    _divide(tree, np.ascontiguousarray(white), np.ascontiguousarray(known), scratch, first, cost)
-    return [Division(*one) for one in zip(first.mT, cost, strict=True)]
+    _divide(tree, np.ascontiguousarray(white), np.ascontiguousarray(stated), scratch, first, cost)
+    return [Division(*pair) for pair in zip(first.mT, cost, strict=True)]
 
 
 def _joining(most: int, event: Mask) -> joining.Scratch:
     """Work space for pieces that may begin with so many frames, at most."""
-    parts = most + int(event.sum()) + event.size // joining.LONGEST
+    pieces_at_most = most + int(event.sum()) + event.size // joining.LONGEST
     functions = pieces.FUNCTIONS + int(event.sum())
-    degrees = (parts, pieces.FUNCTIONS)
+    degrees = (pieces_at_most, pieces.FUNCTIONS)
     return joining.Scratch(
-        begins=np.empty(parts + 1, np.intp),
+        begins=np.empty(pieces_at_most + 1, np.intp),
         edges=np.empty(most + 1, np.intp),
-        middle=np.empty(parts),
-        half=np.empty(parts),
-        beside=np.empty(parts),
+        middle=np.empty(pieces_at_most),
+        half=np.empty(pieces_at_most),
+        beside=np.empty(pieces_at_most),
         products=np.empty(degrees),
         centre=np.empty(degrees),
         length=np.empty(degrees),
@@ -148,21 +148,21 @@ def _packed(times: bytes, events: bytes | None) -> Tree:
     every = [piece for level in levels for piece in level]
     bases = [basis for _, basis, _ in every]
     values = [_functions(bases, i) for i in range(len(bases))]
-    sizes = np.array([one.size for one in values])
+    sizes = np.array([array.size for array in values])
     columns = np.array([basis.shape[1] for basis in bases])
-    own = np.where(np.arange(len(bases)) < len(bases) // 2, columns, 0)
+    kept = np.where(np.arange(len(bases)) < len(bases) // 2, columns, 0)
     begun = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
     event = np.zeros(time.size, dtype=bool)
     if events is not None:
         event[1:] = np.diff(np.frombuffer(events, dtype=np.intp)) > 0
     return Tree(
-        edges=np.array([(inside.start, inside.stop) for inside, _, _ in every]),
+        edges=np.array([(span.start, span.stop) for span, _, _ in every]),
         columns=columns,
         chosen=np.array([chosen for _, _, chosen in every]),
         places=np.cumsum(sizes) - sizes,
         values=np.concatenate(values),
-        held=np.append(0, np.cumsum(own)),
-        starts=np.concatenate([one for one in begun if one[-1] < len(every)]),
+        held=np.append(0, np.cumsum(kept)),
+        starts=np.concatenate([array for array in begun if array[-1] < len(every)]),
         time=time,
         event=event,
     )
@@ -186,10 +186,10 @@ def _functions(bases: list[Array], i: int) -> Array:
 def _axis(a: float, b: float, d: float) -> tuple[float, float, float]:
     """Principal axis of a scatter, and the energy along it."""
     largest = 0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b)
-    one, two = (largest - d, b) if a >= d else (b, largest - a)
-    length = sqrt(one * one + two * two)
+    x, y = (largest - d, b) if a >= d else (b, largest - a)
+    length = sqrt(x * x + y * y)
     if length > 0.0:
-        return one / length, two / length, largest
+        return x / length, y / length, largest
     return 0.0, 1.0, largest
 
 
@@ -203,24 +203,24 @@ def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
     for i in range(len(tree.edges) - 1, -1, -1):
         start, stop = tree.edges[i]
         columns, free = tree.columns[i], tree.columns[i] < stop - start
-        one, second = white[0, start:stop], white[1, start:stop]
+        x, y = white[0, start:stop], white[1, start:stop]
         if 2 * i + 1 < inner:
             first, last = tree.held[2 * i + 1], tree.held[2 * i + 3]
-            one, second = products[0, first:last], products[1, first:last]
+            x, y = products[0, first:last], products[1, first:last]
             for k in range(3):
                 energy[k, i] = energy[k, 2 * i + 1] + energy[k, 2 * i + 2]
         else:
-            energy[0, i], energy[2, i] = kernels.dot(one, one), kernels.dot(second, second)
-            energy[1, i] = kernels.dot(one, second)
+            energy[0, i], energy[2, i] = kernels.dot(x, x), kernels.dot(y, y)
+            energy[1, i] = kernels.dot(x, y)
         a, b, d = energy[0, i], energy[1, i], energy[2, i]
         for j in range(columns if free or i < inner else 0):
             if j == tree.chosen[i]:
                 scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i] = a, b, d
-            column = tree.values[tree.places[i] + j * one.size :]
+            column = tree.values[tree.places[i] + j * x.size :]
             held, cross = 0.0, 0.0
-            for t in range(one.size):
-                held += column[t] * one[t]
-                cross += column[t] * second[t]
+            for t in range(x.size):
+                held += column[t] * x[t]
+                cross += column[t] * y[t]
             a, b, d = a - held * held, b - held * cross, d - cross * cross
             if i < inner:
                 products[0, tree.held[i] + j], products[1, tree.held[i] + j] = held, cross
@@ -236,8 +236,8 @@ def _best(tree: Tree, scratch: Scratch) -> None:
     """Least cost of all divisions of each piece, by axis to start from."""
     axes, weights = scratch.axes, scratch.weights
     for j in range(axes.shape[1]):
-        one, two = axes[0, j], axes[1, j]
-        weights[0, j], weights[1, j], weights[2, j] = two * two, -2.0 * one * two, one * one
+        x, y = axes[0, j], axes[1, j]
+        weights[0, j], weights[1, j], weights[2, j] = y * y, -2.0 * x * y, x * x
     # The lowest levels are taken a part at a time, whose costs stay in the cache.
     upper = max(1, (len(tree.edges) + 1) >> _WITHIN)
     for root in range(upper - 1, 2 * upper - 1):
@@ -252,13 +252,13 @@ def _best_within(tree: Tree, scratch: Scratch, root: int, end: int, least: Array
     weights, inner, level = scratch.weights, len(tree.edges) // 2, end // 2
     while level > 0:
         for k in range(level):
-            i, here = (root + 1) * level - 1 + k, level - 1 + k
+            i, place = (root + 1) * level - 1 + k, level - 1 + k
             a, b, d = scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i]
-            price, result = pieces.COST * tree.chosen[i], least[here]
+            price, result = pieces.COST * tree.chosen[i], least[place]
             for j in range(result.size):
                 result[j] = weights[0, j] * a + weights[1, j] * b + weights[2, j] * d + price
             if i < inner:
-                left, right = least[2 * here + 1], least[2 * here + 2]
+                left, right = least[2 * place + 1], least[2 * place + 2]
                 for j in range(result.size):
                     result[j] = min(result[j], left[j] + right[j])
         level //= 2
@@ -278,11 +278,11 @@ def _halve(tree: Tree, scratch: Scratch, left_half: float, right_half: float) ->
     end = len(tree.edges) // 2
     while end > 0:  # level by level
         begin = end // 2
-        own, below, halved = least[begin:end], least[end : 2 * end + 1], scratch.halved[begin:end]
-        for i in range(own.size):
+        whole, below, halved = least[begin:end], least[end : 2 * end + 1], scratch.halved[begin:end]
+        for i in range(whole.size):
             halves = below[2 * i] + below[2 * i + 1]
-            halved[i] = halves < own[i] + pieces.TIE
-            own[i] = min(halves, own[i])
+            halved[i] = halves < whole[i] + pieces.TIE
+            whole[i] = min(halves, whole[i])
         end = begin
 
 
@@ -310,14 +310,14 @@ def _chosen(tree: Tree, scratch: Scratch, begins: Mask) -> tuple[float, float, f
 
 @compiled
 def _refine(
-    tree: Tree, scratch: Scratch, one: float, two: float, begins: Mask
+    tree: Tree, scratch: Scratch, x: float, y: float, begins: Mask
 ) -> tuple[float, float, float]:
     """Axis and division in turns: the axis, and the energy along it."""
     energy = 0.0
     for _ in range(pieces.ROUNDS):
-        _halve(tree, scratch, one, two)
-        one, two, energy = _axis(*_chosen(tree, scratch, begins))
-    return one, two, energy
+        _halve(tree, scratch, x, y)
+        x, y, energy = _axis(*_chosen(tree, scratch, begins))
+    return x, y, energy
 
 
 @compiled
@@ -329,44 +329,44 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
         a, b, d = scratch.scatter[:, tree.starts[i]]
         axes[0, i], axes[1, i], _ = _axis(a, b, d)
     if axes.shape[1] > len(tree.starts):
-        known = not np.isnan(axis[0])
-        axes[0, -1] = axis[0] if known else axes[0, 0]
-        axes[1, -1] = axis[1] if known else axes[1, 0]
+        stated = not np.isnan(axis[0])
+        axes[0, -1] = axis[0] if stated else axes[0, 0]
+        axes[1, -1] = axis[1] if stated else axes[1, 0]
     _best(tree, scratch)
     kernels.copy(scratch.least[0], scratch.starting)
-    apart = 0.0
+    angle = 0.0
     for number in range(pieces.AXES):
         place, lowest = 0, np.inf
         for i in range(axes.shape[1]):
-            if scratch.starting[i] < lowest and not _near(axes[:, i], taken, number, apart):
+            if scratch.starting[i] < lowest and not _near(axes[:, i], taken, number, angle):
                 place, lowest = i, scratch.starting[i]
-        one, two, energy = _refine(tree, scratch, axes[0, place], axes[1, place], begins[number])
-        taken[number, 0], taken[number, 1] = one, two
-        again = _near(taken[number], taken, number, apart)
+        x, y, energy = _refine(tree, scratch, axes[0, place], axes[1, place], begins[number])
+        taken[number, 0], taken[number, 1] = x, y
+        repeated = _near(taken[number], taken, number, angle)
         costs[number] = np.inf
-        if not again and lowest < np.inf:
+        if not repeated and lowest < np.inf:
             for t in range(across.size):
-                across[t] = two * white[0, t] - one * white[1, t]
+                across[t] = y * white[0, t] - x * white[1, t]
             costs[number] = joining.join(
                 tree.time, tree.event, across, scratch.joined, begins[number]
             )
         # An axis with an energy E along it, in units of the noise, is known to 1 / sqrt(E).
-        apart = pieces.APART / sqrt(energy)
+        angle = pieces.APART / sqrt(energy)
 
 
 @compiled
-def _near(axis: Array, taken: Array, count: int, apart: float) -> bool:
+def _near(axis: Array, taken: Array, count: int, angle: float) -> bool:
     """Compare an axis with those that are taken: is it within an angle [rad] of one."""
     near = False
     for i in range(count):
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])
-        near |= acos(min(product, 1.0)) < apart
+        near |= acos(min(product, 1.0)) < angle
     return near
 
 
 @kernels.entered
 def _divide(
-    tree: Tree, white: Array, known: Array, scratch: Scratch, first: Mask, cost: Array
+    tree: Tree, white: Array, stated: Array, scratch: Scratch, first: Mask, cost: Array
 ) -> None:
     """Divisions of all pixels of a tile."""
     begins, block = scratch.begins, len(scratch.white)
@@ -377,7 +377,7 @@ def _divide(
                 for p in range(together.shape[2]):
                     scratch.white[p, axis, t] = together[axis, t, p]
         for p in range(start, min(start + block, white.shape[2])):
-            _pixel(tree, scratch, scratch.white[p - start], known[:, p], begins)
+            _pixel(tree, scratch, scratch.white[p - start], stated[:, p], begins)
             for rank in range(2):
                 best = 0
                 for number in range(1, pieces.AXES):

@@ -91,18 +91,18 @@ def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
 ) -> tuple[Any, Any, Any]:
     """A temperature and its deviation, NaN where useless; and what is wrong with them."""
-    lost, missing, beyond, zero, one = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
+    lost, missing, beyond, zero, unit = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
     lowest, highest = np.float32(model.lowest), np.float32(model.highest)
     for t in range(temperature.size):
         kelvin, deviation = np.float32(temperature[t]), np.sqrt(np.float32(variance[t]))
-        missing += one if np.isnan(kelvin) else zero
+        missing += unit if np.isnan(kelvin) else zero
         margin = _SIGMAS * (zero if np.isnan(deviation) else deviation)
-        beyond += one if (kelvin < lowest - margin) | (kelvin > highest + margin) else zero
+        beyond += unit if (kelvin < lowest - margin) | (kelvin > highest + margin) else zero
         useful = (abs(kelvin) < _USELESS) & (deviation < _USELESS)
         value[t] = kelvin if useful else _NAN
         std[t] = deviation if useful else _NAN
     for t in range(temperature.size):  # not above: it would not be taken many at once
-        lost += one if np.isnan(value[t]) else zero
+        lost += unit if np.isnan(value[t]) else zero
     return lost, missing, beyond > zero
 
 
@@ -154,17 +154,17 @@ def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, cova
     for m in range(bands):
         kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
         kernels.fill(work.removed[m, :frames], 0.0)
-    gray, again = False, 0
+    gray, rounds = False, 0
     while True:
         ratios = pixel.ratios(model, work)
-        line = pixel.emission(model, ratios, work, again)
+        line = pixel.emission(model, ratios, work, rounds)
         pixel.background(model, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
-        if again == 0:
+        if rounds == 0:
             gray = pixel.may_be_gray(model, ratios, work)
-        if again == pixel.BENDS or not _bent(model, work, frames):
+        if rounds == pixel.BENDS or not _bent(model, work, frames):
             break
-        again += 1
+        rounds += 1
         _straighten(work, bands, frames)
     deviations = bars.bars(model, ratios, line, work, covariance)
     _write(model, ratios, work, record, vectors)
@@ -255,26 +255,26 @@ def _separate(
     solved: Solved,
 ) -> None:
     """Steps of some pixels of a tile."""
-    inside, outside, pixels = work.inside, work.outside, places.size
-    block = len(inside)
+    samples, outside, pixels = work.inside, work.outside, places.size
+    block = len(samples)
     for start in range(0, pixels, block):
         together = places[start : start + block]
-        _turn(signals, together, inside)
+        _turn(signals, together, samples)
         for p in range(together.size):
-            here = np.uintp(together[p])
+            place = np.uintp(together[p])
             for m in range(model.noise.size):
-                kernels.copy(inside[p, m], work.signals[m])
-            kernels.copy(materials[here], work.material)
-            record, matrices = solved.record[here], solved.matrices[here]
-            ratios = _pixel(model, work, outside[p], record, solved.vectors[here], matrices[3])
-            bars.judge(model, ratios, work, record, solved.sums[..., here])
+                kernels.copy(samples[p, m], work.signals[m])
+            kernels.copy(materials[place], work.material)
+            record, matrices = solved.record[place], solved.matrices[place]
+            ratios = _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
+            bars.judge(model, ratios, work, record, solved.sums[..., place])
             _scatters(model, ratios, work, record, matrices)
         _return(outside, together, solved.films)
 
 
 def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     """All that the pixels of a tile share."""
-    curve, others = tile.curves[0], len(tile.noise) - 1
+    curve, second_bands = tile.curves[0], len(tile.noise) - 1
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in bars.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
@@ -286,9 +286,9 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
         noise=np.array(tile.noise),
-        pattern=np.array(tile.pattern or np.zeros(others + 1)),
+        pattern=np.array(tile.pattern or np.zeros(second_bands + 1)),
         drift=drift / np.sqrt(3.0),
-        chances=(float(chdtri(others, chances[0])), float(chdtri(others, chances[1]))),
+        chances=(float(chdtri(second_bands, chances[0])), float(chdtri(second_bands, chances[1]))),
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
         edges=edges,
         limits=limits,
@@ -318,10 +318,12 @@ def _columns(functions: smooth.Subspace) -> dict[str, Any]:
 def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
     """Fields of a `Model` that hold the responses."""
     first = curves[0]
-    around = first.reference + np.array([-0.5, 0.5])  # [K]
+    temperature = first.reference + np.array([-0.5, 0.5])  # [K]
     temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
-    rates = [np.diff(np.log(one.slope(around) / first.slope(around)))[0] for one in curves]
-    ratios = [one.slope(temperatures) / first.slope(temperatures) for one in curves]
+    rates = [
+        np.diff(np.log(curve.slope(temperature) / first.slope(temperature)))[0] for curve in curves
+    ]
+    ratios = [curve.slope(temperatures) / first.slope(temperatures) for curve in curves]
     return {
         "tables": kernels.rows(curves),
         "rates": np.array(rates),
@@ -332,13 +334,13 @@ def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
 def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
     # Places of one frame that lie a multiple of a page apart would drive each other from the cache.
-    apart = -(-frames // _PAGE) * _PAGE + _APART
+    distance = -(-frames // _PAGE) * _PAGE + _APART
     names = Work._fields
     together, banded = names[1 : names.index("signals")], names[names.index("signals") :][:6]
     vectors = names[names.index("axis") : names.index("material")]
     block, size = max(_BLOCK, _TURNED // frames), len(together)
-    space = np.empty((size + len(banded) * bands, apart))
-    rows = space[size:].reshape(len(banded), bands, apart)
+    space = np.empty((size + len(banded) * bands, distance))
+    rows = space[size:].reshape(len(banded), bands, distance)
     return {
         "first": rows[0, 0, :frames],  # of the signals
         **dict(zip(together, space[:size, :frames], strict=True)),
@@ -368,7 +370,7 @@ def solve(tile: Tile, functions: smooth.Subspace, drift: float) -> Solution:
 def solve_parts(
     tile: Tile,
     functions: smooth.Subspace,
-    parts: Iterable[tuple[Whole, smooth.Subspace]],
+    divided: Iterable[tuple[Whole, smooth.Subspace]],
     drift: float,
 ) -> Solution:
     """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
@@ -380,18 +382,18 @@ def solve_parts(
     materials = np.full((pixels, 5 + bands), np.nan)
     if material is not None:
         numbers = (material.inverse_energy, material.emissivity)
-        rest = (material.noise_variance, material.drift_variance, material.spread)
-        materials[:] = np.stack([*numbers, *rest, *material.ratio], 1)
+        spreads = (material.noise_variance, material.drift_variance, material.spread)
+        materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
     space = _work_space(frames, bands, len(shared.rising))
-    for places, own in parts:
-        model, count = shared._replace(**_columns(own)), own.functions.shape[1]
+    for places, of_part in divided:
+        model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
-        space["scatter"] = np.empty((own.orders, bands, bands))
+        space["scatter"] = np.empty((of_part.orders, bands, bands))
         _separate(model, signals, places, materials, Work(**space), solved)
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()

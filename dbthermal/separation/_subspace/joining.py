@@ -48,10 +48,10 @@ class Scratch(NamedTuple):
 def _part(time: Array, curve: Array, scratch: Scratch, number: int) -> None:
     """Sum up a curve in a part of the time, in place."""
     start, stop = scratch.begins[number], scratch.begins[number + 1]
-    own, basis, size = curve[start:stop], scratch.basis, stop - start
+    section, basis, size = curve[start:stop], scratch.basis, stop - start
     middle = 0.5 * (time[start] + time[stop - 1])
     half = time[stop - 1] - middle if size > 1 else 1.0
-    scale, energy, a, b, before = 1.0 / half, kernels.dot(own, own), 0.0, 0.0, 1.0
+    scale, energy, a, b, before = 1.0 / half, kernels.dot(section, section), 0.0, 0.0, 1.0
     for k in range(pieces.FUNCTIONS):
         scratch.products[number, k], scratch.centre[number, k] = 0.0, 0.0
         scratch.length[number, k] = 0.0
@@ -59,15 +59,15 @@ def _part(time: Array, curve: Array, scratch: Scratch, number: int) -> None:
             energy = 0.0
             continue
         # Orthogonal polynomials: p_k = (x - a) p_k-1 - b p_k-2.
-        one, last = basis[max(k - 1, 0), :size], basis[max(k - 2, 0), :size]
+        previous, last = basis[max(k - 1, 0), :size], basis[max(k - 2, 0), :size]
         following, at, square, first, held = basis[k, :size], time[start:stop], 0.0, 0.0, 0.0
         for t in range(size):
             x = (at[t] - middle) * scale
-            value = (x - a) * one[t] - b * last[t] if k > 0 else 1.0
+            value = (x - a) * previous[t] - b * last[t] if k > 0 else 1.0
             following[t] = value
             square += value * value
             first += value * value * x
-            held += value * own[t]
+            held += value * section[t]
         energy -= held * held / square
         a, b, before = first / square, square / before if k > 0 else 0.0, square
         scratch.centre[number, k], scratch.length[number, k] = a, sqrt(square)
@@ -111,41 +111,41 @@ def _add(scratch: Scratch, number: int, end: float, steps: int) -> float:
         for k in range(count):
             constant = scratch.powers[0, j]
             row[k] = scratch.powers[k, j] if k < pieces.FUNCTIONS else constant
-        rest = scratch.products[number, j]
+        value = scratch.products[number, j]
         for k in range(count):
             if row[k] != 0.0:
                 size = sqrt(matrix[k, k] ** 2 + row[k] ** 2)
                 cosine, sine = matrix[k, k] / size, row[k] / size
-                for other in range(k, count):
-                    above, below = matrix[k, other], row[other]
-                    matrix[k, other] = cosine * above + sine * below
-                    row[other] = cosine * below - sine * above
-                right[k], rest = cosine * right[k] + sine * rest, cosine * rest - sine * right[k]
-        energy += rest * rest
+                for column in range(k, count):
+                    above, below = matrix[k, column], row[column]
+                    matrix[k, column] = cosine * above + sine * below
+                    row[column] = cosine * below - sine * above
+                right[k], value = cosine * right[k] + sine * value, cosine * value - sine * right[k]
+        energy += value * value
     return float(energy)
 
 
 @compiled
 def _split(event: Mask, scratch: Scratch, begins: Mask) -> tuple[int, int]:
     """Parts of the time between first frames and steps of the camera: numbers of both."""
-    begun, edges, count, parts = scratch.begins, scratch.edges, 0, 0
+    begun, edges, count, pieces = scratch.begins, scratch.edges, 0, 0
     for t in range(begins.size):
         if begins[t]:
-            edges[count] = parts
+            edges[count] = pieces
             count += 1
-        if begins[t] or event[t] or t - begun[max(parts - 1, 0)] == LONGEST:
-            begun[parts] = t
-            parts += 1
-    edges[count], begun[parts] = parts, begins.size
-    return count, parts
+        if begins[t] or event[t] or t - begun[max(pieces - 1, 0)] == LONGEST:
+            begun[pieces] = t
+            pieces += 1
+    edges[count], begun[pieces] = pieces, begins.size
+    return count, pieces
 
 
 @compiled
 def join(time: Array, event: Mask, across: Array, scratch: Scratch, begins: Mask) -> float:
     """Keep the best of the first frames of pieces, in place; the cost (eq. 12)."""
     begun, edges, least, before = scratch.begins, scratch.edges, scratch.least, scratch.before
-    count, parts = _split(event, scratch, begins)
-    for number in range(parts):
+    count, count_of_pieces = _split(event, scratch, begins)
+    for number in range(count_of_pieces):
         _part(time, across, scratch, number)
     least[0] = 0.0
     for stop in range(1, count + 1):

@@ -69,7 +69,7 @@ class Table(NamedTuple):
 
 def rows(curves: Sequence[Curve]) -> Array:
     """Responses of some bands (band, number), on one range, for `response`."""
-    tables = [table(curve, *(other for other in curves if other is not curve)) for curve in curves]
+    tables = [table(curve, *(more for more in curves if more is not curve)) for curve in curves]
     return np.array([np.hstack(row) for row in tables])
 
 
@@ -94,7 +94,7 @@ def response(rows: Array, band: int) -> Table:
 
 
 @lru_cache
-def table(curve: Curve, *others: Curve) -> Table:
+def table(curve: Curve, *second: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error; of the others' range."""
     margin = _MARGIN * (curve.highest - curve.lowest)
     widest = np.array([max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin])
@@ -102,12 +102,12 @@ def table(curve: Curve, *others: Curve) -> Table:
         low, high = (curve.reference + share * (widest - curve.reference)).tolist()
         dense = np.linspace(low, high, 1001)
         errors, starts = [], []
-        for one in (*others, curve):
-            u = Chebyshev.interpolate(_signal, degree, [low, high], args=(one,))
-            slope, ends = u.deriv(), _signal(np.array([low, high]), one)
-            errors += [u(dense) - _signal(dense, one), slope(dense) - one.slope(dense)]
-            inverse = Chebyshev.interpolate(_temperature, _TERMS - 1, ends, args=(one,))
-            starts += [inverse(_signal(dense, one)) - dense]
+        for band in (*second, curve):
+            u = Chebyshev.interpolate(_signal, degree, [low, high], args=(band,))
+            slope, ends = u.deriv(), _signal(np.array([low, high]), band)
+            errors += [u(dense) - _signal(dense, band), slope(dense) - band.slope(dense)]
+            inverse = Chebyshev.interpolate(_temperature, _TERMS - 1, ends, args=(band,))
+            starts += [inverse(_signal(dense, band)) - dense]
         if np.abs(errors).max() < _ERROR and np.abs(starts).max() < _START_ERROR:
             break
     else:
@@ -181,12 +181,12 @@ def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
 
 
 @compiled
-def mixed(one: float, a: tuple[float, ...], two: float, b: tuple[float, ...]) -> tuple[float, ...]:
+def mixed(u: float, a: tuple[float, ...], v: float, b: tuple[float, ...]) -> tuple[float, ...]:
     """Ten coefficients of a sum of two polynomials."""
-    low = one * a[0] + two * b[0], one * a[1] + two * b[1], one * a[2] + two * b[2]
-    up = one * a[3] + two * b[3], one * a[4] + two * b[4], one * a[5] + two * b[5]
-    more = one * a[6] + two * b[6], one * a[7] + two * b[7], one * a[8] + two * b[8]
-    return low + up + more + (one * a[9] + two * b[9],)
+    low = u * a[0] + v * b[0], u * a[1] + v * b[1], u * a[2] + v * b[2]
+    up = u * a[3] + v * b[3], u * a[4] + v * b[4], u * a[5] + v * b[5]
+    more = u * a[6] + v * b[6], u * a[7] + v * b[7], u * a[8] + v * b[8]
+    return low + up + more + (u * a[9] + v * b[9],)
 
 
 @compiled
@@ -300,13 +300,13 @@ def _turn(turned: Array, turns: Array, p: int, q: int) -> None:
     cosine = 1.0 / sqrt(tangent * tangent + 1.0)
     sine = tangent * cosine
     for i in range(len(turned)):
-        one, two = turned[p, i], turned[q, i]
-        turned[p, i], turned[q, i] = cosine * one - sine * two, sine * one + cosine * two
-        one, two = turns[p, i], turns[q, i]
-        turns[p, i], turns[q, i] = cosine * one - sine * two, sine * one + cosine * two
+        x, y = turned[p, i], turned[q, i]
+        turned[p, i], turned[q, i] = cosine * x - sine * y, sine * x + cosine * y
+        x, y = turns[p, i], turns[q, i]
+        turns[p, i], turns[q, i] = cosine * x - sine * y, sine * x + cosine * y
     for i in range(len(turned)):
-        one, two = turned[i, p], turned[i, q]
-        turned[i, p], turned[i, q] = cosine * one - sine * two, sine * one + cosine * two
+        x, y = turned[i, p], turned[i, q]
+        turned[i, p], turned[i, q] = cosine * x - sine * y, sine * x + cosine * y
 
 
 @_numbers
@@ -328,14 +328,14 @@ def combined(columns: Array, spans: tiles.Whole, scales: Array, count: int, resu
         a, b = columns[j, start:stop], columns[j + 1, start:stop]
         c, d = columns[j + 2, start:stop], columns[j + 3, start:stop]
         w, x, y, z = scales[j], scales[j + 1], scales[j + 2], scales[j + 3]
-        part = result[start:stop]
-        for t in range(part.size):
-            part[t] += w * a[t] + x * b[t] + y * c[t] + z * d[t]
+        section = result[start:stop]
+        for t in range(section.size):
+            section[t] += w * a[t] + x * b[t] + y * c[t] + z * d[t]
     for j in range(count - count % 4, count):
         start, stop = spans[j]
-        column, part, scale = columns[j, start:stop], result[start:stop], scales[j]
-        for t in range(part.size):
-            part[t] += scale * column[t]
+        column, section, scale = columns[j, start:stop], result[start:stop], scales[j]
+        for t in range(section.size):
+            section[t] += scale * column[t]
 
 
 @compiled
@@ -345,12 +345,12 @@ def projected(columns: Array, spans: tiles.Whole, count: int, curve: Array, resu
         start, stop, w, x, y, z = spans[j, 0], spans[j + 3, 1], 0.0, 0.0, 0.0, 0.0
         a, b = columns[j, start:stop], columns[j + 1, start:stop]
         c, d = columns[j + 2, start:stop], columns[j + 3, start:stop]
-        part = curve[start:stop]
-        for t in range(part.size):
-            w += a[t] * part[t]
-            x += b[t] * part[t]
-            y += c[t] * part[t]
-            z += d[t] * part[t]
+        section = curve[start:stop]
+        for t in range(section.size):
+            w += a[t] * section[t]
+            x += b[t] * section[t]
+            y += c[t] * section[t]
+            z += d[t] * section[t]
         result[j], result[j + 1], result[j + 2], result[j + 3] = w, x, y, z
     for j in range(count - count % 4, count):
         start, stop = spans[j]
@@ -363,13 +363,13 @@ def projected_both(columns: Array, spans: tiles.Whole, first: Array, last: Array
     count = len(columns)
     for j in range(0, count - count % 2, 2):
         start, stop, a, b, c, d = spans[j, 0], spans[j + 1, 1], 0.0, 0.0, 0.0, 0.0
-        one, two = columns[j, start:stop], columns[j + 1, start:stop]
-        some, more = first[start:stop], last[start:stop]
-        for t in range(some.size):
-            a += one[t] * some[t]
-            b += two[t] * some[t]
-            c += one[t] * more[t]
-            d += two[t] * more[t]
+        column, next_column = columns[j, start:stop], columns[j + 1, start:stop]
+        section, last_section = first[start:stop], last[start:stop]
+        for t in range(section.size):
+            a += column[t] * section[t]
+            b += next_column[t] * section[t]
+            c += column[t] * last_section[t]
+            d += next_column[t] * last_section[t]
         to[0, j], to[0, j + 1], to[1, j], to[1, j + 1] = a, b, c, d
     if count % 2:
         projected(columns[-1:], spans[-1:], 1, first, to[0, -1:])

@@ -69,12 +69,12 @@ def tree(time: bytes, segment: bytes | None) -> list[list[Piece]]:
         bounds = edges[:: 2 ** (levels - level)]
         halved.append([])
         for (start, stop), basis in zip(pairwise(bounds), _bases(times, bounds), strict=True):
-            one, inside = slice(start, stop), None if events is None else events[start:stop]
-            if inside is not None and inside[0] < inside[-1]:
-                halved[-1].append((one, *functions(times[one].tobytes(), inside.tobytes())))
+            span, segments = slice(start, stop), None if events is None else events[start:stop]
+            if segments is not None and segments[0] < segments[-1]:
+                halved[-1].append((span, *functions(times[span].tobytes(), segments.tobytes())))
             else:
                 chosen = FUNCTIONS if len(basis) > smooth.PIECE_ORDER else basis.shape[1]
-                halved[-1].append((one, basis, chosen))
+                halved[-1].append((span, basis, chosen))
     return halved
 
 
@@ -139,7 +139,7 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
 
 
 def outside(
-    signals: Array, noise: tuple[float, ...], parts: Iterable[tuple[Whole, smooth.Subspace]]
+    signals: Array, noise: tuple[float, ...], divided: Iterable[tuple[Whole, smooth.Subspace]]
 ) -> tuple[Array, Array]:
     """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
 
@@ -147,9 +147,9 @@ def outside(
     """
     pixels, bands, frames = signals.shape
     scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
-    for places, own in parts:
-        columns = np.ascontiguousarray(own.functions.T)
-        _outside(columns, own.spans, signals, places, np.empty((bands, len(columns))), scatter)
+    for places, of_part in divided:
+        columns = np.ascontiguousarray(of_part.functions.T)
+        _outside(columns, of_part.spans, signals, places, np.empty((bands, len(columns))), scatter)
         freedom[places] = frames - len(columns)
     whitened = scatter.transpose(1, 2, 0) / np.multiply.outer(noise, noise)[..., np.newaxis]
     return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
@@ -161,11 +161,11 @@ def _outside(
 ) -> None:
     """Products of signals (pixel, band, time) outside columns (column, time), in place."""
     for p in range(places.size):
-        here = signals[places[p]]
-        for m in range(len(here)):
-            kernels.projected(columns, spans, len(columns), here[m], held[m])
+        signal = signals[places[p]]
+        for m in range(len(signal)):
+            kernels.projected(columns, spans, len(columns), signal[m], held[m])
             for n in range(m + 1):
-                product = kernels.dot(here[m], here[n]) - kernels.dot(held[m], held[n])
+                product = kernels.dot(signal[m], signal[n]) - kernels.dot(held[m], held[n])
                 scatter[places[p], m, n] = scatter[places[p], n, m] = product
 
 
@@ -200,8 +200,8 @@ def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[
         for i, j in pairs
     )
     principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
-    known = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
-    energy = np.where(np.isnan(known), principal, known)
+    pooled = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
+    energy = np.where(np.isnan(pooled), principal, pooled)
     order = _order(energy, white.shape[1])
     used = order + 1 + functions.steps
     return energy[order, np.arange(order.size)], used

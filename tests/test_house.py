@@ -1,0 +1,75 @@
+"""The house: what each room may weigh, and nouns for its names."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import dbthermal
+
+HOUSE = Path(dbthermal.__file__).parent
+
+# Lines and modules that a room may have. A room that grows takes from another; these only fall.
+BUDGET = {
+    "": (3520, 19),
+    "_cli": (850, 6),
+    "alignment": (3040, 13),
+    "calibration": (820, 3),
+    "correction": (1330, 6),
+    "emissivity": (520, 3),
+    "explorer": (1110, 6),
+    "figures": (800, 7),
+    "instruments": (6120, 24),
+    "limits": (740, 4),
+    "readers": (1910, 9),
+    "reporting": (620, 4),
+    "separation": (13080, 55),
+    "simulation": (640, 3),
+    "store": (1260, 5),
+}
+INSTALLED = 36_250  # lines of all rooms
+
+PRONOUNS = {
+    *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
+    *("both", "each", "found", "two", "rest", "left", "inside", "around", "again", "beside"),
+    *("alone", "given"),
+}
+MOST = 0.005  # share of all names; in verde, ccdproc, suite2p and icepack 0.000 to 0.001
+
+
+def modules() -> Iterator[Path]:
+    """Yield the files of the package."""
+    yield from sorted(HOUSE.rglob("*.py"))
+
+
+def room_of(path: Path) -> str:
+    """Package that a file is in; empty for the modules beside the packages."""
+    return path.relative_to(HOUSE).parts[0] if path.parent != HOUSE else ""
+
+
+def test_rooms_keep_to_their_budgets() -> None:
+    """In lines and modules, each and together; and no room is without one."""
+    weights = dict.fromkeys(BUDGET, (0, 0))
+    for path in modules():
+        lines, files = weights[room_of(path)]
+        size = len(path.read_text(encoding="utf-8").splitlines())
+        weights[room_of(path)] = lines + size, files + 1
+    beyond = [
+        f"{room or 'base'}: {weights[room]}. Must be at most {most}."
+        for room, most in BUDGET.items()
+        if weights[room][0] > most[0] or weights[room][1] > most[1]
+    ]
+    assert not beyond, "\n".join(beyond)
+    assert sum(lines for lines, _ in weights.values()) <= INSTALLED
+
+
+def test_names_are_nouns() -> None:
+    """Pronouns and participles stand for no quantity: a reader asks which."""
+    names = [
+        node.id.strip("_")
+        for path in modules()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Name)
+    ]
+    share = sum(name in PRONOUNS for name in names) / len(names)
+    print(f"pronouns: {share:.2%} of {len(names)} names")
+    assert share <= MOST
