@@ -128,7 +128,7 @@ def materials(
     variance = material.inverse_energy + material.spread + between
     none = np.zeros_like(variance)
     material = replace(material, inverse_energy=variance, spread=none)
-    return pooled(inputs, known=material)
+    return pooled(inputs, stated=material)
 
 
 def _survey(

@@ -56,7 +56,7 @@ def materials(
 
     Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
     alone are a selection by their ratios: unless they are nearly all of their material, all of it
-    are surveyed again, with its ratios. Those `known` stay, and pixels are surveyed with them.
+    are surveyed again, with its ratios. Those `stated` stay, and pixels are surveyed with them.
     """
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
@@ -109,8 +109,8 @@ def estimate(
     maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
     the pixels' own, corrected to these ratios. Both may have `gradients` over the place. A pixel
     that differs from its material by more than four standard deviations is left out. The noise is
-    that of the bands (band,) [K]; NaN for a material without information. Ratios (band, pixel) that
-    are `known` are those.
+    that of the bands (band,) [K]; NaN for a material without information. Ratios (band, pixel) of a
+    `material` are kept.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1

@@ -88,7 +88,7 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> l
     Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
 
     The second one is that of the other line, if there is one, and costs more. The axis of a
-    material may be `known` (2, pixel), NaN for others.
+    material may be `stated` (2, pixel), NaN for others.
     """
     tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = white.shape[1:]
