@@ -36,6 +36,9 @@ _MODULES: Final = {
     "apparent": "_apparent",
 }
 _COVARIANCE: Final = "emissivity_covariance"
+# Share of pixels in pieces from which these are kept for the next pass: 0.08 where a band is two
+# frames late, 0.19 of a rapid object before displaced cameras (outcomes of tests/separation) [1].
+_DIVIDED: Final = 0.125
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -232,7 +235,7 @@ def separated(
             for pixels in threads.map(separate, inputs.blocks):
                 bar.update(pixels)
             # Few pixels in pieces may be so by a flaw, as a delay: these are searched anew.
-            if 2 * np.count_nonzero(inputs.division.any(axis=0)) < result["status"].size:
+            if np.mean(inputs.division.any(axis=0)) < _DIVIDED:
                 inputs.division[:] = 0
             return survey
 
