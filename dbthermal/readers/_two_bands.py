@@ -88,13 +88,7 @@ def two_bands(
             "equal: resample the second recording, or crop the first."
         )
     # Offset of the clocks, by which they must overlap.
-    late = offset
-    if late is None:
-        dates = [recording.attrs.get("start") for recording in pair]
-        if None in dates:
-            raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
-        begun, later = (datetime.fromisoformat(str(date)) for date in dates)
-        late = (later - begun).total_seconds()
+    late = _between_dates(pair) if offset is None else offset
     starts, stops = ([recording["time"].values[place] for recording in pair] for place in (0, -1))
     overlap = np.minimum(stops[0], stops[1] + late) - np.maximum(starts[0], starts[1] + late)
     if not overlap > 0 and max(recording.sizes["time"] for recording in pair) > 1:
@@ -137,6 +131,15 @@ def two_bands(
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
     borders = map(_border, overlapping, names)
     return warned(capture, *_temperatures(overlapping), *filter(None, borders))
+
+
+def _between_dates(pair: tuple[xr.Dataset, xr.Dataset]) -> float:
+    """Time from the date of the first recording to that of the second [s]."""
+    dates = [recording.attrs.get("start") for recording in pair]
+    if None in dates:
+        raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
+    begun, later = (datetime.fromisoformat(str(date)) for date in dates)
+    return (later - begun).total_seconds()
 
 
 def _names(bands: Any) -> list[str]:

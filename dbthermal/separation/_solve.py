@@ -251,9 +251,8 @@ def separated(
     if inputs.method.pools:
         _withhold(result)
     # Say what was used: noise, method, settings, warnings.
-    sources = inputs.response.attrs, capture.attrs
-    held = sources[0] | sources[1]
-    notes = [np.atleast_1d(attrs.get("warnings", [])) for attrs in sources]
+    held = inputs.response.attrs | capture.attrs
+    notes = [np.atleast_1d(data.attrs.get("warnings", [])) for data in (inputs.response, capture)]
     doubts = dict.fromkeys(str(sentence) for note in notes for sentence in note)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}

@@ -243,7 +243,7 @@ def _complete_pixels(
     # A frame that was lost is no sample to complete: many captures lack some.
     arrays = [completed[name].values[:, y, x] for name in (*FILMS, *MAPS, f"{FILMS[0]}_std")]
     wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in arrays[:2]], axis=0)
-    wanted |= np.any([np.isnan(part).any(axis=0) for part in arrays[2:4]], axis=0)
+    wanted |= np.any([np.isnan(block).any(axis=0) for block in arrays[2:4]], axis=0)
     wanted &= valid.any(axis=0)
     measured = np.array([arrays[0], arrays[-1]], dtype=np.float64)
     sources = np.where(wanted, scene.source[places], -1)
@@ -251,18 +251,18 @@ def _complete_pixels(
         chosen = sources == source
         if not chosen.any():
             continue
-        part = tile.select_pixels(chosen)
+        block = tile.select_pixels(chosen)
         static, variance = scenes.solve_statics(
-            scene, part, valid[:, chosen], source, places[chosen]
+            scene, block, valid[:, chosen], source, places[chosen]
         )
         if source == scenes.MATERIAL:
             kept = ~scenes.contradicted(scene, static, places[chosen])
             sources[chosen] = np.where(kept, source, scenes.PRIOR)
             chosen = sources == source
-            static, part = static.select_pixels(kept), part.select_pixels(kept)
+            static, block = static.select_pixels(kept), block.select_pixels(kept)
             variance = variance[kept]
         values = scenes.solve(
-            scene, part, valid[:, chosen], static, variance, measured[..., chosen]
+            scene, block, valid[:, chosen], static, variance, measured[..., chosen]
         )
         _fill(scene, completed, places[chosen], values, source)
 
@@ -275,11 +275,11 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
         names = (name, f"{name}_std")
-        new = [values[part][order] if name in MAPS else values[part] for part in names]
+        new = [values[key][order] if name in MAPS else values[key] for key in names]
         limits = (curve.lowest, curve.highest) if name == FILMS[0] else (-np.inf, np.inf)
         _take(
-            *(completed[part].values for part in names),
-            *(np.asfortranarray(part) for part in new),
+            *(completed[key].values for key in names),
+            *(np.asfortranarray(key) for key in new),
             np.stack([y, x], axis=-1),
             limits,
             filled,

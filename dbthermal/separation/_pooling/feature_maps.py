@@ -49,12 +49,12 @@ def mean_signals(
         curve = responses.curve(response, str(counts["band"].values[band]))
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
-            part = counts.isel(band=band, y=rows).values
-            valid = schema.measured(part)
-            part = part if valid.all() else np.where(valid, part, 0.0)
+            block = counts.isel(band=band, y=rows).values
+            valid = schema.measured(block)
+            block = block if valid.all() else np.where(valid, block, 0.0)
             sums, numbers = (
                 np.stack([film[selected].sum(axis=0, dtype=np.float64) for selected in thirds])
-                for film in (part, valid)
+                for film in (block, valid)
             )
             frames[index, rows] = numbers.sum(axis=0)
             with np.errstate(invalid="ignore"):  # without a sample
@@ -89,7 +89,7 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
     films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
     frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
     for row in np.flatnonzero(of.any(axis=1)):
-        film, std = (part[:, row, of[row]] for part in films)
+        film, std = (array[:, row, of[row]] for array in films)
         # Sorted along contiguous samples: far faster than a median along the first axis.
         ordered = np.sort(film.T.copy(), axis=1)
         median = ordered[:, [(frames - 1) // 2, frames // 2]].mean(axis=1)
@@ -111,14 +111,14 @@ def edges(maps: Array, variances: Array) -> Array:
 
     counts, 0 where all features are NaN.
     """
-    known = np.isfinite(maps) & np.isfinite(variances) & (variances > 0)
-    weight = np.divide(1.0, variances, out=np.zeros_like(maps), where=known)
+    sound = np.isfinite(maps) & np.isfinite(variances) & (variances > 0)
+    weight = np.divide(1.0, variances, out=np.zeros_like(maps), where=sound)
     window = np.array([0.0, _BLUR, _BLUR])
     # m = sum g w f / sum g w,  var(m) = sum g^2 w / (sum g w)^2
     total = ndimage.gaussian_filter(weight, window)
     # The square of a Gaussian is a narrower Gaussian.
     squares = ndimage.gaussian_filter(weight, window / np.sqrt(2)) / (4 * np.pi * _BLUR**2)
-    weighted = ndimage.gaussian_filter(weight * np.where(known, maps, 0.0), window)
+    weighted = ndimage.gaussian_filter(weight * np.where(sound, maps, 0.0), window)
     valid = total > _EMPTY * weight.max(axis=(1, 2), keepdims=True)
     mean = np.divide(weighted, total, out=np.zeros_like(total), where=valid)
     variance = np.divide(squares, total**2, out=np.full_like(total, np.inf), where=valid)

@@ -140,8 +140,8 @@ class Regions:
             queue = [(float(statistic[i]), int(pairs[i, 0]), int(pairs[i, 1])) for i in alike]
             heapq.heapify(queue)
             while queue:
-                before, one, other = heapq.heappop(queue)
-                first, second = self.root(one), self.root(other)
+                before, region, neighbour = heapq.heappop(queue)
+                first, second = self.root(region), self.root(neighbour)
                 if first == second:
                     continue
                 now, resolved_now = self._compare_one(first, second)
@@ -154,9 +154,9 @@ class Regions:
                 self._merge(first, second)
                 joined = True
 
-    def join(self, one: int, other: int) -> None:
+    def join(self, region: int, neighbour: int) -> None:
         """Join the regions of two cells."""
-        first, second = self.root(one), self.root(other)
+        first, second = self.root(region), self.root(neighbour)
         if first != second:
             self._merge(first, second)
 
@@ -198,13 +198,13 @@ class Regions:
             values[:, second] = 0.0
 
 
-def alike(first: Mask, second: Mask, ratios: Features, both: Features) -> bool:
+def alike(first: Mask, second: Mask, ratios: Features, maps: Features) -> bool:
     """Say that the ratios on both sides of a border (y, x) may be those of one material.
 
     Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
     """
-    told = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
-    sides = [told & region for region in (first, second)]
+    sound = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
+    sides = [sound & region for region in (first, second)]
     if not all(region.any() for region in sides):
         return True
     middle = np.array([np.median(ratios.values[:, region], axis=1) for region in sides])
@@ -218,11 +218,11 @@ def alike(first: Mask, second: Mask, ratios: Features, both: Features) -> bool:
 
     if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
         return True
-    for region, own, beside in zip(sides, middle, middle[::-1], strict=True):
-        values = both.values[-1, region]
+    for region, mean, opposite in zip(sides, middle, middle[::-1], strict=True):
+        values = maps.values[-1, region]
         if np.isfinite(values).any():
             emissivity = np.nanmedian(values)
-            if near((1.0 - own * (1.0 - emissivity)) / emissivity, beside, _OWN):
+            if near((1.0 - mean * (1.0 - emissivity)) / emissivity, opposite, _OWN):
                 return True
     return False
 

@@ -222,10 +222,10 @@ def _agrees(scatter: Array, axis: Array, limit: float) -> bool:
 
 
 @inlined
-def _across(scatter: Array, work: Work, known: float) -> float:
+def _across(scatter: Array, work: Work, pooled: float) -> float:
     """Energy of a scatter across its principal axis, or across the material's."""
     whole, along, axis = 0.0, 0.0, work.material_axis
-    if known:
+    if pooled:
         for m in range(axis.size):
             along += axis[m] * kernels.dot(scatter[m], axis)
     else:
@@ -236,14 +236,14 @@ def _across(scatter: Array, work: Work, known: float) -> float:
 
 
 @inlined
-def _order(work: Work, known: float, frames: int) -> int:
+def _order(work: Work, pooled: float, frames: int) -> int:
     """Order less one of the lowest information criterion, see `ratios`."""
     scatter = work.scatter
     lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
     # N ln E + K ln N is least where E N^(K / N) is.
     best, least, price, step = lowest, np.inf, 1.0, frames ** (1.0 / frames)
     for order in range(lowest, len(scatter) - 1):
-        criterion = price * max(_across(scatter[order], work, known), reflection_ratio.TINY)
+        criterion = price * max(_across(scatter[order], work, pooled), reflection_ratio.TINY)
         price *= step
         if criterion < least:
             best, least = order, criterion
@@ -276,9 +276,9 @@ def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
             step += (off[m] - before[m]) ** 2
             turned -= before[m] * (off[m] - before[m])
         if i > 0:
-            part = min(max(turned / max(step, reflection_ratio.TINY), 0.0), 1.0)
+            share = min(max(turned / max(step, reflection_ratio.TINY), 0.0), 1.0)
             for m in range(bands):
-                square += (before[m] + part * (off[m] - before[m])) ** 2
+                square += (before[m] + share * (off[m] - before[m])) ** 2
             statistic = square / ratios.inverse_energy
             nearest = min(nearest, statistic)
             chance += _chance(statistic, bands - 1) / (len(model.gray) - 1.0)
@@ -303,8 +303,8 @@ def _mixed(model: Model, work: Work, emissivity: float) -> tuple[float, ...]:
     factors, tables = work.factors, model.tables
     for m in range(factors.size):
         factors[m] = work.null_weights[m] * (1.0 - work.ratio[m] * (1.0 - emissivity))
-    one, two = kernels.response(tables, 0), kernels.response(tables, 1)
-    mixed = kernels.mixed(factors[0], one.signal, factors[1], two.signal)
+    first, second = kernels.response(tables, 0), kernels.response(tables, 1)
+    mixed = kernels.mixed(factors[0], first.signal, factors[1], second.signal)
     for m in range(2, factors.size):
         mixed = kernels.mixed(1.0, mixed, factors[m], kernels.response(tables, m).signal)
     return mixed
@@ -347,7 +347,7 @@ def combined(weights: Array, coefficients: Array, count: int, columns: Array) ->
 
 
 @inlined
-def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
+def emission(model: Model, ratios: Ratio, work: Work, rounds: int) -> Line:
     """Steps 2 and 3 in turns: the object (eq. 5, 6) and the emissivities (eq. 7), in place."""
     z, weights, temperature = work.first, work.weights, work.temperature
     count, material, largest = ratios.order + model.steps, work.material, 1.0
@@ -372,7 +372,7 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     for turn in range(ROUNDS):
         _approach(model, emissivity, work, work.emitted)
         slope, variance, scale, energy = regression.regress(
-            work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
+            work.emitted, z, model.noise[0], weights, work.residual, work.few, rounds + turn > 0
         )
         constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
@@ -443,14 +443,14 @@ def _bend(model: Model, work: Work, outside: float) -> None:
     physical, scale = 0.0 < work.emissivity[0] < 1.0, 1.0 / first.half
     for m in range(1, work.emissivity.size):
         bend, factor = work.bend[m, :frames], 1.0 - work.emissivity[m]
-        other = kernels.response(model.tables, m)
-        apart = kernels.mixed(1.0, other.signal, -1.0, first.signal)
+        second = kernels.response(model.tables, m)
+        difference = kernels.mixed(1.0, second.signal, -1.0, first.signal)
         for t in range(frames):
-            bend[t] = factor * kernels.polynomial(apart, (result[t] - first.middle) * scale)
+            bend[t] = factor * kernels.polynomial(difference, (result[t] - first.middle) * scale)
         for t in range(frames if outside > 0.0 else 0):
             if not abs(result[t] - first.middle) <= first.half:
-                part = kernels.exact(other, result[t])[0] - kernels.exact(first, result[t])[0]
-                bend[t] = factor * part
+                exact = kernels.exact(second, result[t])[0] - kernels.exact(first, result[t])[0]
+                bend[t] = factor * exact
         physical &= 0.0 < work.emissivity[m] < 1.0 and kernels.mean(bend) * 0.0 == 0.0
     for m in range(1, work.emissivity.size if not physical else 1):
         kernels.fill(work.bend[m, :frames], 0.0)
