@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
@@ -16,6 +16,8 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
+from dbthermal.separation import _blur as blurs
+from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
@@ -115,11 +117,55 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
     alone = None if alone is None else _checked(alone, corrected, inputs)
+    # Separate, and once more if the bands are blurred unlike.
+    parts = _separated(corrected, inputs, reflection_shift, materials, alone, workers, progress)
+    misfit = misfits.measure(parts.inputs, parts.result)
+    alike = blurs.equalise(corrected, parts.inputs, parts.result, misfit)
+    if alike is not None:
+        corrected, inputs = alike.capture, replace(inputs, capture=alike.capture)
+        parts = _separated(corrected, inputs, reflection_shift, materials, None, workers, progress)
+        misfit = misfits.measure(parts.inputs, parts.result)
+        misfit = replace(misfit, change=np.hypot(misfit.change, alike.detail))
+        parts.doubts.append(alike.sentence)
+    result, materials = parts.result, parts.materials
+    if result is alone:  # which is the caller's
+        result = result.copy(deep=True)
+    misfits.widen(parts.inputs, result, misfit)
+    # Complete what is still unknown.
+    context = replace(context, materials=materials, reflection_shift=parts.reflection_shift)
+    result = filled(result, corrected, response, context, workers)
+    if materials is not None:
+        result["material"] = materials
+    source = "none" if parts.reflection_shift is None else "found"
+    source = source if reflection_shift is None else "given"
+    return warned(result.assign_attrs(reflection_shift=source), *unlike, *parts.doubts)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What was measured, and by what."""
+
+    result: xr.Dataset
+    inputs: Inputs
+    materials: xr.DataArray | None
+    reflection_shift: xr.Dataset | None
+    doubts: list[str]
+
+
+def _separated(
+    corrected: xr.Dataset,
+    inputs: Inputs,
+    reflection_shift: xr.Dataset | None,
+    materials: xr.DataArray | None,
+    alone: xr.Dataset | None,
+    workers: int,
+    progress: bool,
+) -> _Parts:
+    """Separate each pixel, with the shift of the reflections, and then over materials."""
     # Find the shift of the reflections, where cameras stand apart.
-    original, source, share = alone, "given", 0.0
+    share = 0.0
     if reflection_shift is None:
-        reflection_shift, share = _shift(corrected, response)
-        source = "none" if reflection_shift is None else "found"
+        reflection_shift, share = _shift(corrected, inputs.response)
     if reflection_shift is not None:
         shift = displaced.check(reflection_shift, corrected, inputs.bands[0])
         inputs = replace(inputs, displacement=shift)
@@ -139,14 +185,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result, materials = _over_found_materials(pool, inputs, corrected, alone)
     if materials is not None:
         hold(alone, result, materials, apart=reflection_shift is not None)
-    if result is original:  # which is the caller's
-        result = result.copy(deep=True)
-    # Complete what is still unknown.
-    context = replace(context, materials=materials, reflection_shift=reflection_shift)
-    result = filled(result, corrected, response, context, workers)
-    if materials is not None:
-        result["material"] = materials
-    return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
+    return _Parts(result, inputs, materials, reflection_shift, doubts)
 
 
 def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr.Dataset:

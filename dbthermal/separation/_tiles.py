@@ -409,6 +409,32 @@ def cut(
         yield Cut(window, places, status, valid, sections)
 
 
+def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
+    """Signals (band, frame, pixel) [K] of some rows, the quietest band first, in the frames of most.
+
+    And these frames (time), the pixels that have them all, and the noise (band, pixel) over that of
+    a sample.
+    """
+    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
+    source = rows if displacement is None else displacement.source(rows)
+    block = inputs.capture.isel(y=source).load()
+    slopes = np.array([curve.reference_slope for curve in inputs.curves])
+    grains = quality.grains(block, inputs.noise * slopes)
+    if displacement is None:
+        counts, valid, status = quality.read(block, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+        gain = np.ones((2, status.size))
+    else:
+        counts, usable, _, status, gain = displaced.paired(
+            lambda: (block, grains), displacement, rows, source, slice(None), fewest
+        )
+    sets = quality.common_frames(counts, usable, status, fewest)
+    frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
+    window = rows, slice(0, inputs.capture.sizes["x"])
+    signals = _tile(inputs, counts, block["time"].values, window, None, slice(None)).signals
+    return signals[:, frames], frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
+
+
 def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:
     """Frames with which the pieces of the time begin (time, pixel); None if none are kept."""
     return np.unpackbits(division, axis=0, count=frames).view(bool) if division.any() else None

@@ -1,0 +1,189 @@
+r"""Blurs that differ between the bands, of lenses, diffraction, or rough surfaces, made alike.
+
+With Gaussian blurs of variances s, the rapid changes h of band m are those of the first one, blurred,
+
+.. math:: h_m / k_m - h_1 = c \nabla^2 h_1 + \delta h_1, \quad c = (s_m - s_1) / 2
+
+with an error delta of the ratio that is common to a neighbourhood, and least squares over all
+pixels. The band that is sharper is blurred, and c is sought again until nothing is left.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import gaussian_filter, laplace, uniform_filter
+
+from dbthermal._arrays import Array, Mask, empty, quotient, release
+from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._misfit import Misfit, object_weights, smooth_functions
+
+_ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
+_AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
+_EDGE: Final = 4  # pixels at the image's edge that are left out
+_NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
+_MOVING: Final = 1.0  # variance of the changes over that of noise
+# Deviations and size [pixel^2] of a difference that counts, and the share of the pixels with a
+# remainder from which it is sought.
+_SURE, _LEAST, _MUCH = 6.0, 0.1, 0.2
+_MOST: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
+_BLOCKS: Final = 8  # of rows that tell it
+
+
+@dataclass(frozen=True)
+class Equalised:
+    """A capture whose bands are blurred alike in their rapid changes."""
+
+    capture: xr.Dataset
+    variances: Array  # of the blur of each band (band) [pixel^2]
+    detail: Array  # deviation of the object's signal, if it is blurred as they are (y, x) [K]
+
+    @property
+    def sentence(self) -> str:
+        """What was done, for the user."""
+        blurs = ", ".join(
+            f"'{band}' {deviation:.2f}"
+            for band, deviation in zip(
+                self.capture["band"].values, np.sqrt(self.variances), strict=True
+            )
+        )
+        return (
+            f"The bands are not equally sharp: reflections were blurred by {blurs} pixel, and the "
+            "deviations hold what that may do to details of the object."
+        )
+
+
+def equalise(
+    corrected: xr.Dataset, inputs: Inputs, result: xr.Dataset, misfit: Misfit
+) -> Equalised | None:
+    """Blur the sharper bands, if a difference explains what a result leaves; None if not."""
+    sound = result["status"].values == 0
+    if np.mean((misfit.leak > 0.0) | (misfit.change > 0.0), where=sound) <= _MUCH:
+        return None
+    excess = np.zeros(len(inputs.bands))
+    for place in range(1, excess.size):
+        excess[inputs.bands[place]] = _difference(inputs, result, sound, place)
+    variances = excess.max() - excess
+    if not variances.any():
+        return None
+    # Blur what smooth functions of time do not hold: maps of their coefficients say what they do.
+    counts = empty(corrected["counts"].shape, np.float32)
+    factor = np.ones(excess.size)
+    square = np.zeros(sound.shape)
+    weights = object_weights(inputs, result)
+    for band, film in enumerate(counts):
+        film[:] = corrected["counts"].values[band]
+        if variances[band] > 0.0:
+            deviation = float(np.sqrt(variances[band]))
+            more = _blur_rapid(film, inputs, deviation)
+            square += (weights[band] * more / inputs.curves[band].reference_slope) ** 2
+            point = np.zeros((1 + 8 * int(np.ceil(deviation)),) * 2)
+            point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
+            factor[band] = np.sqrt(np.sum(_blurred(point, deviation) ** 2))
+        release()
+    if "noise_factor" in corrected:
+        factor = factor * corrected["noise_factor"].values
+    variable = corrected["counts"].copy(data=counts)
+    capture = corrected.assign(counts=variable, noise_factor=("band", factor))
+    return Equalised(capture, variances, np.sqrt(square))
+
+
+def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float) -> Array:
+    """Blur the rapid changes of a film (time, y, x), in place.
+
+    Returns the root mean square (y, x) over time of what a blur makes of all else, and of the
+    rapid changes that it would take from outside the image.
+    """
+    status = inputs.capture["status"].values if "status" in inputs.capture else 0
+    valid = np.isfinite(film) & (status == np.uint32(0))
+    filled = np.where(valid, film, np.mean(film, axis=0, where=valid, keepdims=True))
+    np.nan_to_num(filled, copy=False)
+    functions = smooth_functions(inputs, np.ones(len(film), dtype=bool)).astype(np.float32)
+    maps = np.tensordot(functions.T, filled, 1)
+    change = np.stack([_blurred(image, deviation) - image for image in maps])
+    outside = 1.0 - gaussian_filter(np.ones(film.shape[1:]), deviation, mode="constant")
+    square = np.sum(change.astype(np.float64) ** 2, axis=0)
+    for frame, values, used, coefficients in zip(film, filled, valid, functions, strict=True):
+        blurred = _blurred(values, deviation) - np.tensordot(coefficients, change, 1)
+        square += (outside * (blurred - np.tensordot(coefficients, maps, 1))) ** 2
+        frame[used] = blurred[used]
+    return np.asarray(np.sqrt(square / len(film)))
+
+
+def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
+    return np.asarray(gaussian_filter(image, deviation, mode="nearest"))
+
+
+def _difference(inputs: Inputs, result: xr.Dataset, sound: Mask, place: int) -> float:
+    """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
+    excess = step = 0.0
+    for turn in range(_ROUNDS):
+        rows = inputs.blocks[:: max(1, len(inputs.blocks) // _BLOCKS)]
+        forces, form, variance = np.sum(
+            [_equations(inputs, result, sound, place, excess, block) for block in rows], axis=0
+        )
+        if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
+            return 0.0
+        step = 2.0 * forces / form
+        excess += float(np.clip(step, -_STEP, _STEP))
+        if abs(step) < _SETTLED * abs(excess):
+            return excess if 2.0 * _LEAST < abs(excess) < _MOST else 0.0
+    return 0.0
+
+
+def _equations(
+    inputs: Inputs, result: xr.Dataset, sound: Mask, place: int, excess: float, rows: slice
+) -> tuple[float, float, float]:
+    """Normal equation of c over some rows, for bands that are blurred by an excess before."""
+    signals, frames, pixels, gain = tiles.read(inputs, rows)
+    shape = (rows.stop - rows.start, result.sizes["x"])
+    ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
+    inner = np.zeros(shape, dtype=bool)
+    inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
+    used = inner & sound[rows] & pixels.reshape(shape) & np.isfinite(ratio)
+    ratio = np.where(used, ratio, 1.0)
+    blurs = np.sqrt([max(excess, 0.0), max(-excess, 0.0)])
+    basis = smooth_functions(inputs, frames)
+
+    def rapid(film: Array) -> Array:
+        return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
+
+    first, other = (
+        np.stack([_blurred(image, blur) for image in signals[band].reshape(-1, *shape)])
+        for band, blur in zip((0, place), blurs, strict=True)
+    )
+    rest, reflection = rapid(other / ratio - first), rapid(first)
+    curvature = rapid(laplace(first, axes=(1, 2)))
+    # Noise in the products: that of the first band, in all three.
+    rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
+    noise = np.stack(
+        [_blurred(image, blurs[0]) for image in rng.standard_normal((_NUMBER, *shape))]
+    )
+    bent = laplace(noise, axes=(1, 2))
+    levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
+    own, mixed, bending = (
+        free * levels[0] * np.mean((a * b)[:, inner])
+        for a, b in ((noise, noise), (noise, bent), (bent, bent))
+    )
+    products = (
+        np.sum(rest * reflection, axis=0) + own,
+        np.sum(rest * curvature, axis=0) + mixed,
+        np.sum(reflection**2, axis=0) - own,
+        np.sum(reflection * curvature, axis=0) - mixed,
+        np.sum(curvature**2, axis=0) - bending,
+    )
+    # The error of the ratio, of a neighbourhood, is eliminated.
+    around = [
+        uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
+        for values in (*products, np.full(shape, _MOVING * own))
+    ]
+    used &= around[2] > around[5]
+    share = quotient(around[3], around[2], 0.0)
+    forces, form = products[1] - share * products[0], products[4] - share * products[3]
+    second = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
+    variance = (second + levels[0]) * (form + bending)
+    sums = (float(values[used].sum()) for values in (forces, form, variance))
+    return next(sums), next(sums), next(sums)

@@ -1,0 +1,331 @@
+r"""Bars for what the model leaves in the bands, seen in averages that hold little noise.
+
+The bands' null combination, scaled to the object's signal,
+
+.. math:: q = \sum_m w_m (z_m / k_m - z_1), \quad \sum_m w_m (1 - k_m) / k_m = 1
+
+holds no reflection; less the object's own signal it holds noise alone. If not, the object is as
+uncertain: by the reflection's leak into q, where the ratio differs from event to event (coloured
+bodies, unlike blurs, a camera that shakes), and by changes that no reflection explains (rapid heat
+that the model misses, pixels that drift).
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from functools import lru_cache, partial
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import uniform_filter
+
+from dbthermal import _smooth as smooth
+from dbthermal._arrays import Array, Mask, quotient, release
+from dbthermal._compiled import compiled
+from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._subspace.fused import FILMS
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
+
+Whole = npt.NDArray[np.intp]
+
+_BLOCK: Final = 4  # pixels along a side of what is averaged
+_AROUND: Final = 5  # blocks along a side of a neighbourhood
+# Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
+# noise. In plain scenes the bars stay as they are.
+_SURE, _ROUGH = 3.0, 0.1
+_MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
+# Octaves of time that smooth functions hold, for the octave that is seen: 1/f noise is alike in all.
+_OCTAVES: Final = float(np.log2(HIGHEST_ORDER))
+_NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the object's range
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What the model leaves, zero where that may be noise."""
+
+    leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
+    change: Array  # deviation of the object's signal, at any time (y, x) [K]
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Of each block of some rows (..., row, column): averages of its pixels without a flag."""
+
+    pixels: Array  # their number
+    noise: Array  # variances of remainder and reflection, and their covariance (3, ...) [K^2]
+    rough: Array  # variance of the remainder's means in time, and its part of noise (2, ...) [K^2]
+    single: Array  # the same of single pixels, by differences of neighbours (2, ...) [K^2]
+    products: Array  # remainder times reflection, and reflection squared (2, event, ...) [K^2]
+    freedom: Array  # degrees of freedom of each event (event, ...)
+
+
+_NAMES: Final = tuple(field.name for field in fields(_Blocks))
+
+
+def measure(
+    inputs: Inputs, result: xr.Dataset, apply: Callable[..., Iterable[Any]] = map
+) -> Misfit:
+    """What a result leaves in the bands of its pixels without a flag, in one reading."""
+    parts = list(apply(partial(_of_rows, inputs, result), inputs.blocks))
+    blocks = _Blocks(
+        *(np.concatenate([getattr(part, name) for part in parts], axis=-2) for name in _NAMES)
+    )
+    # Place of each pixel's block.
+    sizes = np.array([rows.stop - rows.start for rows in inputs.blocks])
+    first = np.cumsum(-(-sizes // _BLOCK)) - -(-sizes // _BLOCK)
+    rows = np.concatenate(
+        [start + np.arange(size) // _BLOCK for start, size in zip(first, sizes, strict=True)]
+    )
+    place = np.ix_(rows, np.arange(result.sizes["x"]) // _BLOCK)
+    return Misfit(_leak(blocks)[place], _change(blocks)[place])
+
+
+def _around(blocks: _Blocks, values: Array) -> Array:
+    """Mean (..., row, column) over the pixels of the blocks around each."""
+    size = (1,) * (values.ndim - 2) + (_AROUND, _AROUND)
+    weight = uniform_filter(blocks.pixels, _AROUND, mode="constant")
+    mean = uniform_filter(values * blocks.pixels, size, mode="constant")
+    return np.asarray(quotient(mean, weight + 0.0 * mean, 0.0))
+
+
+def _number(blocks: _Blocks) -> Array:
+    """Blocks (row, column) around each that tell something."""
+    told = (blocks.pixels > 0).astype(np.float64)
+    return np.maximum(uniform_filter(told, _AROUND, mode="constant") * _AROUND**2, 1.0)
+
+
+def _change(blocks: _Blocks) -> Array:
+    """Deviation (row, column) [K] by changes that no reflection explains."""
+    # What blocks share: means in time, an octave beyond the smooth functions.
+    variance, noise = _around(blocks, blocks.rough)
+    freedom = _number(blocks) * HIGHEST_ORDER
+    more = variance - noise
+    shared = np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0)
+    # What is each pixel's, as 1/f noise, of which smooth functions hold all octaves.
+    variance, noise = _around(blocks, blocks.single)
+    more = variance - noise
+    single = np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0)
+    return np.asarray(np.sqrt(np.maximum(shared, single)))
+
+
+def _leak(blocks: _Blocks) -> Array:
+    """Deviation (row, column) of the share of the reflection that is left, over the events."""
+    (cross, energy), (remainder, reflection, _) = (
+        _around(blocks, values) for values in (blocks.products, blocks.noise)
+    )
+    freedom = _around(blocks, blocks.freedom)
+    strong = energy > _MOVING * freedom * reflection
+    energy = np.where(strong, energy, 0.0)
+    share = quotient(cross, energy, 0.0)
+    variance = quotient(
+        remainder * (energy + freedom * reflection) / _number(blocks), energy**2, 0.0
+    )
+    # Scatter of the events about their mean, less noise, by the weight of each.
+    total = energy.sum(axis=0)
+    weight = quotient(energy, total + 0.0 * energy, 0.0)
+    apart = share - (weight * share).sum(axis=0)
+    events = quotient(np.ones_like(total), (weight**2).sum(axis=0), 1.0)
+    scatter = (weight * (apart**2 - variance)).sum(axis=0) * quotient(events, events - 1.0, 0.0)
+    doubt = np.sqrt(2.0 * ((weight * variance) ** 2).sum(axis=0))
+    return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
+
+
+def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
+    """Averages over the blocks of some rows."""
+    signals, frames, pixels, gain = tiles.read(inputs, rows)
+    film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
+    ratio, emissivity = (
+        result[name].values[:, rows].reshape(len(inputs.bands), -1)[inputs.bands]
+        for name in ("reflection_ratio", "emissivity")
+    )
+    pixels &= result["status"].values[rows].ravel() == 0
+    for values in (film, ratio, emissivity):
+        pixels &= np.isfinite(values).all(axis=0)
+    # Number the blocks, and count their pixels.
+    width = result.sizes["x"]
+    shape = -(-film.shape[1] // width // _BLOCK), -(-width // _BLOCK)
+    row, column = np.divmod(np.arange(film.shape[1]), width)
+    place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
+    number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
+    # Weigh the bands, and average what is left beside the object, and the reflection.
+    weights, noise = _weights(
+        np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, np.newaxis] * gain
+    )
+    center, half, curve = _object_signal(inputs, film, weights * emissivity, pixels)
+    span, event = _spans(frames)
+    rest, reflection = np.zeros((2, len(film), number.size))
+    _average(signals, film, weights, center, half, curve, place, rest, reflection)
+    # Noise of single pixels, from neighbours, which have the object's rapid changes in common.
+    pairs = np.flatnonzero((place[:-1] >= 0) & (place[:-1] == place[1:]) & (column[:-1] % 2 == 0))
+    length = _length(len(frames)) // 2
+    squares = _compare(signals, weights, pairs, length) / length
+    single = np.stack([np.bincount(place[pairs], part, number.size) for part in squares])
+    single = single / np.maximum(np.bincount(place[pairs], minlength=number.size), 1.0)
+    release()
+    filled = np.maximum(number, 1.0)
+    noise = [np.bincount(place[pixels], part[pixels], number.size) for part in noise] / filled**2
+    # Take the smooth functions out, and sum over means and events.
+    basis = smooth_functions(inputs, frames)
+    rest, reflection = (
+        film - basis @ (basis.T @ film) for film in (rest / filled, reflection / filled)
+    )
+    means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
+    leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
+    events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
+    freedom = np.outer(events @ (1.0 - np.sum(basis**2, axis=1)), np.ones(number.size))
+    averages = (
+        np.where(number < 0.5 * _BLOCK**2, 0.0, number),
+        noise,
+        np.stack([np.mean((means @ rest) ** 2, axis=0), leverage * noise[0]]),
+        single,
+        np.stack([events @ (rest * reflection), events @ reflection**2])
+        - freedom * noise[2:0:-1, np.newaxis],
+        freedom,
+    )
+    return _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+
+
+def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
+    """Smooth functions (frame, number), and steps of shutter events, over some frames (time)."""
+    time = inputs.capture["time"].values[frames].astype(np.float64)
+    segment = inputs.capture["segment"].values[frames] if "segment" in inputs.capture else None
+    order = min(HIGHEST_ORDER, time.size // 4)
+    return smooth.subspace(time, order, segment=segment).functions
+
+
+def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:
+    """Weights (band, y, x) of the bands, in their order, for the object's signal."""
+    ratio = result["reflection_ratio"].values[inputs.bands]
+    sound = (result["status"].values == 0) & np.isfinite(ratio).all(axis=0)
+    every = np.zeros(ratio.shape)
+    noise = np.tile(inputs.noise[inputs.bands, np.newaxis], np.count_nonzero(sound))
+    every[:, sound] = _weights(ratio[:, sound], noise)[0]
+    return every[np.argsort(inputs.bands)]
+
+
+def _length(frames: int) -> int:
+    """Frames of an event, which is as long as two smooth functions have changes of sign."""
+    return frames // min(HIGHEST_ORDER, frames // 4)
+
+
+def _spans(frames: Mask) -> tuple[Whole, Whole]:
+    """Span of each of some frames (time), an octave beyond the smooth functions, and its event."""
+    event, half = np.divmod(np.flatnonzero(frames), _length(frames.size))
+    spans = 2 * event + (2 * half >= _length(frames.size))
+    return np.unique(spans, return_inverse=True)[1], event
+
+
+def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
+    """Weights (band, pixel) of the bands for the object's signal, at the least noise.
+
+    And the variances (3, pixel) of their sum and of the reflection, and the covariance [K^2].
+    """
+    contrast = (1.0 - ratio[1:]) / ratio[1:]
+    weights = contrast / ((deviation[1:] / ratio[1:]) ** 2 + deviation[0] ** 2)
+    weights /= np.sum(weights * contrast, axis=0)
+    every = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
+    noise = (
+        np.sum((every * deviation) ** 2, axis=0),
+        deviation[0] ** 2,
+        every[0] * deviation[0] ** 2,
+    )
+    return every, np.stack(noise)
+
+
+def _object_signal(
+    inputs: Inputs, film: Array, shares: Array, pixels: Mask
+) -> tuple[Array, Array, Array]:
+    """Cubic polynomial (power, pixel) [K] of the object in the weighted bands.
+
+    Over its range: of the temperature less its center, over half the range (pixel) [K].
+    """
+    lowest, highest = film.min(axis=0), film.max(axis=0)
+    center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
+    curves = [inputs.curves[band] for band in inputs.bands]
+    nodes = np.where(pixels, center + _NODES[:, np.newaxis] * half, curves[0].reference)
+    values = sum(share * curve.signal(nodes) for share, curve in zip(shares, curves, strict=True))
+    return center, half, np.linalg.solve(np.vander(_NODES, increasing=True), values)
+
+
+@compiled
+def _average(
+    signals: Array,
+    film: npt.NDArray[np.float32],
+    weights: Array,
+    center: Array,
+    half: Array,
+    curve: Array,
+    place: Whole,
+    rest: Array,
+    reflection: Array,
+) -> None:
+    """Add up what is left beside the object, and the reflection, by block (time, block), in place."""
+    for t in range(len(film)):
+        for p in range(place.size):
+            b = place[p]
+            if b >= 0:
+                x = (film[t, p] - center[p]) / half[p]
+                value = -(curve[0, p] + x * (curve[1, p] + x * (curve[2, p] + x * curve[3, p])))
+                for m in range(len(signals)):
+                    value += weights[m, p] * signals[m, t, p]
+                rest[t, b] += value
+                reflection[t, b] += signals[0, t, p]
+
+
+@compiled
+def _compare(signals: Array, weights: Array, pairs: Whole, length: int) -> Array:
+    """Mean squares (2, pair) of second differences of neighbours' difference, per frame [K^2].
+
+    Of means over so many frames, and of frames: alike for noise that is independent in time.
+    """
+    result = np.zeros((2, pairs.size))
+    frames = signals.shape[1]
+    for i in range(pairs.size):
+        p, q = pairs[i], pairs[i] + 1
+        before = last = mean_before = mean_last = total = 0.0
+        for t in range(frames):
+            value = 0.0
+            for m in range(len(signals)):
+                value += weights[m, p] * signals[m, t, p] - weights[m, q] * signals[m, t, q]
+            if t > 1:
+                result[1, i] += (value - 2.0 * last + before) ** 2 / (12.0 * (frames - 2))
+            before, last = last, value
+            total += value
+            if t % length == length - 1:
+                number, total = t // length, total / length
+                if number > 1:
+                    square = (total - 2.0 * mean_last + mean_before) ** 2
+                    result[0, i] += square * length / (12.0 * (frames // length - 2))
+                mean_before, mean_last, total = mean_last, total, 0.0
+    return result
+
+
+def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
+    """Widen the deviations of a result by what the model leaves, in place."""
+    first = inputs.bands[0]
+    emissivity, ratio = result["emissivity"].values[first], result["reflection_ratio"].values
+    sound = (result["status"].values == 0) & ((misfit.leak > 0.0) | (misfit.change > 0.0))
+    # Of the ratios, whose error makes a leak, and of the emissivities that follow from them.
+    ratios = np.where(sound, misfit.leak * (1.0 - ratio), 0.0)
+    emissivities = (1.0 - emissivity) * ratios
+    covariance = result["emissivity_covariance"].values
+    covariance += np.where(sound, emissivities[:, np.newaxis] * emissivities, 0.0)
+    for name, added in (("reflection_ratio_std", ratios), ("emissivity_std", emissivities)):
+        result[name].values[:] = np.where(sound, np.hypot(result[name].values, added), result[name])
+    # Of the object in every frame, and of the reflection beside it.
+    films = [result[name].values for name in FILMS]
+    curve = inputs.curves[first]
+    for row in map(int, np.flatnonzero(sound.any(axis=1))):
+        columns = np.flatnonzero(sound[row])
+        chosen = [film[:, row, columns].astype(np.float64) for film in films]
+        leak, change, share = (
+            values[row, columns] for values in (misfit.leak, misfit.change, emissivity)
+        )
+        slope = curve.slope(chosen[0].mean(axis=0))
+        contrast = (1.0 - share) * (chosen[0] - chosen[2])
+        added = np.hypot(leak * contrast, change / slope)
+        films[1][:, row, columns] = np.hypot(chosen[1], added)
+        films[3][:, row, columns] = np.hypot(chosen[3], share / (1.0 - share) * added)
+        release()
