@@ -1,6 +1,6 @@
 r"""Blurs that differ between the bands, of lenses, diffraction, or rough surfaces, made alike.
 
-With Gaussian blurs of variances s, the rapid changes h of band m are those of the first one, blurred,
+With Gaussian blurs of variances s, the rapid changes h of band m are those of the first, blurred,
 
 .. math:: h_m / k_m - h_1 = c \nabla^2 h_1 + \delta h_1, \quad c = (s_m - s_1) / 2
 
@@ -16,19 +16,16 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import gaussian_filter, laplace, uniform_filter
 
-from dbthermal._arrays import Array, Mask, empty, quotient, release
-from dbthermal.separation import _tiles as tiles
+from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import Misfit, object_weights, smooth_functions
+from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
 _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
 _EDGE: Final = 4  # pixels at the image's edge that are left out
 _NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
 _MOVING: Final = 1.0  # variance of the changes over that of noise
-# Deviations and size [pixel^2] of a difference that counts, and the share of the pixels with a
-# remainder from which it is sought.
-_SURE, _LEAST, _MUCH = 6.0, 0.1, 0.2
+_SURE, _LEAST = 6.0, 0.1  # deviations and size [pixel^2] of a difference that counts
 _MOST: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
 _BLOCKS: Final = 8  # of rows that tell it
 
@@ -61,11 +58,11 @@ def equalise(
 ) -> Equalised | None:
     """Blur the sharper bands, if a difference explains what a result leaves; None if not."""
     sound = result["status"].values == 0
-    if np.mean((misfit.leak > 0.0) | (misfit.change > 0.0), where=sound) <= _MUCH:
+    if not misfit.common(sound):
         return None
     excess = np.zeros(len(inputs.bands))
     for place in range(1, excess.size):
-        excess[inputs.bands[place]] = _difference(inputs, result, sound, place)
+        excess[inputs.bands[place]] = _difference(inputs, result, place)
     variances = excess.max() - excess
     if not variances.any():
         return None
@@ -117,13 +114,13 @@ def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
     return np.asarray(gaussian_filter(image, deviation, mode="nearest"))
 
 
-def _difference(inputs: Inputs, result: xr.Dataset, sound: Mask, place: int) -> float:
+def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
     excess = step = 0.0
     for turn in range(_ROUNDS):
         rows = inputs.blocks[:: max(1, len(inputs.blocks) // _BLOCKS)]
         forces, form, variance = np.sum(
-            [_equations(inputs, result, sound, place, excess, block) for block in rows], axis=0
+            [_equations(inputs, result, place, excess, block) for block in rows], axis=0
         )
         if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
             return 0.0
@@ -135,15 +132,15 @@ def _difference(inputs: Inputs, result: xr.Dataset, sound: Mask, place: int) -> 
 
 
 def _equations(
-    inputs: Inputs, result: xr.Dataset, sound: Mask, place: int, excess: float, rows: slice
+    inputs: Inputs, result: xr.Dataset, place: int, excess: float, rows: slice
 ) -> tuple[float, float, float]:
     """Normal equation of c over some rows, for bands that are blurred by an excess before."""
-    signals, frames, pixels, gain = tiles.read(inputs, rows)
+    _, films, frames, pixels, gain = reflected(inputs, result, rows)
     shape = (rows.stop - rows.start, result.sizes["x"])
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
     inner = np.zeros(shape, dtype=bool)
     inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
-    used = inner & sound[rows] & pixels.reshape(shape) & np.isfinite(ratio)
+    used = inner & pixels.reshape(shape) & np.isfinite(ratio)
     ratio = np.where(used, ratio, 1.0)
     blurs = np.sqrt([max(excess, 0.0), max(-excess, 0.0)])
     basis = smooth_functions(inputs, frames)
@@ -151,11 +148,11 @@ def _equations(
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
 
-    first, other = (
-        np.stack([_blurred(image, blur) for image in signals[band].reshape(-1, *shape)])
-        for band, blur in zip((0, place), blurs, strict=True)
+    first, second = (
+        np.stack([_blurred(image, blur) for image in films[order].reshape(-1, *shape)])
+        for order, blur in zip((0, place), blurs, strict=True)
     )
-    rest, reflection = rapid(other / ratio - first), rapid(first)
+    rest, reflection = rapid(second / ratio - first), rapid(first)
     curvature = rapid(laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
     rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
@@ -183,7 +180,7 @@ def _equations(
     used &= around[2] > around[5]
     share = quotient(around[3], around[2], 0.0)
     forces, form = products[1] - share * products[0], products[4] - share * products[3]
-    second = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
-    variance = (second + levels[0]) * (form + bending)
+    noisy = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
+    variance = (noisy + levels[0]) * (form + bending)
     sums = (float(values[used].sum()) for values in (forces, form, variance))
     return next(sums), next(sums), next(sums)

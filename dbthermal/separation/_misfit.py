@@ -12,7 +12,7 @@ that the model misses, pixels that drift).
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -35,8 +35,9 @@ _AROUND: Final = 5  # blocks along a side of a neighbourhood
 # Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
 # noise. In plain scenes the bars stay as they are.
 _SURE, _ROUGH = 3.0, 0.1
+_MUCH: Final = 0.2  # share of the pixels whose remainders have a cause in common; plain: to 0.02
 _MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
-# Octaves of time that smooth functions hold, for the octave that is seen: 1/f noise is alike in all.
+# Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
 _OCTAVES: Final = float(np.log2(HIGHEST_ORDER))
 _NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the object's range
 
@@ -47,6 +48,16 @@ class Misfit:
 
     leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
+
+    @property
+    def size(self) -> float:
+        """Typical deviation of the object's signal beside a contrast of a kelvin [K]."""
+        return float(np.sqrt(np.mean(self.leak**2) + np.mean(self.change**2)))
+
+    def common(self, sound: Mask) -> bool:
+        """Many pixels (y, x) without a flag have a remainder: a cause that they share."""
+        several = sound & ((self.leak > 0.0) | (self.change > 0.0))
+        return np.count_nonzero(several) > _MUCH * np.count_nonzero(sound)
 
 
 @dataclass(frozen=True)
@@ -134,7 +145,7 @@ def _leak(blocks: _Blocks) -> Array:
 
 def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     """Averages over the blocks of some rows."""
-    signals, frames, pixels, gain = tiles.read(inputs, rows)
+    signals, frames, pixels, gain = read(inputs, result, rows)
     film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
     ratio, emissivity = (
         result[name].values[:, rows].reshape(len(inputs.bands), -1)[inputs.bands]
@@ -157,12 +168,16 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     span, event = _spans(frames)
     rest, reflection = np.zeros((2, len(film), number.size))
     _average(signals, film, weights, center, half, curve, place, rest, reflection)
-    # Noise of single pixels, from neighbours, which have the object's rapid changes in common.
-    pairs = np.flatnonzero((place[:-1] >= 0) & (place[:-1] == place[1:]) & (column[:-1] % 2 == 0))
-    length = _length(len(frames)) // 2
-    squares = _compare(signals, weights, pairs, length) / length
-    single = np.stack([np.bincount(place[pairs], part, number.size) for part in squares])
-    single = single / np.maximum(np.bincount(place[pairs], minlength=number.size), 1.0)
+    # Noise of single pixels: neighbours have the object's rapid changes in common.
+    middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
+    alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
+    middle = middle[alike & (place[middle] >= 0)]
+    segment = np.zeros(len(film), dtype=np.intp)
+    if "segment" in inputs.capture:
+        segment = inputs.capture["segment"].values[frames].astype(np.intp)
+    squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
+    single = np.stack([np.bincount(place[middle], part, number.size) for part in squares])
+    single = single / np.maximum(np.bincount(place[middle], minlength=number.size), 1.0)
     release()
     filled = np.maximum(number, 1.0)
     noise = [np.bincount(place[pixels], part[pixels], number.size) for part in noise] / filled**2
@@ -171,6 +186,14 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     rest, reflection = (
         film - basis @ (basis.T @ film) for film in (rest / filled, reflection / filled)
     )
+    # Pieces of time leave changes that the deviations of their pixels hold.
+    held = np.zeros(place.size)
+    start = rows.start * width
+    divided = pixels & inputs.division[:, start : start + place.size].any(axis=0)
+    if divided.any():
+        deviations = result["object_temperature_std"].values[:, rows].reshape(len(frames), -1)
+        held[divided] = np.nanmean(np.square(deviations[:, divided]), axis=0)
+    held = np.bincount(place[pixels], held[pixels], number.size) / filled
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
     events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
@@ -178,13 +201,56 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     averages = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
         noise,
-        np.stack([np.mean((means @ rest) ** 2, axis=0), leverage * noise[0]]),
+        np.stack([np.mean((means @ rest) ** 2, axis=0), leverage * noise[0] + held]),
         single,
         np.stack([events @ (rest * reflection), events @ reflection**2])
         - freedom * noise[2:0:-1, np.newaxis],
         freedom,
     )
     return _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+
+
+def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, Mask, Array]:
+    """As `tiles.read`, with an object that changes rapidly at the place of the first band.
+
+    What displaced cameras see of it is resampled as a product: :math:`W [e_m U_m(x)]`.
+    """
+    signals, frames, pixels, gain = tiles.read(inputs, rows)
+    if inputs.displacement is None or not inputs.division.any():
+        return signals, frames, pixels, gain
+    source = inputs.displacement.source(rows)
+    weights = inputs.displacement.weights(rows, source)
+    film = result["object_temperature"].values[:, source][frames]
+    within = slice(rows.start - source.start, rows.stop - source.start)
+    missing = ~np.isfinite(film).all(axis=0)
+    pixels &= abs(weights) @ missing.ravel() == 0.0
+    for order, band in enumerate(inputs.bands[1:], 1):
+        curve = inputs.curves[band]
+        emitted = result["emissivity"].values[band, source] * (
+            curve.signal(np.where(missing, curve.reference, film)) - curve.reference
+        )
+        np.nan_to_num(emitted, copy=False)
+        shown = (weights @ emitted.reshape(len(film), -1).T).T
+        signals[order] -= shown - emitted[:, within].reshape(shown.shape)
+    return signals, frames, pixels, gain
+
+
+def reflected(
+    inputs: Inputs, result: xr.Dataset, rows: slice
+) -> tuple[Array, Array, Mask, Mask, Array]:
+    """Signals (band, frame, pixel) [K] of some rows, the quietest band first, and their reflections.
+
+    And the frames (time), the pixels without a flag, and the noise's gain, as `tiles.read`.
+    """
+    signals, frames, pixels, gain = read(inputs, result, rows)
+    film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
+    pixels &= (result["status"].values[rows].ravel() == 0) & np.isfinite(film).all(axis=0)
+    beside = signals.copy()
+    for order, band in enumerate(inputs.bands):
+        curve, emissivity = inputs.curves[band], result["emissivity"].values[band, rows].ravel()
+        emitted = emissivity[pixels] * (curve.signal(film[:, pixels]) - curve.reference)
+        beside[order][:, pixels] -= emitted
+    return signals, beside, frames, pixels, gain
 
 
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
@@ -250,7 +316,7 @@ def _object_signal(
 
 
 @compiled
-def _average(
+def _average(  # noqa: PLR0913, PLR0917 - a loop over arrays
     signals: Array,
     film: npt.NDArray[np.float32],
     weights: Array,
@@ -261,7 +327,7 @@ def _average(
     rest: Array,
     reflection: Array,
 ) -> None:
-    """Add up what is left beside the object, and the reflection, by block (time, block), in place."""
+    """Add up what is left beside the object, and the reflection, by block, in place."""
     for t in range(len(film)):
         for p in range(place.size):
             b = place[p]
@@ -275,30 +341,40 @@ def _average(
 
 
 @compiled
-def _compare(signals: Array, weights: Array, pairs: Whole, length: int) -> Array:
-    """Mean squares (2, pair) of second differences of neighbours' difference, per frame [K^2].
+def _compare(signals: Array, weights: Array, middle: Whole, segment: Whole, length: int) -> Array:
+    """Variances (2, middle) of means over so many frames, by second differences [K^2].
 
-    Of means over so many frames, and of frames: alike for noise that is independent in time.
+    Of three pixels in a row, by the middle one: of means in time, and of frames over their number,
+    which are the same for noise that is independent in time. None spans a shutter event.
     """
-    result = np.zeros((2, pairs.size))
-    frames = signals.shape[1]
-    for i in range(pairs.size):
-        p, q = pairs[i], pairs[i] + 1
+    result = np.zeros((2, middle.size))
+    for i in range(middle.size):
+        p = middle[i]
+        number = np.zeros(2)
         before = last = mean_before = mean_last = total = 0.0
-        for t in range(frames):
+        since = 0
+        for t in range(segment.size):
+            if t > 0 and segment[t] != segment[t - 1]:
+                since, total = 0, 0.0
             value = 0.0
             for m in range(len(signals)):
-                value += weights[m, p] * signals[m, t, p] - weights[m, q] * signals[m, t, q]
-            if t > 1:
-                result[1, i] += (value - 2.0 * last + before) ** 2 / (12.0 * (frames - 2))
+                value += 2.0 * weights[m, p] * signals[m, t, p]
+                value -= weights[m, p - 1] * signals[m, t, p - 1]
+                value -= weights[m, p + 1] * signals[m, t, p + 1]
+            if since > 1:
+                result[1, i] += (value - 2.0 * last + before) ** 2 / length
+                number[1] += 1.0
             before, last = last, value
-            total += value
-            if t % length == length - 1:
-                number, total = t // length, total / length
-                if number > 1:
-                    square = (total - 2.0 * mean_last + mean_before) ** 2
-                    result[0, i] += square * length / (12.0 * (frames // length - 2))
+            total += value / length
+            since += 1
+            if since % length == 0:
+                if since > 2 * length:
+                    result[0, i] += (total - 2.0 * mean_last + mean_before) ** 2
+                    number[0] += 1.0
                 mean_before, mean_last, total = mean_last, total, 0.0
+        # Either second difference, of independent noise, has six times the variance.
+        for kind in range(2):
+            result[kind, i] /= 36.0 * max(number[kind], 1.0)
     return result
 
 

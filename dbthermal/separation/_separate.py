@@ -16,13 +16,15 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
-from dbthermal.separation import _blur as blurs
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
+from dbthermal.separation._blur import equalise
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
+from dbthermal.separation._misfit import Misfit
+from dbthermal.separation._motion import stabilise
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._solve import get_method, require_workers, separated
@@ -37,6 +39,8 @@ _UNEXPLAINED: Final = (
     "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
     "small."
 )
+# Rounds in which motion is undone, and what must be left at most, of what was left before.
+_ROUNDS, _BETTER = 2, 0.7
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
 
 
@@ -117,16 +121,36 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
     alone = None if alone is None else _checked(alone, corrected, inputs)
-    # Separate, and once more if the bands are blurred unlike.
-    parts = _separated(corrected, inputs, reflection_shift, materials, alone, workers, progress)
-    misfit = misfits.measure(parts.inputs, parts.result)
-    alike = blurs.equalise(corrected, parts.inputs, parts.result, misfit)
+
+    # Separate; and again while what is left shows the cameras' motion, or that their blurs differ.
+    def separated_again(capture: xr.Dataset, per_pixel: xr.Dataset | None) -> tuple[_Parts, Misfit]:
+        scope = check(capture, response, inputs.method, settings=settings)
+        parts = _separated(
+            capture, scope, reflection_shift, materials, per_pixel, workers, progress
+        )
+        return parts, misfits.measure(parts.inputs, parts.result)
+
+    original, motion, sentences = corrected, None, []
+    parts, misfit = separated_again(corrected, alone)
+    for _ in range(_ROUNDS):
+        steady = stabilise(original, parts.inputs, parts.result, misfit, motion)
+        if steady is None and reflection_shift is None:  # a shift that motion feigns hides it
+            scope = replace(parts.inputs, displacement=None)
+            steady = stabilise(original, scope, parts.result, misfit, motion)
+        if steady is None:
+            break
+        retry = separated_again(steady.capture, None)
+        if retry[1].size > _BETTER * misfit.size:
+            break
+        corrected, motion, (parts, misfit) = steady.capture, steady.motion, retry
+        sentences = [steady.sentence]
+    alike = equalise(corrected, parts.inputs, parts.result, misfit)
     if alike is not None:
-        corrected, inputs = alike.capture, replace(inputs, capture=alike.capture)
-        parts = _separated(corrected, inputs, reflection_shift, materials, None, workers, progress)
-        misfit = misfits.measure(parts.inputs, parts.result)
-        misfit = replace(misfit, change=np.hypot(misfit.change, alike.detail))
-        parts.doubts.append(alike.sentence)
+        retry = separated_again(alike.capture, None)
+        if retry[1].size < _BETTER * misfit.size:
+            corrected, (parts, misfit) = alike.capture, retry
+            misfit = replace(misfit, change=np.hypot(misfit.change, alike.detail))
+            sentences.append(alike.sentence)
     result, materials = parts.result, parts.materials
     if result is alone:  # which is the caller's
         result = result.copy(deep=True)
@@ -138,7 +162,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result["material"] = materials
     source = "none" if parts.reflection_shift is None else "found"
     source = source if reflection_shift is None else "given"
-    return warned(result.assign_attrs(reflection_shift=source), *unlike, *parts.doubts)
+    return warned(result.assign_attrs(reflection_shift=source), *unlike, *parts.doubts, *sentences)
 
 
 @dataclass(frozen=True)

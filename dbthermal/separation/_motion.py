@@ -1,0 +1,97 @@
+r"""Cameras that shake: the image's motion from frame to frame, told by what is left, and undone.
+
+What a separation leaves, the bands' null combination less the object, holds no reflection, but the
+motion s of each band's image, times the gradient of its mean:
+
+.. math:: r(t) = \sum_b w_b \, s_b(t) \cdot \nabla \bar z_b
+
+Least squares over all pixels, frame by frame, with a prior for s: cameras on one support move alike.
+Motion that is slow, as smooth functions of time, is not seen.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import shift as shifted
+
+from dbthermal._arrays import Array, empty, release
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
+
+_COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
+# Mean square of a motion over its variance, from which it is undone: of 10^5 frames without motion
+# none has a mean over 250 of more than 1.5.
+_SURE: Final = 3.0
+_SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
+
+
+@dataclass(frozen=True)
+class Stabilised:
+    """A capture whose frames lie on one another."""
+
+    capture: xr.Dataset
+    motion: Array  # of each band's image (band, time, axis) [pixel]
+
+    @property
+    def sentence(self) -> str:
+        """What was done, for the user."""
+        sizes = ", ".join(
+            f"'{band}' {np.sqrt(np.mean(path**2)):.2f}"
+            for band, path in zip(self.capture["band"].values, self.motion, strict=True)
+        )
+        return f"The image moved from frame to frame, by {sizes} pixel (rms), which was undone."
+
+
+def stabilise(
+    corrected: xr.Dataset,
+    inputs: Inputs,
+    result: xr.Dataset,
+    misfit: Misfit,
+    before: Array | None = None,
+) -> Stabilised | None:
+    """Undo the motion that explains what a result leaves, and one before; None if there is none."""
+    if not misfit.common(result["status"].values == 0):
+        return None
+    count = len(inputs.bands)
+    form, forces = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, corrected.sizes["time"]))
+    for rows in inputs.blocks:
+        _add_equations(inputs, result, rows, form, forces)
+    # Is there any?
+    level, axes = np.linalg.eigh(form)
+    seen = level > _SEEN * level.max()
+    square = np.mean((axes[:, seen].T @ forces) ** 2, axis=1) / level[seen]
+    if not np.any(square > _SURE):
+        return None
+    prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
+    precision = np.kron(np.linalg.inv(prior), np.eye(2))
+    motion = np.linalg.solve(form + precision, forces).reshape(count, 2, -1)
+    motion = np.swapaxes(motion[np.argsort(inputs.bands)], 1, 2)
+    motion = motion if before is None else motion + before
+    counts = empty(corrected["counts"].shape, np.float32)
+    for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
+        for frame, image, step in zip(film, moved, path, strict=True):
+            frame[:] = shifted(image, step, order=3, mode="nearest")
+        release()
+    return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion)
+
+
+def _add_equations(
+    inputs: Inputs, result: xr.Dataset, rows: slice, form: Array, forces: Array
+) -> None:
+    """Add the normal equations of all bands' motion over some rows, in place."""
+    signals, films, frames, pixels, gain = reflected(inputs, result, rows)
+    weights = object_weights(inputs, result)[inputs.bands][:, rows].reshape(len(signals), -1)
+    used = pixels & (weights[0] != 0.0)
+    images = signals.mean(axis=1).reshape(len(signals), -1, result.sizes["x"])
+    slopes = np.stack(np.gradient(images, axis=(1, 2)), axis=1).reshape(len(signals), 2, -1)
+    slopes = (weights[:, np.newaxis] * slopes)[..., used].reshape(2 * len(signals), -1)
+    noise = inputs.noise[inputs.bands, np.newaxis] * gain
+    weighted = slopes / np.sum((weights * noise)[:, used] ** 2, axis=0)
+    rest = np.einsum("bp,btp->tp", weights[:, used], films[..., used])
+    basis = smooth_functions(inputs, frames)
+    pull = weighted @ rest.T
+    forces[:, frames] += pull - pull @ basis @ basis.T
+    form += weighted @ slopes.T
+    release()
