@@ -33,7 +33,6 @@ _EXTRAS: Final = {
     "cv2": "alignment",
     "matplotlib": "figures",
     "skimage": "materials",
-    "torch": "torch",
 }
 """Library -> the extra that has it."""
 

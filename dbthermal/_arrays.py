@@ -4,7 +4,6 @@ Films on disk are in files that vanish with the process, and are used as arrays.
 as the process's memory until they are released (`release`).
 """
 
-import importlib
 import mmap
 import os
 from collections.abc import Iterator
@@ -44,24 +43,6 @@ def select(values: Any, selected: Any, axis: int = -1) -> Any:
     """Values at the selected indices or mask along an axis, in the same order of axes in memory."""
     selected = np.flatnonzero(selected) if selected.dtype == bool else selected
     return values.take(selected, axis=axis)
-
-
-def require_device(device: str, method: str) -> None:
-    """Refuse a device that torch cannot compute on here; ImportError without torch."""
-    try:
-        torch = importlib.import_module("torch")
-        torch.ones(1, dtype=torch.float64, device=device).item()
-    except ImportError as error:
-        raise ImportError(
-            f"Missing library 'torch' for device '{device}' of method '{method}'. Must be "
-            "installed: python -m pip install 'dbthermal[torch]'."
-        ) from error
-    except (AssertionError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"Invalid device '{device}' of method '{method}'. Must be one on which torch has "
-            f"double precision here: {reason}"
-        ) from error
 
 
 @contextmanager

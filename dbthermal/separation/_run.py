@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings
 
 # Memory [byte], from the peaks of processes with one and two threads, of 350 to 3000 frames:
-BASE: Final = 450_000_000  # of a process that has imported and compiled all, and with torch
+BASE: Final = 450_000_000  # of a process that has imported and compiled all
 _READ: Final = 4  # of a sample of a band that is read; the same in dask's chunks beside it
 _SAMPLE: Final = 12  # of a sample of a band in a block: results (8), and those being written
 _TILE: Final = 140  # of a sample of a band in the tile of a compiled method (110 to 140)

@@ -317,7 +317,7 @@ def get_method(name: str | Method) -> Method:
     Examples
     --------
     >>> get_method("subspace").settings(background_drift=1.0)  # K
-    SubspaceSettings(background_drift=1.0, device=None)
+    SubspaceSettings(background_drift=1.0)
     """
     if isinstance(name, Method):
         return name

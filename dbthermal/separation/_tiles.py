@@ -39,7 +39,7 @@ PIXELS: Final = 320
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long."""
 
-_COMPILED: Final = 8  # times as many pixels in a tile of a compiled method, or on a device
+_COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
 _NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together

@@ -24,7 +24,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-import torch
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -49,14 +48,6 @@ BANDS: Final = ("8-14", "9.5", "10.6", "12.1")
 NOISE: Final = (0.03, 0.35, 0.15, 0.4)  # [K]
 EMISSIVITY: Final = (0.86, 0.72, 0.88, 0.95)
 DAY: Final = 24 * 3600 * 60  # frames of a day at 60 Hz
-FORMS: Final = {
-    "compiled": None,
-    "tensors": "cpu",
-    "tensors on GPU": "cuda",
-}
-"""Forms of the default method's steps, and the device of `SubspaceSettings`."""
-FORM_PIXELS: Final = 2560  # a tile of them
-MOVED: Final = 24  # of a sample of both bands, as it comes and with four films of results [byte]
 ARCHIVE: Final = 10_000  # captures of a full frame, USUAL["frames"] each
 
 Times = dict[tuple[str, str], dict[int, float]]
@@ -111,32 +102,6 @@ def solve(movie: xr.Dataset, method: str, settings: Any = None) -> xr.Dataset:
 def seconds_of(method: str, sizes: dict[str, int]) -> float:
     """Processor time [s] of a separation; the better of two, for the first one may compile."""
     return processor_time(partial(solve, capture(**sizes), method))[0]
-
-
-def forms() -> dict[str, tuple[float, float]]:
-    """Bytes a second of the default method by the form of its steps, and of its device's memory.
-
-    Both of one thread of the processor; of a GPU by the clock.
-    """
-    movie, found = capture(FORM_PIXELS, USUAL["frames"], 2), {}
-    torch.set_num_threads(1)
-    for name, device in FORMS.items():
-        if device == "cuda" and not torch.cuda.is_available():
-            continue
-        settings, taken = separation.SubspaceSettings(device=device), list[float]()
-        block, copied = torch.ones(2**27, device=device), list[float]()  # 512 MiB
-        target = block.clone()
-        clock = time.perf_counter if device == "cuda" else time.process_time
-        for _ in range(3):
-            start = clock()
-            solve(movie, "subspace", settings)
-            taken.append(clock() - start)
-            start = clock()
-            float(target.copy_(block)[-1])  # waits for the device
-            copied.append(clock() - start)
-        found[name] = MOVED * movie["counts"][0].size / min(taken), 2 * block.nbytes / min(copied)
-        print(name, found[name], flush=True)
-    return found
 
 
 def series(method: str, name: str) -> Iterator[tuple[int, float]]:
@@ -254,16 +219,11 @@ def machine() -> str:
     if (info := Path("/proc/cpuinfo")).exists():
         model = (re.search(r"model name\s*: (.*)", info.read_text()) or [model, model])[1]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "torch", "zarr"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "zarr"))
     return (
         f"{model}, {os.cpu_count()} processors, {memory:.0f} GB; Python "
-        f"{platform.python_version()}, {packages}; {gpu()}"
+        f"{platform.python_version()}, {packages}"
     )
-
-
-def gpu() -> str:
-    """Name of the first GPU of torch."""
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
 
 
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
@@ -303,12 +263,6 @@ over frames have {few} pixels, series over bands {pixels}.
 
 `subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
 
-`subspace` compiled and on tensors ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
-thread, on a GPU by the clock; {gpu}. Bytes are those of the samples and of the four films
-of results, compared with a copy in the same memory.
-
-{forms}
-
 Estimates from the rate of {processes} processes, without any loss between computers that share only
 a disk.
 
@@ -330,9 +284,7 @@ def default_figures(calls: default_call.Calls, busy: float) -> str:
     return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=table)
 
 
-def table(
-    default: str, times: Times, disk: Disk, rates: dict[str, tuple[float, float]], busy: float
-) -> str:
+def table(default: str, times: Times, disk: Disk, busy: float) -> str:
     """All that was measured, in Markdown: the default call's figures, then ratios first."""
     most = max(disk.seconds)
     frames = times["subspace", "frames"]
@@ -344,11 +296,6 @@ def table(
         processes=most,
         ratios=rows(("ratio", ""), *ratios(times, disk)),
         methods=methods(times),
-        tile=FORM_PIXELS,
-        gpu=gpu(),
-        forms=rows(
-            ("form", "frames/s of 640x512", "GB/s", "share of the memory's"), *shares(rates)
-        ),
         samples=", ".join(f"{n}: {1e9 * s / FEW / n:.0f}" for n, s in frames.items()),
         costs=costs(disk, disk.samples / disk.seconds[most]),
         **USUAL,
@@ -372,12 +319,6 @@ def ratios(times: Times, disk: Disk) -> Iterator[tuple[str, str]]:
         gain, weak = one / disk.seconds[number], number * disk.weak[1] / disk.weak[number]
         yield f"rate of {number} processes over one, the same capture", f"{gain:.2f}"
         yield f"rate of {number} processes over one, {number} times the rows", f"{weak:.2f}"
-
-
-def shares(rates: dict[str, tuple[float, float]]) -> Iterator[tuple[str, ...]]:
-    """Yield each form with its frames and bytes a second, and its share of the memory's rate."""
-    for name, (rate, most) in rates.items():
-        yield name, f"{rate / MOVED / FRAME:.2g}", f"{rate / 1e9:.2g}", f"{100 * rate / most:.2g} %"
 
 
 def methods(times: Times) -> str:
@@ -447,7 +388,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         times = all_series()
         with TemporaryDirectory(dir=folder) as place:
             disk = from_disk(Path(place))
-        text = table(default, times, disk, forms(), busy)
+        text = table(default, times, disk, busy)
         store.save_figure(figure(times), folder / "benchmarks.png", record)
         if chosen.write:
             page.write_text(text, encoding="utf-8")

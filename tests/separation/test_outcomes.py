@@ -251,7 +251,7 @@ def test_what_is_at_hand_is_not_separated_again(shelf: Shelf) -> None:
     )
     xr.testing.assert_identical(given, plain)
     pooled = alone.assign_attrs(pooled=1)
-    unlike = alone.assign_attrs(settings="SubspaceSettings(background_drift=1.0, device=None)")
+    unlike = alone.assign_attrs(settings="SubspaceSettings(background_drift=1.0)")
     wrong = [(pooled, "without materials"), (unlike, "background_drift=3.0")]
     for other, message in (*wrong, (alone.isel(x=slice(9)), "size 9")):
         with pytest.raises(ValueError, match=message):

@@ -1,14 +1,20 @@
 """Compiled steps and the same steps on tensors: the same bits and values."""
 
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
+import tensors
 import xarray as xr
 from captures import emissivity_of
 
 from dbthermal import separation, simulation
+from dbthermal._arrays import Mask
+from dbthermal._smooth import Subspace
+from dbthermal.separation import SubspaceSettings as Settings
+from dbthermal.separation._subspace import method
+from dbthermal.separation._subspace.fused import Solution
+from dbthermal.separation._tiles import Tile
 
 TIME = np.arange(240) / 10.0  # s
 # Largest difference, relative to the deviation of a quantity or, of films in single precision, to
@@ -27,17 +33,25 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture(params=["cpu", "cuda"])
-def device(request: pytest.FixtureRequest) -> str:
-    """Device of torch; a skip where it has none of the kind."""
-    torch = pytest.importorskip("torch")
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("torch has no CUDA device here: tensors on a GPU are not compared")
-    return str(request.param)
+def on_tensors(tile: Tile, functions: Subspace, settings: Settings) -> Solution:
+    """Steps 1 to 4 on tensors."""
+    return tensors.solve("cpu", tile, functions, settings.background_drift)
+
+
+def divided_on_tensors(
+    tile: Tile, first: Mask, functions: Subspace, settings: Settings
+) -> Solution:
+    """The same in pieces of time, pixels of the same pieces together."""
+    groups, every = zip(*method._parts(tile, first, functions), strict=True)
+    per_pixel = [
+        on_tensors(tile.select_pixels(places), pieces, settings)
+        for places, pieces in zip(groups, every, strict=True)
+    ]
+    return per_pixel[0].join(per_pixel[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_capture_on_a_device(case: str, device: str) -> None:
+def test_a_capture_on_tensors(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bad, masked and saturated samples, rapid and constant objects, backgrounds at rest."""
     options = dict(CASES[case])
     emissivity = options.pop("emissivity", (0.86, 0.72))
@@ -59,10 +73,10 @@ def test_a_capture_on_a_device(case: str, device: str) -> None:
     added = {name: options.pop(name) for name in ("segment", "pattern_std") if name in options}
     capture = capture.assign(added)
     options["mask"] = xr.DataArray(mask, dims=("time", "y", "x"))
-    one, other = (
-        separation.solve(capture, rig.response(), settings=settings, **options)
-        for settings in (None, separation.SubspaceSettings(device=device))
-    )
+    one = separation.solve(capture, rig.response(), **options)
+    monkeypatch.setattr(method, "_solve", on_tensors)
+    monkeypatch.setattr(method, "_divided", divided_on_tensors)
+    other = separation.solve(capture, rig.response(), **options)
     np.testing.assert_array_equal(other["status"], one["status"])
     assert int(one["object_temperature"].notnull().any("time").sum()) >= 5
     for name in ("object_temperature", "background_temperature", "emissivity", "reflection_ratio"):
@@ -72,17 +86,3 @@ def test_a_capture_on_a_device(case: str, device: str) -> None:
         np.testing.assert_array_equal(np.isfinite(value), np.isfinite(expected))
         error, film = np.abs(value - expected), name.endswith("temperature")
         assert not np.any(error > ROUNDING * (std + 0.1 * film))
-
-
-@pytest.mark.parametrize("name", ["cuda:99", "abacus", "meta"])
-def test_a_device_that_is_not_there(name: str) -> None:
-    """A device that torch does not have is refused with its name."""
-    with pytest.raises(ValueError, match=f"Invalid device '{name}' of method 'subspace'. Must be"):
-        separation.SubspaceSettings(device=name)
-
-
-def test_a_device_without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error says which extra has the library."""
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ImportError, match=r"Missing library 'torch' for .*dbthermal\[torch\]"):
-        separation.SubspaceSettings(device="cuda")

@@ -10,7 +10,7 @@ from scenes import field, held
 
 from dbthermal import schema, simulation
 from dbthermal.schema import Status
-from dbthermal.separation import Stream, SubspaceSettings
+from dbthermal.separation import Stream
 from dbthermal.simulation import Rig
 
 RATE = 10.0  # [Hz]
@@ -155,9 +155,6 @@ def test_a_bad_stream_is_named(glass: Data) -> None:
         options: dict[str, Any] = {"frame_rate": RATE} | {name: 0.0}
         with pytest.raises(ValueError, match=name):
             Stream(capture, response, **options)
-    on_device = SubspaceSettings(device="cpu")
-    with pytest.raises(ValueError, match="Invalid device 'cpu' of a stream"):
-        Stream(capture, response, frame_rate=RATE, settings=on_device)
     with pytest.raises(ValueError, match="Missing noise of the response"):
         Stream(capture, response.drop_vars("noise"), frame_rate=RATE)
 

@@ -130,8 +130,6 @@ class Stream:
         options["reflection_shift"] = reflection_shift
         options["method"] = replace(METHOD, name="stream", minimum_frames=1, any_bands=False)
         inputs = _inputs.check(template, response, **options)
-        if inputs.settings.device is not None:
-            raise ValueError(f"Invalid device '{inputs.settings.device}' of a stream. Omit it.")
         self.bands = tuple(curve.band for curve in inputs.curves)
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.

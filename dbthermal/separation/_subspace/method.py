@@ -50,17 +50,16 @@ separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for
 formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
-import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, require_device, select
+from dbthermal._arrays import Array, select
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
@@ -118,24 +117,17 @@ class SubspaceSettings:
         Prior: the background drifts along with the object's own curve by at most this, up or
         down, over the capture [K], each drift as likely. No method can see that part; it only
         widens the error bars of emissivity and background.
-    device : str, optional
-        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled; or on
-        tensors of torch (extra ``torch``), in torch's words, such as "cuda". All else, such as
-        flags and pieces of time, is the same code on the processor.
     """
 
     background_drift: float = 3.0
-    device: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a drift that is negative or not finite, and a device that is not there."""
+        """Refuse a drift that is negative or not finite."""
         check_fields(self, "subspace")
         if not 0 <= self.background_drift < np.inf:
             raise ValueError(
                 f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
             )
-        if self.device is not None:
-            require_device(self.device, "subspace")
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -165,12 +157,8 @@ def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
 
 
 def _solve(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Solution:
-    """Steps 1 to 4, compiled, or on a device."""
-    solve = fused.solve
-    if settings.device is not None:
-        tensors = importlib.import_module("dbthermal.separation._subspace.tensors")
-        solve = partial(tensors.solve, settings.device)
-    return solve(tile, functions, settings.background_drift)
+    """Steps 1 to 4."""
+    return fused.solve(tile, functions, settings.background_drift)
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -383,14 +371,7 @@ def _divided(
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
     parts = _parts(tile, first, functions)
-    if settings.device is None:
-        return fused.solve_parts(tile, functions, parts, settings.background_drift)
-    groups, every = zip(*parts, strict=True)
-    per_pixel = [
-        _solve(tile.select_pixels(places), own, settings)
-        for places, own in zip(groups, every, strict=True)
-    ]
-    return per_pixel[0].join(per_pixel[1:]).select_pixels(np.argsort(np.concatenate(groups)))
+    return fused.solve_parts(tile, functions, parts, settings.background_drift)
 
 
 METHOD: Final = Method(

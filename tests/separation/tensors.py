@@ -1,6 +1,6 @@
-"""Steps 1 to 4 of `method` on tensors of torch, all pixels of a tile at once, on any device.
+"""Steps 1 to 4 of the default method on tensors of torch, all pixels of a tile at once.
 
-The equations of `fused`, whose results are repeated within rounding: the form to read. Tensors are
+The readable twin of the compiled `fused`, whose results it repeats within rounding. Tensors are
 (band, time, pixel) or end so; numbers of a pixel are its last axis. What a step finds is kept in
 the work space under its name in `fused.Solution` or `pixel.Work`.
 """
