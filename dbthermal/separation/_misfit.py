@@ -57,7 +57,7 @@ class Misfit:
     def common(self, sound: Mask) -> bool:
         """Many pixels (y, x) without a flag have a remainder: a cause that they share."""
         several = sound & ((self.leak > 0.0) | (self.change > 0.0))
-        return np.count_nonzero(several) > _MUCH * np.count_nonzero(sound)
+        return bool(np.count_nonzero(several) > _MUCH * np.count_nonzero(sound))
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,8 @@ def _around(blocks: _Blocks, values: Array) -> Array:
 def _number(blocks: _Blocks) -> Array:
     """Blocks (row, column) around each that tell something."""
     told = (blocks.pixels > 0).astype(np.float64)
-    return np.maximum(uniform_filter(told, _AROUND, mode="constant") * _AROUND**2, 1.0)
+    around: Array = uniform_filter(told, _AROUND, mode="constant") * _AROUND**2
+    return np.maximum(around, 1.0)
 
 
 def _change(blocks: _Blocks) -> Array:
@@ -176,11 +177,12 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     if "segment" in inputs.capture:
         segment = inputs.capture["segment"].values[frames].astype(np.intp)
     squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
-    single = np.stack([np.bincount(place[middle], part, number.size) for part in squares])
+    single: Array = np.stack([np.bincount(place[middle], part, number.size) for part in squares])
     single = single / np.maximum(np.bincount(place[middle], minlength=number.size), 1.0)
     release()
     filled = np.maximum(number, 1.0)
-    noise = [np.bincount(place[pixels], part[pixels], number.size) for part in noise] / filled**2
+    summed = [np.bincount(place[pixels], part[pixels], number.size) for part in noise]
+    noise = np.stack(summed) / filled**2
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
     rest, reflection = (
@@ -198,7 +200,7 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
     events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
     freedom = np.outer(events @ (1.0 - np.sum(basis**2, axis=1)), np.ones(number.size))
-    averages = (
+    averages: tuple[Array, ...] = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
         noise,
         np.stack([np.mean((means @ rest) ** 2, axis=0), leverage * noise[0] + held]),
@@ -238,7 +240,7 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
 def reflected(
     inputs: Inputs, result: xr.Dataset, rows: slice
 ) -> tuple[Array, Array, Mask, Mask, Array]:
-    """Signals (band, frame, pixel) [K] of some rows, the quietest band first, and their reflections.
+    """Signals (band, frame, pixel) [K] of some rows, and the reflections alone.
 
     And the frames (time), the pixels without a flag, and the noise's gain, as `tiles.read`.
     """

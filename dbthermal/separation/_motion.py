@@ -66,9 +66,9 @@ def stabilise(
         return None
     prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
     precision = np.kron(np.linalg.inv(prior), np.eye(2))
-    motion = np.linalg.solve(form + precision, forces).reshape(count, 2, -1)
-    motion = np.swapaxes(motion[np.argsort(inputs.bands)], 1, 2)
-    motion = motion if before is None else motion + before
+    steps = np.linalg.solve(form + precision, forces).reshape(count, 2, -1)
+    steps = np.swapaxes(steps[np.argsort(inputs.bands)], 1, 2)
+    motion = np.asarray(steps if before is None else steps + before)
     counts = empty(corrected["counts"].shape, np.float32)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
         for frame, image, step in zip(film, moved, path, strict=True):
