@@ -6,9 +6,10 @@ linearised signal :math:`z = T_r + (I - U(T_r)) / a`, in kelvin, and the blackbo
 :math:`u(T)`, with :math:`u(T_r) = T_r` and slope 1 there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -19,10 +20,13 @@ from dbthermal import planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
+    "ACCURACY",
     "COEFFICIENTS",
     "KINDS",
+    "Accuracy",
     "Curve",
     "LinearCurve",
+    "accuracy",
     "apparent_temperature",
     "counts",
     "curve",
@@ -35,6 +39,29 @@ KINDS: Final = ("exact", "linear")
 
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
+
+ACCURACY: Final[Mapping[str, float]] = MappingProxyType(
+    {
+        "offset_std": 0.5,
+        "gain_std": 0.01,
+        "pattern_std": 0.1,
+        "blackbody_accuracy": 0.1,
+        "blackbody_emissivity": 0.97,
+        "room_temperature": 295.15,
+    }
+)
+"""What a calibration is taken to keep, where its response states nothing else.
+
+An uncooled camera in a laboratory is accurate to 0.5 K [1]; corrected for its own temperature, it
+leaves 0.2 K over time and pixels [2]: here 1 % of 20 K, and 0.1 K from pixel to pixel. An area
+blackbody is known to 0.1 K, and black within 1 to 3 % [3].
+
+References
+----------
+.. [1] Kelly et al. (2019), Remote Sensing 11, 567, doi:10.3390/rs11050567
+.. [2] Nugent, Shaw, Pust (2013), Optical Engineering 52, 061304, doi:10.1117/1.OE.52.6.061304
+.. [3] Clausen (2007), International Journal of Thermophysics 28, 2145
+"""
 
 _SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
 _MARGIN: Final = 100.0  # beyond the range, in which the reference temperature must lie [K]
@@ -156,6 +183,80 @@ class LinearCurve(Curve):
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature of counts [K]."""
         return (np.asarray(counts, dtype=np.float64) - self.offset) / self.amplitude
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Standard deviations of what a calibration is taken for, which two bands cannot show.
+
+    Attributes
+    ----------
+    offset, pattern : ndarray
+        Drift (band) of each camera's level, and of its pixels about that, since the sweep [K].
+    gain : ndarray
+        Relative error (band) of each camera's gain about the middle of its calibrated range [1].
+    blackbody : float
+        Error that all temperatures of the blackbody share [K].
+    reflected : float
+        What the blackbody mirrors of the room, 1 less its emissivity [1].
+    room, centre : float
+        Temperatures of the room and of the middle of the calibrated range [K].
+    """
+
+    offset: Array
+    gain: Array
+    pattern: Array
+    blackbody: float
+    reflected: float
+    room: float
+    centre: float
+
+    def reading(self, band: int, temperature: npt.ArrayLike) -> Array:
+        """Standard deviation [K] that all pixels share of a reading in one band."""
+        value = np.asarray(temperature, dtype=np.float64)
+        gain = self.gain[band] * (value - self.centre)
+        mirrored = self.reflected * (value - self.room)
+        return np.asarray(
+            np.sqrt(self.offset[band] ** 2 + self.blackbody**2 + gain**2 + mirrored**2)
+        )
+
+
+def accuracy(response: xr.Dataset, bands: list[str]) -> Accuracy:
+    """Accuracy of some bands of a response, `ACCURACY` where it states none.
+
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`. ValueError for a deviation that is negative or not finite, or
+        an emissivity outside (0, 1].
+    bands : list of str
+        Names of the bands, in the order of the result.
+
+    Examples
+    --------
+    >>> from dbthermal import simulation
+    >>> exact = simulation.Rig().response()  # which is what the simulated cameras have
+    >>> accuracy(exact, ["9.5"]).offset, accuracy(exact.drop_vars("offset_std"), ["9.5"]).offset
+    (array([0.]), array([0.5]))
+    """
+    places = schema.band_positions(schema.check(response, "response"), bands, "the response")
+    values = {
+        name: np.asarray(response[name].values if name in response else default, np.float64)
+        for name, default in ACCURACY.items()
+    }
+    for name, value in values.items():
+        black = name != "blackbody_emissivity" or np.all((value > 0.0) & (value <= 1.0))
+        if not (black and np.all((value >= 0.0) & np.isfinite(value))):
+            rule = "in (0, 1]" if not black else "zero or positive, and finite"
+            raise ValueError(f"Invalid {name} {value.tolist()} of the response. Must be {rule}.")
+    offset, gain, pattern = (
+        np.broadcast_to(values[name], response.sizes["band"])[places]
+        for name in ("offset_std", "gain_std", "pattern_std")
+    )
+    reflected = 1.0 - float(values["blackbody_emissivity"])
+    centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
+    room, blackbody = float(values["room_temperature"]), float(values["blackbody_accuracy"])
+    return Accuracy(offset, gain, pattern, blackbody, reflected, room, centre)
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:

@@ -13,6 +13,7 @@ from dbthermal.response import require_range
 
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
+_EXACT: Final = ("offset_std", "gain_std", "pattern_std", "blackbody_accuracy")
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ class Rig:
         """Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
 
         The Sakuma-Hattori curve through exact in-band radiances, which it meets within 0.05 mK
-        between -10 and 80 degrees Celsius.
+        between -10 and 80 degrees Celsius. It states no error of a calibration, for there is none:
+        bars of what is made with it are those of the noise alone.
         """
         temperature = np.linspace(self.lowest, self.highest, _CALIBRATION_POINTS)
         unit = self.counts_per_kelvin / bands.get("8-14").slope(_SLOPE_TEMPERATURE)
@@ -86,7 +88,9 @@ class Rig:
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
         slopes = [curve.reference_slope for curve in responses.curves(noiseless, self.bands)]
         noise = xr.DataArray(np.array(self.noise) * slopes, {"band": list(self.bands)}, "band")
-        return calibration.fit_response(counts, noise).assign_attrs(origin="simulated")
+        stated = {"blackbody_emissivity": 1.0, **dict.fromkeys(_EXACT, 0.0)}
+        result = calibration.fit_response(counts, noise, **stated)
+        return result.assign_attrs(origin="simulated")
 
 
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
