@@ -22,6 +22,7 @@ from dbthermal._arrays import Array
 __all__ = [
     "ACCURACY",
     "COEFFICIENTS",
+    "EXACT",
     "KINDS",
     "Accuracy",
     "Curve",
@@ -62,6 +63,12 @@ References
 .. [2] Nugent, Shaw, Pust (2013), Optical Engineering 52, 061304, doi:10.1117/1.OE.52.6.061304
 .. [3] Clausen (2007), International Journal of Thermophysics 28, 2145
 """
+
+EXACT: Final[Mapping[str, float]] = MappingProxyType(
+    dict.fromkeys(ACCURACY, 0.0)
+    | {"blackbody_emissivity": 1.0, "room_temperature": ACCURACY["room_temperature"]}
+)
+"""Accuracy of a simulated calibration without any error: bars are then those of noise alone."""
 
 _SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
 _MARGIN: Final = 100.0  # beyond the range, in which the reference temperature must lie [K]

@@ -87,8 +87,8 @@ def fit_response(  # noqa: PLR0913 - what is known of the blackbody and the came
         Of all bands or of each: standard deviations of the drift of the camera's level after this
         calibration [K], of its relative gain about the middle of the temperatures [1], and of the
         drift of its pixels about the level [K]. The bars of a result contain them. By default
-        `response.ACCURACY`, and with the level's what the counts are off the curve. They are 0 for
-        an exact simulation only.
+        `response.ACCURACY`, and with the level's what the counts are off the curve. Of an exact
+        simulation ``**response.EXACT`` states all: bars of results then are those of noise alone.
     blackbody_accuracy : float
         Standard deviation of the error that all of the blackbody's temperatures share [K].
     blackbody_emissivity, room_temperature : float

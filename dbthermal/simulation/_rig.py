@@ -13,7 +13,6 @@ from dbthermal.response import require_range
 
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
-_EXACT: Final = ("offset_std", "gain_std", "pattern_std", "blackbody_accuracy")
 
 
 @dataclass(frozen=True)
@@ -88,8 +87,7 @@ class Rig:
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
         slopes = [curve.reference_slope for curve in responses.curves(noiseless, self.bands)]
         noise = xr.DataArray(np.array(self.noise) * slopes, {"band": list(self.bands)}, "band")
-        stated = {"blackbody_emissivity": 1.0, **dict.fromkeys(_EXACT, 0.0)}
-        result = calibration.fit_response(counts, noise, **stated)
+        result = calibration.fit_response(counts, noise, **responses.EXACT)
         return result.assign_attrs(origin="simulated")
 
 

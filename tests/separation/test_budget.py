@@ -1,20 +1,28 @@
 """Errors that two bands cannot show are in the bars by cause, and apart from those of the noise."""
 
+import json
+import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
 from scipy.constants import Boltzmann, Planck, speed_of_light
 
-from dbthermal import calibration, separation
+from dbthermal import calibration, explorer, reporting, separation, store
+from dbthermal.__main__ import main
+from dbthermal.response import EXACT
+from dbthermal.schema import BUDGETS, COMPLETED, SHARED
 
 Floats = NDArray[np.float64]
 TIME, SHAPE = np.arange(250) / 10.0, (16, 24)
 EDGES = {"8-14": (8.0, 14.0), "9.5": (9.2, 9.8)}  # um
 COUNTS, OFFSET = (115.0, 11.0), 14000.0  # count per kelvin at 300 K, count
+MIDDLE = 310.65  # of the blackbody's temperatures [K]
 NETD, ROOM = (0.03, 0.35), 295.15  # K
 LEFT, RIGHT = (0.86, 0.72), (0.93, 0.82)  # emissivities
 
@@ -51,7 +59,10 @@ def response(emissivity: float = 1.0, **stated: Any) -> xr.Dataset:
 
 
 def glass(
-    seed: int, offset: Floats | tuple[float, ...] = (0.0, 0.0), gain: tuple[float, ...] = (0.0, 0.0)
+    seed: int,
+    offset: tuple[float, ...] = (0.0, 0.0),
+    gain: tuple[float, ...] = (0.0, 0.0),
+    pivot: float = 290.0,
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Two panes that warm up while people pass; cameras whose level [K] and gain have drifted."""
     rng = np.random.default_rng(seed)
@@ -70,7 +81,7 @@ def glass(
     movie = []
     for band in range(2):
         clean = values[band] * counts_of(band, warm) + (1 - values[band]) * counts_of(band, cold)
-        clean += gain[band] * (clean - counts_of(band, 300.0)) + offset[band] * COUNTS[band]
+        clean += gain[band] * (clean - counts_of(band, pivot)) + offset[band] * COUNTS[band]
         movie.append(clean + NETD[band] * COUNTS[band] * rng.standard_normal(clean.shape))
     dims, coords = ("time", "y", "x"), {"band": [*EDGES], "time": TIME}
     films = {"object_temperature": (dims, warm), "background_temperature": (dims, cold)}
@@ -93,3 +104,115 @@ WORLD: Mapping[str, dict[str, Any]] = {
     "gains": {"gain": (-0.01, 0.01)},
     "blackbody": {"emissivity": 0.97},
 }
+
+
+@pytest.mark.parametrize("name", WORLD)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_two_bands_cannot_show_is_in_the_bars(name: str, seed: int) -> None:
+    """With the stated accuracy 95 % of the intervals hold, apart from it those of a plain scene."""
+    how = dict(WORLD[name])
+    fitted = response(how.pop("emissivity", 1.0))
+    truth, capture = glass(seed, **how)
+    result = separation.separate(capture, fitted)
+    assert float((result["status"] == 0).mean()) > 0.9
+    for quantity in truth.data_vars:
+        assert holds(result, truth, str(quantity)) > 0.95
+    if name == "plain":
+        alone = separation.without_calibration(result)
+        assert 0.92 < holds(alone, truth) < 0.98
+        exact = separation.separate(capture, response(**EXACT))
+        for quantity in truth.data_vars:
+            std = f"{quantity}_std"
+            np.testing.assert_allclose(alone[std], exact[std], rtol=2e-3)
+            np.testing.assert_array_equal(result[quantity], exact[quantity])
+
+
+@pytest.mark.parametrize("call", [separation.solve, separation.separate])
+@pytest.mark.parametrize(
+    ("cause", "drift", "stated"),
+    [
+        ("offset", {"offset": (0.0, 0.2)}, {"offset_std": (0.0, 0.2)}),
+        ("offset", {"offset": (0.2, 0.0)}, {"offset_std": (0.2, 0.0)}),
+        ("gain", {"gain": (0.01, 0.0), "pivot": MIDDLE}, {"gain_std": (0.01, 0.0)}),
+        ("gain", {"gain": (0.0, 0.01), "pivot": MIDDLE}, {"gain_std": (0.0, 0.01)}),
+    ],
+)
+def test_parts_are_those_of_the_errors(
+    call: Any, cause: str, drift: dict[str, Any], stated: dict[str, Any]
+) -> None:
+    """An error as large as is stated moves each quantity by as much as the budget has of it."""
+    right = call(glass(1)[1], response(**EXACT))
+    off = call(glass(1, **drift)[1], response(**{**EXACT, **stated}))
+    good = (right["status"] == 0) & (off["status"] == 0)
+    for quantity, budget in BUDGETS.items():
+        if quantity == "background_temperature" or (quantity, cause) == ("emissivity", "offset"):
+            continue  # whose level is a prior's; which no offset moves
+        change = (off[quantity] - right[quantity]) ** 2
+        found = np.sqrt(change.mean("time") if "time" in change.dims else change).where(good)
+        part = off[budget].sel(cause=cause).where(good)
+        assert float(found.median()) == pytest.approx(float(part.median()), rel=0.15)
+
+
+def test_completed_pixels_have_a_budget_too() -> None:
+    """Values that are completed contain it; what was measured keeps its bits."""
+    truth, capture = glass(1)
+    capture = capture.isel(time=slice(120))
+    mirrored = np.array([0.86, 0.72])[:, None, None]
+    still = [
+        mirrored[band] * counts_of(band, truth["object_temperature"].values[:120, :, :8])
+        + (1.0 - mirrored[band]) * counts_of(band, ROOM)
+        for band in range(2)
+    ]
+    capture["counts"][..., :8] = np.array(still, np.float32)
+    capture["counts"][..., :8] += np.random.default_rng(2).normal(0, 3.5, (2, 120, 16, 8))
+    fitted = response(pattern_std=0.0)
+    alone = separation.solve(capture, fitted)
+    whole = separation.complete(alone, capture, fitted, prior="plate window glass")
+    completed = (whole["status"].values & int(COMPLETED)) != 0
+    assert completed[:, :8].any()
+    shared = np.sqrt((whole["uncertainty"].sel(cause=[*SHARED]) ** 2).sum("cause")).values
+    assert (shared[completed] > 0.5).all()
+    std, before = (it["object_temperature_std"].values for it in (whole, alone))
+    assert np.all(std[:, completed] >= shared[completed] * (1 - 1e-5))
+    np.testing.assert_array_equal(std[np.isfinite(before)], before[np.isfinite(before)])
+    # Without the calibration the completion is that of an exact one.
+    exact = separation.complete(
+        separation.solve(capture, response(**EXACT)),
+        capture,
+        response(**EXACT),
+        prior="plate window glass",
+    )
+    noise = separation.without_calibration(whole)["object_temperature_std"]
+    np.testing.assert_allclose(noise, exact["object_temperature_std"], rtol=5e-3)
+
+
+def test_regions_never_claim_less_than_the_calibration(tmp_path: Path) -> None:
+    """Means over pixels in the explorer, a file of curves and a report contain the shared part."""
+    _, capture = glass(1)
+    fitted = response()
+    result = separation.separate(capture, fitted)
+    shared = np.sqrt((result["uncertainty"].sel(cause=[*SHARED]) ** 2).sum("cause"))
+    least = float(shared.values[2:14, 2:10].mean())
+    region = explorer.Region("rectangle", ((2, 2), (14, 10)))
+    curve = explorer.View(result).curve("object_temperature", region, pixels="measured")
+    np.testing.assert_allclose(curve["calibration_std"], least, rtol=1e-5)
+    assert np.all(curve["std"] >= least)
+    assert float(curve["std"].max()) < 1.05 * least  # the noise of 96 pixels is averaged
+    # Apparent temperatures of the bands, of a response that is at hand.
+    seen = explorer.View(result, capture, fitted).curve("input 8-14", region)
+    assert float(seen["std"].min()) > 0.5
+    # The file of curves, and the report.
+    store.save(result, tmp_path / "result.zarr", store.provenance({}))
+    path = tmp_path / "curves.csv"
+    arguments = ["export", str(tmp_path / "result.zarr"), "--region", "2", "14", "2", "10"]
+    assert main([*arguments, "-o", str(path)]) == 0
+    table = pd.read_csv(path)
+    assert (table.filter(like=" std [K]").values >= least * (1 - 1e-5)).all()
+    page = tmp_path / "scene.html"
+    reporting.report(result, page, capture, fitted, regions={"pane": region})
+    text = page.read_text("utf-8")
+    assert "Deviation by cause" in text
+    texts = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.DOTALL)
+    (saved,) = (json.loads(numbers) for numbers in texts if '"regions"' in numbers)
+    assert saved["regions"]["pane"]["object_temperature"]["std"] >= least * (1 - 1e-5)
+    assert saved["uncertainty"]["offset"] > 0.5
