@@ -31,7 +31,7 @@ FLOOR: Final = {"object_temperature": 0.05, "emissivity": 0.01}
 
 @cache
 def _response(bands: tuple[str, ...]) -> xr.Dataset:
-    return calibration.fit_response(blackbody(bands), **EXACT)
+    return calibration.fit_response(blackbody(bands), None, **EXACT)
 
 
 def response_of(made: Scene, *, noise: bool = True) -> xr.Dataset:

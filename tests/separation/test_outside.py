@@ -124,7 +124,7 @@ def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Data
     label = {"band": bands, "temperature": temperature}
     blackbody = xr.DataArray(seen, label, ("band", "temperature"), attrs=units)
     stds = xr.DataArray(noise, {"band": bands}, ("band",), attrs=units)
-    return truth, capture, calibration.fit_response(blackbody, **EXACT).assign(noise=stds)
+    return truth, capture, calibration.fit_response(blackbody, None, **EXACT).assign(noise=stds)
 
 
 @pytest.mark.parametrize(
