@@ -103,9 +103,9 @@ materials text*         as listed by 'data'; all by default
 --blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
 --blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
 --room-temperature kelvin  of that room, as 22C
---offset-std number+    drift of the cameras' level since, of both or each [K] (0.5)
---gain-std number+      error of the cameras' gain, of both or each (0.01)
---pattern-std number+   drift of single pixels since, of both or each [K] (0.1)
+--offset-std number2    drift of the level of each camera since [K] (0.5)
+--gain-std number2      error of the gain of each camera (0.01)
+--pattern-std number2   drift of the pixels of each camera since [K] (0.1)
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
@@ -24,10 +24,8 @@ __all__ = [
     "COEFFICIENTS",
     "EXACT",
     "KINDS",
-    "Accuracy",
     "Curve",
     "LinearCurve",
-    "accuracy",
     "apparent_temperature",
     "counts",
     "curve",
@@ -51,7 +49,7 @@ ACCURACY: Final[Mapping[str, float]] = MappingProxyType(
         "room_temperature": 295.15,
     }
 )
-"""What a calibration is taken to keep, where its response states nothing else.
+"""What a calibration is taken for where its response states nothing else; see `fit_response`.
 
 An uncooled camera in a laboratory is accurate to 0.5 K [1]; corrected for its own temperature, it
 leaves 0.2 K over time and pixels [2]: here 1 % of 20 K, and 0.1 K from pixel to pixel. An area
@@ -65,8 +63,7 @@ References
 """
 
 EXACT: Final[Mapping[str, float]] = MappingProxyType(
-    dict.fromkeys(ACCURACY, 0.0)
-    | {"blackbody_emissivity": 1.0, "room_temperature": ACCURACY["room_temperature"]}
+    dict.fromkeys(ACCURACY, 0.0) | {"blackbody_emissivity": 1.0, "room_temperature": 295.15}
 )
 """Accuracy of a simulated calibration without any error: bars are then those of noise alone."""
 
@@ -194,76 +191,42 @@ class LinearCurve(Curve):
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Standard deviations of what a calibration is taken for, which two bands cannot show.
+    """Standard deviations of what a calibration is taken for, see `ACCURACY`."""
 
-    Attributes
-    ----------
-    offset, pattern : ndarray
-        Drift (band) of each camera's level, and of its pixels about that, since the sweep [K].
-    gain : ndarray
-        Relative error (band) of each camera's gain about the middle of its calibrated range [1].
-    blackbody : float
-        Error that all temperatures of the blackbody share [K].
-    reflected : float
-        What the blackbody mirrors of the room, 1 less its emissivity [1].
-    room, centre : float
-        Temperatures of the room and of the middle of the calibrated range [K].
-    """
-
-    offset: Array
-    gain: Array
-    pattern: Array
-    blackbody: float
-    reflected: float
-    room: float
-    centre: float
+    offset: Array  # (band) [K]
+    gain: Array  # (band) [1], about the middle of the calibrated range
+    pattern: Array  # (band) [K]
+    blackbody: float  # [K]
+    reflected: float  # by the blackbody, of the room [1]
+    room: float  # [K]
+    centre: float  # of the calibrated range [K]
 
     def reading(self, band: int, temperature: npt.ArrayLike) -> Array:
         """Standard deviation [K] that all pixels share of a reading in one band."""
         value = np.asarray(temperature, dtype=np.float64)
-        gain = self.gain[band] * (value - self.centre)
-        mirrored = self.reflected * (value - self.room)
-        return np.asarray(
-            np.sqrt(self.offset[band] ** 2 + self.blackbody**2 + gain**2 + mirrored**2)
-        )
+        gain, mirrored = self.gain[band] * (value - self.centre), value - self.room
+        fixed = self.offset[band] ** 2 + self.blackbody**2
+        return np.asarray(np.sqrt(fixed + gain**2 + (self.reflected * mirrored) ** 2))
 
 
 def accuracy(response: xr.Dataset, bands: list[str]) -> Accuracy:
-    """Accuracy of some bands of a response, `ACCURACY` where it states none.
+    """Accuracy of some bands of a response, `ACCURACY` where it states none; ValueError for none.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`. ValueError for a deviation that is negative or not finite, or
-        an emissivity outside (0, 1].
-    bands : list of str
-        Names of the bands, in the order of the result.
-
-    Examples
-    --------
-    >>> from dbthermal import simulation
-    >>> exact = simulation.Rig().response()  # which is what the simulated cameras have
-    >>> accuracy(exact, ["9.5"]).offset, accuracy(exact.drop_vars("offset_std"), ["9.5"]).offset
-    (array([0.]), array([0.5]))
+    That is a deviation that is negative or not finite, or an emissivity outside (0, 1].
     """
-    places = schema.band_positions(schema.check(response, "response"), bands, "the response")
-    values = {
-        name: np.asarray(response[name].values if name in response else default, np.float64)
-        for name, default in ACCURACY.items()
-    }
-    for name, value in values.items():
-        black = name != "blackbody_emissivity" or np.all((value > 0.0) & (value <= 1.0))
-        if not (black and np.all((value >= 0.0) & np.isfinite(value))):
-            rule = "in (0, 1]" if not black else "zero or positive, and finite"
-            raise ValueError(f"Invalid {name} {value.tolist()} of the response. Must be {rule}.")
+    places, stated = schema.band_positions(response, bands, "the response"), {}
+    for name, default in ACCURACY.items():
+        value = response[name].values if name in response else default
+        low, high = (1e-3, 1.0) if name == "blackbody_emissivity" else (0.0, schema.LARGEST)
+        stated[name] = _numbers.real_numbers(f"{name} of the response", value, (low, high))
     offset, gain, pattern = (
-        np.broadcast_to(values[name], response.sizes["band"])[places]
+        np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
     )
-    reflected = 1.0 - float(values["blackbody_emissivity"])
+    blackbody, reflected = stated["blackbody_accuracy"], 1.0 - stated["blackbody_emissivity"]
     centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
-    room, blackbody = float(values["room_temperature"]), float(values["blackbody_accuracy"])
-    return Accuracy(offset, gain, pattern, blackbody, reflected, room, centre)
+    room = float(stated["room_temperature"])
+    return Accuracy(offset, gain, pattern, float(blackbody), float(reflected), room, centre)
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:

@@ -44,7 +44,7 @@ _MAKER_ACCURACY: Final = 2.0 / 3.0**0.5  # of a stated accuracy of 2 K, uniform 
 _POINTS, _LARGEST_ERROR = 64, 0.2  # of a fit to a maker's curve: temperatures, error [K]
 
 
-def fit_response(  # noqa: PLR0913 - what is known of the blackbody and the cameras, by name
+def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by name
     counts: xr.DataArray,
     noise: xr.DataArray | None = None,
     *,
@@ -84,16 +84,13 @@ def fit_response(  # noqa: PLR0913 - what is known of the blackbody and the came
     temperature_std : float
         Standard deviation of the blackbody's temperature from reading to reading, s_T [K].
     offset_std, gain_std, pattern_std : float or sequence of float, optional
-        Of all bands or of each: standard deviations of the drift of the camera's level after this
-        calibration [K], of its relative gain about the middle of the temperatures [1], and of the
-        drift of its pixels about the level [K]. The bars of a result contain them. By default
-        `response.ACCURACY`, and with the level's what the counts are off the curve. Of an exact
-        simulation ``**response.EXACT`` states all: bars of results then are those of noise alone.
-    blackbody_accuracy : float
-        Standard deviation of the error that all of the blackbody's temperatures share [K].
-    blackbody_emissivity, room_temperature : float
-        Emissivity of the blackbody, in (0, 1], and the temperature of the room that it mirrors [K].
-        The counts are not corrected for it; the bars contain it.
+        Of all bands or of each, for the bars of results: drift of the camera's level after the
+        sweep [K], by default 0.5 and what the counts are off the curve; error of its gain about the
+        middle of the temperatures [1]; drift of its pixels about the level [K].
+    blackbody_accuracy, blackbody_emissivity, room_temperature : float
+        Error that all temperatures share [K], emissivity, for which the counts are not corrected,
+        and temperature of the room that is mirrored [K]. See `response.ACCURACY` for the defaults;
+        ``**response.EXACT`` states a simulation without these errors.
 
     Returns
     -------
@@ -166,21 +163,22 @@ def fit_response(  # noqa: PLR0913 - what is known of the blackbody and the came
     stated = f"standard deviation of a reading {temperature_std:g} K"
     # State what drifts after the sweep, and what it cannot see.
     if offset_std is None:
-        slopes = [responses.curve(result, band).reference_slope for band in names]
+        slopes = [curve.reference_slope for curve in curves]
         scatter = np.sqrt((result["residual"].values ** 2).mean(axis=1)) / slopes
-        offset_std = np.hypot(ACCURACY["offset_std"], scatter)
-    drift = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
-    result = result.assign(
-        schema.variables(
-            "response",
-            {
-                **{name: _of_bands(name, value, len(names)) for name, value in drift.items()},
-                "blackbody_accuracy": blackbody_accuracy,
-                "blackbody_emissivity": blackbody_emissivity,
-                "room_temperature": room_temperature,
-            },
-        )
-    )
+        offset_std = np.hypot(ACCURACY["offset_std"], scatter).tolist()
+    known: dict[str, Any] = {
+        "blackbody_accuracy": blackbody_accuracy,
+        "blackbody_emissivity": blackbody_emissivity,
+        "room_temperature": room_temperature,
+    }
+    drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
+    for name, drift in drifts.items():
+        values = _numbers.real_numbers(name, drift)
+        if values.shape not in {(), (len(names),)}:
+            rule = f"Must be one for all bands, or {len(names)}"
+            raise ValueError(f"Invalid {name} of shape {values.shape}. {rule}.")
+        known[name] = np.broadcast_to(values, len(names)).copy()
+    result = result.assign(schema.variables("response", known))
     responses.accuracy(result, names)  # refuses what is none
     stated += f", of all {blackbody_accuracy:g} K, emissivity {blackbody_emissivity:g}"
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
@@ -190,15 +188,6 @@ def fit_response(  # noqa: PLR0913 - what is known of the blackbody and the came
     netd = noises / np.array([curve.reference_slope for curve in curves])
     result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
     return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
-
-
-def _of_bands(name: str, value: Any, number: int) -> Array:
-    """Number of each band, or one for all."""
-    numbers = _numbers.real_numbers(name, np.atleast_1d(value))
-    if numbers.shape not in {(1,), (number,)}:
-        rule = f"Must be one for all bands, or {number}"
-        raise ValueError(f"Invalid {name} of shape {numbers.shape}. {rule}.")
-    return np.broadcast_to(numbers, number).copy()
 
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
