@@ -84,6 +84,8 @@ def test_sweep(recorded: tuple[Path, list[Summary]]) -> None:
     assert [step.path.name for step in steps] == names
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     movies = recording.open_sweep(folder, "plate", frames=8)
+    assert movies.attrs["blackbody_accuracy"] == 0.05  # K, of the session; nothing else is stated
+    assert "blackbody_emissivity" not in movies.attrs
     assert movies["counts"].shape == (3, 2, 8, *SHAPE)
     assert list(movies["band"].values) == ["8-14", "9.5", "11"]
     np.testing.assert_allclose(movies["temperature"], [290.0, 300.0], rtol=0, atol=1e-4)  # [K]
