@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, planck, schema
+from dbthermal import planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
@@ -216,9 +216,12 @@ def accuracy(response: xr.Dataset, bands: list[str]) -> Accuracy:
     """
     places, stated = schema.band_positions(response, bands, "the response"), {}
     for name, default in ACCURACY.items():
-        value = response[name].values if name in response else default
+        value = np.asarray(response[name].values if name in response else default, np.float64)
         low, high = (1e-3, 1.0) if name == "blackbody_emissivity" else (0.0, schema.LARGEST)
-        stated[name] = _numbers.real_numbers(f"{name} of the response", value, (low, high))
+        if not np.all((value >= low) & (value <= high)):
+            rule = f"Must lie in [{low:g}, {high:g}]"
+            raise ValueError(f"Invalid {name} {value.tolist()} of the response. {rule}.")
+        stated[name] = value
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")

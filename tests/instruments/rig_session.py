@@ -45,8 +45,7 @@ filters: {1: 9.5, 3: "11"}
 wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0}
 sweep: [9.5, 11]
 thermocouples: {1: blackbody, 4: plate}
-blackbody:
-  {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20, accuracy: 0.05}
+blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}
 """
 
 
