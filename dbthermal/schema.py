@@ -16,9 +16,6 @@ import numpy.typing as npt
 import xarray as xr
 
 __all__ = [
-    "BUDGETS",
-    "CALIBRATION",
-    "CAUSES",
     "COMPLETED",
     "COORDINATES",
     "EMISSIVITY_LIMITS",
@@ -31,7 +28,6 @@ __all__ = [
     "OPTIONAL",
     "PATTERN_STD",
     "SEGMENT",
-    "SHARED",
     "SHUTTER_CLOSED",
     "STAGES",
     "UNMEASURED",

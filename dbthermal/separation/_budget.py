@@ -32,7 +32,7 @@ from dbthermal.schema import BUDGETS, CALIBRATION, CAUSES
 from dbthermal.separation._inputs import Inputs
 
 _FILMS: Final = tuple(BUDGETS)[:2]
-_FRAMES: Final = 64  # of a film, at least, that give its root mean square
+_FRAMES: Final = 16  # of a film, at least, that give its root mean square
 _SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
 _WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
 
@@ -122,9 +122,10 @@ def _enter(budget: Array, parts: dict[str, Array], stds: Array, total: Array) ->
     values["ratio"] = np.minimum(values["ratio"], np.where(np.isfinite(total), total, 0.0))
     values["noise"] = np.sqrt(total**2 - values["ratio"] ** 2)
     budget[:] = np.stack([values[name] for name in CAUSES])
-    common = np.sqrt(sum(values[name] ** 2 for name in CALIBRATION))
-    for frame in stds if np.any(common) else ():
-        np.hypot(frame, common, out=frame, casting="same_kind")
+    variance = np.sum([values[name] ** 2 for name in CALIBRATION], axis=0, dtype=np.float32)
+    with np.errstate(over="ignore"):  # a deviation beyond single precision is infinite
+        for frame in stds if np.any(variance) else ():
+            np.sqrt(frame * frame + variance, out=frame)
 
 
 def _weights(value: Array, noise: Array, single: Any, reference: int) -> Array:
