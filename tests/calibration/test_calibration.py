@@ -320,7 +320,7 @@ def test_accuracy_is_never_zero_unless_stated() -> None:
     off = 0.8 * UNIT * np.array([[1.0], [0.1]]) * np.tile([1.0, -1.0], 7)[:13]
     uneven = calibration.fit_response(blackbody() + off, temperature_std=2.0)
     assert (uneven["offset_std"] > 1.001 * usual["offset_std"]).all()
-    exact = calibration.fit_response(blackbody(), **response.EXACT)
+    exact = calibration.fit_response(blackbody(), None, **response.EXACT)
     assert response.accuracy(exact, ["9.5", "8-14"]).reading(1, 330.0) == 0.0
     older = exact.drop_vars([*response.ACCURACY])
     assert response.accuracy(older, ["9.5"]).reading(0, 310.65) > 0.5
