@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -209,10 +209,13 @@ class Accuracy:
         return np.asarray(np.sqrt(fixed + gain**2 + (self.reflected * mirrored) ** 2))
 
 
-def accuracy(response: xr.Dataset, bands: list[str]) -> Accuracy:
+def accuracy(
+    response: xr.Dataset, bands: list[str], reference: Mapping[str, Any] | None = None
+) -> Accuracy:
     """Accuracy of some bands of a response, `ACCURACY` where it states none; ValueError for none.
 
-    That is a deviation that is negative or not finite, or an emissivity outside (0, 1].
+    That is a deviation that is negative or not finite, or an emissivity outside (0, 1]. A reference
+    in view, attribute of a capture, renews the levels at its temperature, and perhaps the gains.
     """
     places, stated = schema.band_positions(response, bands, "the response"), {}
     for name, default in ACCURACY.items():
@@ -229,6 +232,12 @@ def accuracy(response: xr.Dataset, bands: list[str]) -> Accuracy:
     blackbody, reflected = stated["blackbody_accuracy"], 1.0 - stated["blackbody_emissivity"]
     centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
     room = float(stated["room_temperature"])
+    if reference is not None:  # at whose temperature nothing that the blackbody mirrored counts
+        left = [reference["bands"][band] for band in bands]
+        offset = np.array([of_band["offset_std"] for of_band in left])
+        blackbody, centre, room = reference["std"], *2 * (reference["temperature"],)
+        if all("gain_std" in of_band for of_band in left):
+            gain, reflected = np.array([of_band["gain_std"] for of_band in left]), 0.0
     return Accuracy(offset, gain, pattern, float(blackbody), float(reflected), room, centre)
 
 

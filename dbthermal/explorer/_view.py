@@ -352,8 +352,9 @@ class View:
             return np.asarray(np.broadcast_to(np.sqrt(squares), values.shape))
         if response is None or pane.curve is None:
             return np.zeros(values.shape)
-        accuracy = responses.accuracy(response, [pane.curve.band])
-        return accuracy.reading(0, values)
+        assert self.capture is not None
+        reference = self.capture.attrs.get("reference")
+        return responses.accuracy(response, [pane.curve.band], reference).reading(0, values)
 
     def _noise(self, pane: Pane, values: Values) -> Array:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""

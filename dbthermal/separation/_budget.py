@@ -41,7 +41,9 @@ def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
     """Result with its budgets, and with the calibration's part in its deviations, in place."""
     if "object_temperature_std" in str(result.attrs.get("not_estimated", "")).split():
         return result
-    accuracy = responses.accuracy(inputs.response, [str(band) for band in result["band"].values])
+    names = [str(band) for band in result["band"].values]
+    reference = inputs.capture.attrs.get("reference")
+    accuracy = responses.accuracy(inputs.response, names, reference)
     result = result.assign_coords(cause=[*CAUSES])
     for name in BUDGETS.values():
         variable = schema.OPTIONAL["separated"][name]

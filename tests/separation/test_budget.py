@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.constants import Boltzmann, Planck, speed_of_light
 
-from dbthermal import calibration, explorer, reporting, separation, store
+from dbthermal import calibration, correction, explorer, reporting, separation, store
 from dbthermal.__main__ import main
 from dbthermal.response import EXACT
 from dbthermal.schema import BUDGETS, COMPLETED, SHARED
@@ -63,6 +63,7 @@ def glass(
     offset: tuple[float, ...] = (0.0, 0.0),
     gain: tuple[float, ...] = (0.0, 0.0),
     pivot: float = 290.0,
+    patches: tuple[float, ...] = (),
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Two panes that warm up while people pass; cameras whose level [K] and gain have drifted."""
     rng = np.random.default_rng(seed)
@@ -81,6 +82,8 @@ def glass(
     movie = []
     for band in range(2):
         clean = values[band] * counts_of(band, warm) + (1 - values[band]) * counts_of(band, cold)
+        for place, temperature in enumerate(patches):  # black ones, at the upper edge
+            clean[:, :3, 8 * place : 8 * place + 8] = counts_of(band, temperature)
         clean += gain[band] * (clean - counts_of(band, pivot)) + offset[band] * COUNTS[band]
         movie.append(clean + NETD[band] * COUNTS[band] * rng.standard_normal(clean.shape))
     dims, coords = ("time", "y", "x"), {"band": [*EDGES], "time": TIME}
@@ -225,3 +228,45 @@ def test_regions_never_claim_less_than_the_calibration(tmp_path: Path) -> None:
     (saved,) = (json.loads(numbers) for numbers in texts if '"regions"' in numbers)
     assert saved["regions"]["pane"]["object_temperature"]["std"] >= least * (1 - 1e-5)
     assert saved["uncertainty"]["offset"] > 0.5
+
+
+@pytest.mark.parametrize("patches", [(303.15,), (293.15, 323.15)])
+@pytest.mark.parametrize("lazy", [False, True])
+def test_reference_in_view_renews_the_calibration(patches: tuple[float, ...], lazy: bool) -> None:
+    """Level and gain are those of the patches; the budget shrinks, and 95 % hold."""
+    fitted = response()
+    gain = (0.01, -0.01) if len(patches) > 1 else (0.0, 0.0)
+    truth, capture = glass(3, offset=(0.5, -0.3), gain=gain, patches=patches)
+    raw = capture.assign(counts=capture["counts"].round().astype(np.uint16))
+    masks = np.zeros((len(patches), *SHAPE), dtype=bool)
+    for place, mask in enumerate(masks):
+        mask[:3, 8 * place : 8 * place + 8] = True
+    reference = correction.Reference(fitted, xr.DataArray(masks, dims=("patch", "y", "x")), patches)
+    fixed = correction.corrected_by_camera(raw)
+    found = {}
+    for name, known in {"plain": None, "referred": reference}.items():
+        corrected = correction.correct_capture(raw, fixed, reference=known, lazy=lazy)
+        result = separation.separate(corrected.load(), fitted)
+        result["status"][:3] |= 1  # the patches and their neighbours are no glass
+        error = abs(result["object_temperature"] - truth["object_temperature"])
+        error = error.where(result["status"] == 0)
+        std = result["object_temperature_std"].where(result["status"] == 0)
+        found[name] = float(error.median()), float(std.median()), holds(result, truth)
+    (error, std, share), (plain_error, plain_std, _) = found["referred"], found["plain"]
+    assert error < 0.3 * plain_error
+    assert std < 0.5 * plain_std
+    assert share > 0.9
+    print(found)
+
+
+def test_impossible_reference_is_refused() -> None:
+    """Patches of the same temperature, of one pixel, or without a temperature each, say so."""
+    masks = xr.DataArray(np.zeros((2, *SHAPE), dtype=bool), dims=("patch", "y", "x"))
+    with pytest.raises(ValueError, match="Must differ"):
+        correction.Reference(response(), masks, (300.0, 300.0))
+    with pytest.raises(ValueError, match=r"temperatures \[K\]"):
+        correction.Reference(response(), masks, (300.0,))
+    raw = glass(1)[1].astype(np.uint16)
+    reference = correction.Reference(response(), masks, (300.0, 310.0))
+    with pytest.raises(ValueError, match="Invalid patch 0"):
+        correction.correct_capture(raw, correction.corrected_by_camera(raw), reference=reference)
