@@ -229,7 +229,7 @@ def accuracy(
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
     )
-    blackbody, reflected = stated["blackbody_accuracy"], 1.0 - stated["blackbody_emissivity"]
+    blackbody, black = (float(stated[f"blackbody_{name}"]) for name in ("accuracy", "emissivity"))
     centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
     room = float(stated["room_temperature"])
     if reference is not None:  # at whose temperature nothing that the blackbody mirrored counts
@@ -237,8 +237,8 @@ def accuracy(
         offset = np.array([of_band["offset_std"] for of_band in left])
         blackbody, centre, room = reference["std"], *2 * (reference["temperature"],)
         if all("gain_std" in of_band for of_band in left):
-            gain, reflected = np.array([of_band["gain_std"] for of_band in left]), 0.0
-    return Accuracy(offset, gain, pattern, float(blackbody), float(reflected), room, centre)
+            gain, black = np.array([of_band["gain_std"] for of_band in left]), 1.0
+    return Accuracy(offset, gain, pattern, blackbody, 1.0 - black, room, centre)
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
