@@ -93,7 +93,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     reference : Reference, optional
         Patches in view whose temperature is known: the level of each camera, and by two patches its
         gain, are made theirs, and the bars of results contain the patches' errors in place of what
-        drifts after a calibration; attribute ``reference``.
+        drifts after a calibration; attribute ``level_reference``.
     lazy : bool
         Compute the counts anew whenever rows of them are read, for captures larger than memory.
 

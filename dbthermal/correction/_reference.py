@@ -49,7 +49,7 @@ class Reference:
 def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Dataset:
     """Counts (band, time, y, x) with the level, and by several patches the gain, of a reference.
 
-    Attribute ``reference`` has what remains unknown, see `response.accuracy`.
+    Attribute ``level_reference`` has what remains unknown, see `response.accuracy`.
     """
     counts, names = corrected["counts"], [str(name) for name in corrected["band"].values]
     masks = laid_on(reference.patches, corrected, "the patches", "the capture").values.copy()
@@ -85,4 +85,4 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
 
     result = _rows.lazy(referred, counts) if lazy else counts.copy(data=referred(slice(None)))
     known = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
-    return corrected.assign(counts=result).assign_attrs(reference={**known, "bands": left})
+    return corrected.assign(counts=result).assign_attrs(level_reference={**known, "bands": left})

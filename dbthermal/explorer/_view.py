@@ -353,7 +353,7 @@ class View:
         if response is None or pane.curve is None:
             return np.zeros(values.shape)
         assert self.capture is not None
-        reference = self.capture.attrs.get("reference")
+        reference = self.capture.attrs.get("level_reference")
         return responses.accuracy(response, [pane.curve.band], reference).reading(0, values)
 
     def _noise(self, pane: Pane, values: Values) -> Array:

@@ -42,7 +42,7 @@ def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
     if "object_temperature_std" in str(result.attrs.get("not_estimated", "")).split():
         return result
     names = [str(band) for band in result["band"].values]
-    reference = inputs.capture.attrs.get("reference")
+    reference = inputs.capture.attrs.get("level_reference")
     accuracy = responses.accuracy(inputs.response, names, reference)
     result = result.assign_coords(cause=[*CAUSES])
     for name in BUDGETS.values():
