@@ -75,7 +75,8 @@ def without_calibration(result: xr.Dataset) -> xr.Dataset:
         values = empty(std.shape, std.dtype)
         for place, image in enumerate(std.values):
             less = variance if variance.ndim == 2 else variance[place]
-            values[place] = np.sqrt(np.maximum(image**2 - less, 0.0)) if less.any() else image
+            square = image.astype(np.float64) ** 2
+            values[place] = np.sqrt(np.maximum(square - less, 0.0)) if less.any() else image
             release()
         alone[f"{name}_std"] = std.copy(data=values)
     return alone
