@@ -99,6 +99,12 @@ materials text*         as listed by 'data'; all by default
 --sweep text2           in place of --at: folder and session of a sweep by 'record'
 --maker path            in place of --at: a capture of FLIR's files, for the maker's constants
 --frames whole=64       at most, of each temperature
+--blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
+--blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
+--room-temperature kelvin  of that room, as 22C
+--offset-std number2    drift of the level of each camera since [K] (0.5)
+--gain-std number2      error of the gain of each camera (0.01)
+--pattern-std number2   drift of the pixels of each camera since [K] (0.1)
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
@@ -136,7 +142,8 @@ a*.tif + b*.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zar
 wide.seq narrow.seq --bands 8-14 9.5 -o scene.zarr
 
 calibrate steps.calibrate --at --blackbody --sweep --maker --frames --bands {_FORM} \
-    --correction-output --output
+    --blackbody-accuracy --blackbody-emissivity --room-temperature --offset-std --gain-std \
+    --pattern-std --correction-output --output
 fit the cameras' response, and each pixel's gain and offset, to a blackbody
 --at 10C a10.tif b10.tif --at 30C a30.tif b30.tif --at 50C a50.tif b50.tif --at 70C a70.tif \
     b70.tif --bands 8-14 9.5 --unit count --clock 30 -o response.zarr --correction-output nuc.zarr

@@ -6,10 +6,11 @@ linearised signal :math:`z = T_r + (I - U(T_r)) / a`, in kelvin, and the blackbo
 :math:`u(T)`, with :math:`u(T_r) = T_r` and slope 1 there.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,9 @@ from dbthermal import planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
+    "ACCURACY",
     "COEFFICIENTS",
+    "EXACT",
     "KINDS",
     "Curve",
     "LinearCurve",
@@ -35,6 +38,34 @@ KINDS: Final = ("exact", "linear")
 
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
+
+ACCURACY: Final[Mapping[str, float]] = MappingProxyType(
+    {
+        "offset_std": 0.5,
+        "gain_std": 0.01,
+        "pattern_std": 0.1,
+        "blackbody_accuracy": 0.1,
+        "blackbody_emissivity": 0.97,
+        "room_temperature": 295.15,
+    }
+)
+"""What a calibration is taken for where its response states nothing else; see `fit_response`.
+
+An uncooled camera in a laboratory is accurate to 0.5 K [1]; corrected for its own temperature, it
+leaves 0.2 K over time and pixels [2]: here 1 % of 20 K, and 0.1 K from pixel to pixel. An area
+blackbody is known to 0.1 K, and black within 1 to 3 % [3].
+
+References
+----------
+.. [1] Kelly et al. (2019), Remote Sensing 11, 567, doi:10.3390/rs11050567
+.. [2] Nugent, Shaw, Pust (2013), Optical Engineering 52, 061304, doi:10.1117/1.OE.52.6.061304
+.. [3] Clausen (2007), International Journal of Thermophysics 28, 2145
+"""
+
+EXACT: Final[Mapping[str, float]] = MappingProxyType(
+    dict.fromkeys(ACCURACY, 0.0) | {"blackbody_emissivity": 1.0, "room_temperature": 295.15}
+)
+"""Accuracy of a simulated calibration without any error: bars are then those of noise alone."""
 
 _SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
 _MARGIN: Final = 100.0  # beyond the range, in which the reference temperature must lie [K]
@@ -156,6 +187,58 @@ class LinearCurve(Curve):
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature of counts [K]."""
         return (np.asarray(counts, dtype=np.float64) - self.offset) / self.amplitude
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Standard deviations of what a calibration is taken for, see `ACCURACY`."""
+
+    offset: Array  # (band) [K]
+    gain: Array  # (band) [1], about the middle of the calibrated range
+    pattern: Array  # (band) [K]
+    blackbody: float  # [K]
+    reflected: float  # by the blackbody, of the room [1]
+    room: float  # [K]
+    centre: float  # of the calibrated range [K]
+
+    def reading(self, band: int, temperature: npt.ArrayLike) -> Array:
+        """Standard deviation [K] that all pixels share of a reading in one band."""
+        value = np.asarray(temperature, dtype=np.float64)
+        gain, mirrored = self.gain[band] * (value - self.centre), value - self.room
+        fixed = self.offset[band] ** 2 + self.blackbody**2
+        return np.asarray(np.sqrt(fixed + gain**2 + (self.reflected * mirrored) ** 2))
+
+
+def accuracy(
+    response: xr.Dataset, bands: list[str], reference: Mapping[str, Any] | None = None
+) -> Accuracy:
+    """Accuracy of some bands of a response, `ACCURACY` where it states none; ValueError for none.
+
+    That is a deviation that is negative or not finite, or an emissivity outside (0, 1]. A reference
+    in view, attribute of a capture, renews the levels at its temperature, and perhaps the gains.
+    """
+    places, stated = schema.band_positions(response, bands, "the response"), {}
+    for name, default in ACCURACY.items():
+        value = np.asarray(response[name].values if name in response else default, np.float64)
+        low, high = (1e-3, 1.0) if name == "blackbody_emissivity" else (0.0, schema.LARGEST)
+        if not np.all((value >= low) & (value <= high)):
+            rule = f"Must lie in [{low:g}, {high:g}]"
+            raise ValueError(f"Invalid {name} {value.tolist()} of the response. {rule}.")
+        stated[name] = value
+    offset, gain, pattern = (
+        np.broadcast_to(stated[name], response.sizes["band"])[places]
+        for name in ("offset_std", "gain_std", "pattern_std")
+    )
+    blackbody, black = (float(stated[f"blackbody_{name}"]) for name in ("accuracy", "emissivity"))
+    centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
+    room = float(stated["room_temperature"])
+    if reference is not None:  # at whose temperature nothing that the blackbody mirrored counts
+        left = [reference["bands"][band] for band in bands]
+        offset = np.array([of_band["offset_std"] for of_band in left])
+        blackbody, centre, room = reference["std"], *2 * (reference["temperature"],)
+        if all("gain_std" in of_band for of_band in left):
+            gain, black = np.array([of_band["gain_std"] for of_band in left]), 1.0
+    return Accuracy(offset, gain, pattern, blackbody, 1.0 - black, room, centre)
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:

@@ -105,6 +105,34 @@ NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
 PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
 """Variable `pattern_std`: what the correction leaves from pixel to pixel, constant in time."""
 
+CAUSES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "noise": "a frame of a pixel",
+        "ratio": "all frames of a pixel, or of a material",
+        "pattern": "all frames of a pixel",
+        "offset": "the image",
+        "gain": "the image",
+        "blackbody": "the image",
+        "room": "the image",
+    }
+)
+"""Causes of a deviation, and what shares an error by each; all but two are the calibration's."""
+
+CALIBRATION: Final = tuple(CAUSES)[2:]
+"""Causes that two bands cannot show: a calibration states them, see `response.accuracy`."""
+
+SHARED: Final = tuple(cause for cause, of in CAUSES.items() if of == "the image")
+"""Causes that a mean over pixels does not lessen."""
+
+BUDGETS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "object_temperature": "uncertainty",
+        "background_temperature": "background_uncertainty",
+        "emissivity": "emissivity_uncertainty",
+    }
+)
+"""Quantity of a result -> variable of its deviation by cause."""
+
 SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
@@ -186,6 +214,13 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "bridged": _of("time y x", "1", "sample bridged in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),
             "reflection_shift": _of("axis y x", "pixel", "shift of what is reflected", "float32"),
+            "uncertainty": _of("cause y x", "K", "object temperature's std by cause", "float32"),
+            "background_uncertainty": _of(
+                "cause y x", "K", "background temperature's std by cause", "float32"
+            ),
+            "emissivity_uncertainty": _of(
+                "cause band y x", "1", "band emissivity's std by cause", "float32"
+            ),
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
@@ -199,6 +234,12 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "response": {
             "noise": NOISE,
             "netd": _of("band", "K", "noise-equivalent temperature difference"),
+            "offset_std": _of("band", "K", "standard deviation of the offset's drift"),
+            "gain_std": _of("band", "1", "standard deviation of the gain"),
+            "pattern_std": _of("band", "K", "standard deviation of the pattern's drift"),
+            "blackbody_accuracy": _of("", "K", "error that all blackbody temperatures share"),
+            "blackbody_emissivity": _of("", "1", "emissivity of the blackbody"),
+            "room_temperature": _of("", "K", "temperature that the blackbody mirrors"),
         },
     }
 )

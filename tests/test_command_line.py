@@ -207,6 +207,22 @@ def test_blackbody_in_a_store(
     done(results, *names, "-o", "response2.zarr")
     first, second = (store.open_dataset(results / f"response{n}.zarr") for n in ("", "2"))
     np.testing.assert_allclose(second["offset"], first["offset"], rtol=0, atol=1e-6)
+    # What is known of the accuracy is stated, the rest is what is usual.
+    known = [
+        "--offset-std",
+        "0.2",
+        "0.3",
+        "--blackbody-accuracy",
+        "0.05",
+        "--room-temperature",
+        "25C",
+    ]
+    done(results, *names, *known, "-o", "accurate.zarr")
+    third = store.open_dataset(results / "accurate.zarr")
+    assert third["offset_std"].values.tolist() == [0.2, 0.3]
+    assert (float(third["blackbody_accuracy"]), float(third["room_temperature"])) == (0.05, 298.15)
+    assert float(third["blackbody_emissivity"]) == float(first["blackbody_emissivity"]) == 0.97
+    assert "of all 0.05 K, emissivity 0.97" in third.attrs["blackbody"]
     line = refused(results, *names, "--maker", "scene.zarr", "-o", "response3.zarr")
     assert "Invalid sources ['blackbody', 'maker']" in line
     line = refused(results, "calibrate", "--maker", "scene.zarr", "-o", "response3.zarr")
@@ -418,6 +434,7 @@ calibrate --blackbody scene.zarr --clock 10 -o x.zarr -> clock --blackbody
 calibrate --blackbody scene.zarr --frames 64 -o x.zarr -> frames --blackbody
 calibrate --sweep a b --bands a b -o x.zarr -> bands --sweep
 calibrate --maker a --correction-output y -o x -> correction-output --maker
+calibrate --maker a --gain-std 0.01 0.02 -o x -> gain-std --maker
 calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset

@@ -8,6 +8,7 @@ from typing import Final
 
 from dbthermal._cli import PLUS, leaves
 from dbthermal._cli.files import READERS, kind_of
+from dbthermal.response import ACCURACY
 
 _FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
 """Options of files, of which each kind takes those that its reader has, and the last two."""
@@ -49,7 +50,8 @@ def _of_files(options: argparse.Namespace) -> dict[str, str]:
         if foreign or len(paths) != 1 or not paths[0].is_dir():
             kinds |= {kind_of(path, options) for path in paths}
     # Sources of a calibration in place of files, and what each leaves without effect.
-    sources = {"blackbody": "frames", "sweep": "", "maker": "frames correction_output"}
+    sources = {"blackbody": "frames", "sweep": ""}
+    sources["maker"] = " ".join(["frames", "correction_output", *ACCURACY])
     stated = [source for source in sources if vars(options).get(source)]
     if options.command == "calibrate" and not (options.at or stated):
         return {}

@@ -1,6 +1,6 @@
 """Response of a camera per band, of blackbodies or its maker: Sakuma-Hattori and linear pair."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import permutations
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from dbthermal import _numbers, bands, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal._warnings import warned
-from dbthermal.response import Curve
+from dbthermal.response import ACCURACY, Curve
 
 AMBIENT: Final = 298.15
 """Ambient temperature [K]; a response refers to the calibrated temperature nearest to it."""
@@ -40,14 +40,21 @@ _FALSE_ALARM: Final = 1e-4  # share of good sweeps that are refused
 _FALLING: Final = 5.0  # standard deviations of a difference by which noise may let counts fall
 _QUIETER: Final = 0.5  # NETD over a containing band's, below which the bands may be exchanged
 _ROUNDING: Final = 1.0 / 12.0  # variance of rounding to whole counts [count^2]
+_MAKER_ACCURACY: Final = 2.0 / 3.0**0.5  # of a stated accuracy of 2 K, uniform [K]
 _POINTS, _LARGEST_ERROR = 64, 0.2  # of a fit to a maker's curve: temperatures, error [K]
 
 
-def fit_response(
+def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by name
     counts: xr.DataArray,
     noise: xr.DataArray | None = None,
     *,
     temperature_std: float = TEMPERATURE_STD,
+    offset_std: float | Sequence[float] | None = None,
+    gain_std: float | Sequence[float] = ACCURACY["gain_std"],
+    pattern_std: float | Sequence[float] = ACCURACY["pattern_std"],
+    blackbody_accuracy: float = ACCURACY["blackbody_accuracy"],
+    blackbody_emissivity: float = ACCURACY["blackbody_emissivity"],
+    room_temperature: float = ACCURACY["room_temperature"],
 ) -> xr.Dataset:
     r"""Fit the response of each band to blackbody measurements.
 
@@ -76,6 +83,14 @@ def fit_response(
         and NETD of the response. Without it the counts have no noise but rounding.
     temperature_std : float
         Standard deviation of the blackbody's temperature from reading to reading, s_T [K].
+    offset_std, gain_std, pattern_std : float or sequence of float, optional
+        Of all bands or of each, for the bars of results: drift of the camera's level after the
+        sweep [K], by default 0.5 and what the counts are off the curve; error of its gain about the
+        middle of the temperatures [1]; drift of its pixels about the level [K].
+    blackbody_accuracy, blackbody_emissivity, room_temperature : float
+        Error that all temperatures share [K], emissivity, for which the counts are not corrected,
+        and temperature of the room that is mirrored [K]. See `response.ACCURACY` for the defaults;
+        ``**response.EXACT`` states a simulation without these errors.
 
     Returns
     -------
@@ -84,8 +99,9 @@ def fit_response(
         `offset` O, `linear_slope` a, `linear_intercept` b (band); `residual`, `linear_residual`
         (band, temperature) [count] and the measured `counts`; `reference_temperature`,
         `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
-        `netd` (band) [K]. Attribute ``blackbody``, the temperatures and their deviation in words,
-        which results and reports repeat: an error that all temperatures share is not seen.
+        `netd` (band) [K]. `offset_std`, `gain_std`, `pattern_std` (band), `blackbody_accuracy`,
+        `blackbody_emissivity` and `room_temperature` as stated. Attribute ``blackbody``, the
+        temperatures and their deviations in words, which results and reports repeat.
 
     Warns
     -----
@@ -145,6 +161,26 @@ def fit_response(
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
     celsius = ", ".join(f"{kelvin - zero_Celsius:.2f}" for kelvin in temperature)
     stated = f"standard deviation of a reading {temperature_std:g} K"
+    # State what drifts after the sweep, and what it cannot see.
+    if offset_std is None:
+        slopes = [curve.reference_slope for curve in curves]
+        scatter = np.sqrt((result["residual"].values ** 2).mean(axis=1)) / slopes
+        offset_std = np.hypot(ACCURACY["offset_std"], scatter).tolist()
+    known: dict[str, Any] = {
+        "blackbody_accuracy": blackbody_accuracy,
+        "blackbody_emissivity": blackbody_emissivity,
+        "room_temperature": room_temperature,
+    }
+    drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
+    for name, drift in drifts.items():
+        values = _numbers.real_numbers(name, drift)
+        if values.shape not in {(), (len(names),)}:
+            rule = f"Must be one for all bands, or {len(names)}"
+            raise ValueError(f"Invalid {name} of shape {values.shape}. {rule}.")
+        known[name] = np.broadcast_to(values, len(names)).copy()
+    result = result.assign(schema.variables("response", known))
+    responses.accuracy(result, names)  # refuses what is none
+    stated += f", of all {blackbody_accuracy:g} K, emissivity {blackbody_emissivity:g}"
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
     if noise is None:
         return result
@@ -179,8 +215,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     shift; for another F the curve is fitted over the camera's range, with an error that is stated.
 
     These constants have no error bars, and what a filter in front of the lens takes away is not in
-    them: all deviations of a result count noise alone, and say so in ``calibration``. The maker
-    states 2 K or 2 % as a rule. Emissivity, distance and reflected temperature are not used.
+    them; results say so in ``calibration``. The maker states 2 K or 2 % as a rule: the bars of a
+    result contain 2 K, uniform and common to both bands, and `response.ACCURACY` for all else.
+    Emissivity, distance and reflected temperature are not used.
 
     Parameters
     ----------
@@ -246,7 +283,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
             raise ValueError(f"Invalid form of '{band}', F = {f:g}: {error:.2g} K off. {rule}.")
         curves.append(curve)
         lines.append(_line(temperature, counts))
-    return _response(curves, lines).assign_attrs(calibration=NO_BARS, form_error=error)
+    stated = schema.variables("response", {"blackbody_accuracy": _MAKER_ACCURACY})
+    result = _response(curves, lines).assign(stated)
+    return result.assign_attrs(calibration=NO_BARS, form_error=error)
 
 
 def _line(temperature: Array, counts: Array) -> Array:

@@ -17,12 +17,14 @@ from dbthermal.correction._nonuniformity import (
     renew_offset,
 )
 from dbthermal.correction._pixels import mark_bad
+from dbthermal.correction._reference import Reference
 from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
 __all__ = [
     "DETECTOR_MAXIMUM",
     "OUTLIER",
+    "Reference",
     "blackbody_statistics",
     "correct",
     "correct_capture",

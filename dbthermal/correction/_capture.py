@@ -10,6 +10,7 @@ from dbthermal import _rows, schema
 from dbthermal import _text as texts
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
+from dbthermal.correction._reference import Reference, refer
 from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
@@ -44,7 +45,7 @@ def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(maps).drop_attrs().assign_attrs(by_camera=1)
 
 
-def correct_capture(
+def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     capture: xr.Dataset,
     correction: xr.Dataset,
     *,
@@ -53,6 +54,7 @@ def correct_capture(
     time_constant: float | xr.DataArray | None = None,
     bad_pixels: float | None = OUTLIER,
     drift_reference: xr.DataArray | None = None,
+    reference: Reference | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
     """Correct a raw capture: gain, offset, shutter events, lag, bad pixels and drift, in order.
@@ -88,6 +90,10 @@ def correct_capture(
         correction only, as for a capture of fewer than 16 frames.
     drift_reference : DataArray, optional
         True on a patch of constant temperature, (y, x), bool; by default no correction.
+    reference : Reference, optional
+        Patches in view whose temperature is known: the level of each camera, and by two patches its
+        gain, are made theirs, and the bars of results contain the patches' errors in place of what
+        drifts after a calibration; attribute ``level_reference``.
     lazy : bool
         Compute the counts anew whenever rows of them are read, for captures larger than memory.
 
@@ -147,6 +153,8 @@ def correct_capture(
         result = mark_bad(result, threshold=bad_pixels)
     if drift_reference is not None:
         result = undo_drift(result, drift_reference, lazy=lazy)
+    if reference is not None:
+        result = refer(result, reference, lazy=lazy)
     number = -1 if closed is None else closed.sum("time").values.tolist()
     return result.assign_attrs(shutter_closed_frames=number)
 

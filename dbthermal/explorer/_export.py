@@ -140,12 +140,13 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
 def _table(view: View, lines: xr.Dataset, *, celsius: bool) -> str:
     """Curves as comma-separated values, a row a time, with names and units in the first."""
     units, offset = view.panes[lines.attrs["pane"]].unit(celsius=celsius)
-    names = [("mean", offset), ("minimum", offset), ("maximum", offset), ("std", 0.0)]
+    names = [("mean", offset), ("minimum", offset), ("maximum", offset)]
+    names += [("std", 0.0), ("calibration_std", 0.0)]
     columns = {"time [s]": lines["time"].values} if "time" in lines.coords else {}
     for region in map(str, lines["region"].values):
         line = lines.sel(region=region)
         for name, zero in names:
-            of = "K" if name == "std" and zero != offset else units
+            of = "K" if name.endswith("std") and zero != offset else units
             columns[f"{region} {name} [{of}]"] = np.atleast_1d(line[name].values - zero)
         columns[f"{region} pixels"] = np.atleast_1d(line["pixels"].values)
     rows = xr.Dataset({name: ("row", values) for name, values in columns.items()}).to_dataframe()

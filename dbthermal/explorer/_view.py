@@ -233,9 +233,11 @@ class View:
 
         A common error is not reduced by the number of pixels (`std`): of object and reflected
         temperature the error by the emissivities, less the part by which neighbours differ; of
-        emissivities, completed pixels and displaced cameras all of it. The rest is independent,
+        emissivities, completed pixels and displaced cameras all of it. What the calibration is
+        taken for, k, the whole image shares. The rest is independent,
 
-        .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+        .. math:: s^2 = \left(\frac1n \sum_i k_i\right)^2 + \left(\frac1n \sum_i c_i\right)^2
+                  + \frac1{n^2} \sum_i (s_i^2 - k_i^2 - c_i^2)
 
         Parameters
         ----------
@@ -249,15 +251,15 @@ class View:
         Returns
         -------
         Dataset
-            `mean`, `minimum`, `maximum`, `std` in the pane's units and `pixels`, the number that
-            counts, over (time); without it for a map. NaN where no pixel counts. `std` is NaN where
-            the result states no deviation.
+            `mean`, `minimum`, `maximum`, `std` in the pane's units, its part `calibration_std`, and
+            `pixels`, the number that counts, over (time); without it for a map. NaN where no pixel
+            counts. `std` is NaN where the result states no deviation.
 
         Notes
         -----
-        The deviations exclude the calibration of the cameras, and the correlation of neighbours by
-        interpolation. That of the reflected temperature is mostly the prior of its drift
-        (`SubspaceSettings.background_drift`): without a drift the mean is much closer.
+        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
+        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
+        a drift the mean is much closer.
         """
         pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
@@ -330,7 +332,29 @@ class View:
         if gain is not None:
             warm, cold = (self.pane(name).read(frames, *box)[:, where] for name in FILMS)
             common = gain * np.abs(warm - cold)
-        return {**result, "std": mean_std(np.where(np.isfinite(values), std, np.nan), common)}
+        # What the calibration is taken for is an error of all pixels, beside those of the noise.
+        finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
+        if pane.std:
+            std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
+        std = mean_std(np.where(finite, std, np.nan), common)
+        shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
+        shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
+        return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
+
+    def _shared(self, pane: Pane, values: Values, box: tuple[slice, ...], where: Mask) -> Array:
+        """Deviation of the samples of a pane by the calibration, which the whole image shares."""
+        budget, response = schema.BUDGETS.get(pane.name.partition(" ")[0]), self.response
+        if budget in self.data:
+            parts = self.data[budget].isel(y=box[0], x=box[1]).sel(cause=[*schema.SHARED])
+            if "band" in parts.dims:
+                parts = parts.sel(band=pane.name.partition(" ")[2])
+            squares = (parts.values[:, where].astype(np.float64) ** 2).sum(axis=0)
+            return np.asarray(np.broadcast_to(np.sqrt(squares), values.shape))
+        if response is None or pane.curve is None:
+            return np.zeros(values.shape)
+        assert self.capture is not None
+        reference = self.capture.attrs.get("level_reference")
+        return responses.accuracy(response, [pane.curve.band], reference).reading(0, values)
 
     def _noise(self, pane: Pane, values: Values) -> Array:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""

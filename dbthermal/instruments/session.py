@@ -112,6 +112,10 @@ class Blackbody:
         logger are off by half a kelvin or so each, and the recordings keep the reading.
     stability, window, timeout : float
         Largest range of the readings [K] in a window, how long it is, and longest wait for it [s].
+    accuracy, emissivity, room : float, optional
+        Standard deviation of the error that all readings share [K], emissivity of the blackbody,
+        and temperature of the room that it mirrors [K]: for the bars of results, see
+        `calibration.fit_response`.
     """
 
     temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
@@ -119,6 +123,9 @@ class Blackbody:
     window: Annotated[Positive, Field(le=3600.0)] = 30.0
     tolerance: Annotated[Positive, Field(le=50.0)] = 1.5
     timeout: Annotated[Positive, Field(le=1e5)] = 1800.0
+    accuracy: Annotated[Positive, Field(le=50.0)] | None = None
+    emissivity: Annotated[Positive, Field(le=1.0)] | None = None
+    room: Temperature | None = None
 
     def __post_init__(self) -> None:
         if self.window >= self.timeout:

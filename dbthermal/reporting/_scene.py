@@ -139,6 +139,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     numbers: dict[str, Any] = {
         "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
         "validity": _validity(view),
+        "uncertainty": _budget(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
     # Film, viewer, and the sections of the page.
@@ -147,6 +148,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),
         Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
+        Section("Deviation by cause", list(_causes(numbers["uncertainty"]))),
         Section("Emissivities", list(_emissivities(numbers["regions"]))),
         Section("What was assumed", [_assumed(view)]),
     ]
@@ -188,14 +190,26 @@ def _regions(
     rows = []
     for region in chosen:
         curve = curves[region]["object_temperature"]
-        std = _text(_plain(curve["std"].mean()), 3)
-        rows.append([region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), std])
-    yield table(head, rows)
+        stds = [_text(_plain(curve[key].mean()), 3) for key in ("std", "calibration_std")]
+        rows.append(
+            [region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), *stds]
+        )
+    yield table([*head, "of it by calibration [K]"], rows)
     yield (
         "Of a region only measured pixels and frames count: no pixel with a flag or completed, "
         "and no frame of a pixel that was bridged in time. "
         "Errors that the pixels of a region share are not lessened by their number."
     )
+
+
+def _budget(view: View) -> dict[str, float]:
+    """Median deviation [K] of the object temperature of the measured pixels, by cause."""
+    if "uncertainty" not in view.data:
+        return {}
+    budget, good = view.data["uncertainty"], view.counted("measured")
+    rows = zip(map(str, budget["cause"].values), budget.values[:, good], strict=True)
+    known = {cause: row[np.isfinite(row)] for cause, row in rows}
+    return {cause: float(np.median(row)) for cause, row in known.items() if row.size}
 
 
 def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Figure:
@@ -260,12 +274,25 @@ def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
     yield table(["flag", "meaning", "share of the pixels"], rows, names=2)
 
 
+def _causes(budget: Mapping[str, float]) -> Iterator[Markup | str]:
+    """Yield the table of the deviation by cause."""
+    if not budget:
+        return
+    rows = [[cause, schema.CAUSES[cause], _text(std, 3)] for cause, std in budget.items()]
+    yield table(["cause", "an error is shared by", "standard deviation [K]"], rows, names=2)
+    yield (
+        "Of the object temperature, median over the measured pixels. The bands show noise and "
+        "ratio; all else is what the response of the cameras states."
+    )
+
+
 def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[str, Any]:
     """Numbers of a region: temperatures, emissivities, and the nearest materials."""
     summary: dict[str, Any] = {}
     for name in (name for name in FILMS if name in curves):
         curve = curves[name]
-        summary[name] = {key: _plain(curve[key].mean()) for key in ("mean", "std")}
+        keys = ("mean", "std", "calibration_std")
+        summary[name] = {key: _plain(curve[key].mean()) for key in keys}
         summary[name]["minimum"] = _plain(curve["mean"].min())
         summary[name]["maximum"] = _plain(curve["mean"].max())
     bands = [name.removeprefix("emissivity ") for name in curves if name.startswith("emissivity ")]

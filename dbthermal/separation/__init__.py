@@ -8,6 +8,7 @@ function of a `_tiles.Tile` that returns a `_tiles.Estimate`, is passed to `solv
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
+from dbthermal.separation._budget import without_calibration
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._pooling.materials import materials
@@ -36,6 +37,7 @@ __all__ = [
     "run",
     "separate",
     "solve",
+    "without_calibration",
 ]
 __dir__ = __all__.copy
 

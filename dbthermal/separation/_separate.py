@@ -18,6 +18,7 @@ from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
+from dbthermal.separation._budget import without_calibration
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
@@ -220,7 +221,7 @@ def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr
             "Invalid result alone. Must be of 'subspace', without materials, with "
             f"{made['settings']}."
         )
-    return laid_on(per_pixel, corrected, "the result alone", "the capture")
+    return laid_on(without_calibration(per_pixel), corrected, "the result alone", "the capture")
 
 
 def _over_found_materials(

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from dbthermal import schema
 from dbthermal._arrays import empty, release
 from dbthermal._compiled import compiled
+from dbthermal.separation import _budget as budget
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
 from dbthermal.separation._inputs import Inputs, Method, check
@@ -120,7 +121,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
         quietest band (attribute `reference_band`), each with `_std`; of "subspace" also
-        `emissivity_covariance` (band, other_band, y, x) [1]; `status` (y, x), bits of
+        `emissivity_covariance` (band, other_band, y, x) [1] by noise alone. The deviations contain
+        the accuracy that the response states (`response.accuracy`); `uncertainty` (cause, y, x)
+        [K], root mean square over time of the object's deviation by cause, splits it, as do
+        `background_uncertainty` and `emissivity_uncertainty` (cause, band, y, x) [1], and
+        `without_calibration` takes it out. `status` (y, x), bits of
         `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says why, at
         invalid or masked samples, and where a method never estimates them (attribute
         `not_estimated`); where the status is 0, all others are finite.
@@ -192,7 +197,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         reflection_shift=reflection_shift,
         response_kind=response_kind,
     )
-    return separated(inputs, workers=workers, progress=progress)[0]
+    return budget.added(separated(inputs, workers=workers, progress=progress)[0], inputs)
 
 
 def separated(

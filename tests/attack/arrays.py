@@ -13,6 +13,7 @@ from attack.damage import ALL, Rng, Table, cut, hurt, hurt_one
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import CALIBRATED, SLOPE, Array, Scene, blackbody, clock, pick, scene
 from dbthermal import calibration, separation
+from dbthermal.response import EXACT
 from reproduction import methods
 from reproduction.methods.bcp import BcpSettings
 
@@ -30,7 +31,7 @@ FLOOR: Final = {"object_temperature": 0.05, "emissivity": 0.01}
 
 @cache
 def _response(bands: tuple[str, ...]) -> xr.Dataset:
-    return calibration.fit_response(blackbody(bands))
+    return calibration.fit_response(blackbody(bands), None, **EXACT)
 
 
 def response_of(made: Scene, *, noise: bool = True) -> xr.Dataset:

@@ -293,3 +293,34 @@ def test_emissivity_needs_noise(two_bands: xr.Dataset, measured: xr.Dataset) -> 
     """A response without noise raises a ValueError."""
     with pytest.raises(ValueError, match="Missing noise of the response"):
         calibration.fit_emissivity(measured, two_bands.drop_vars("noise"), STDS)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"offset_std": -0.1}, "Invalid offset_std [-0.1, -0.1] of the response. Must lie in"),
+        ({"gain_std": (0.01, np.nan)}, "Invalid gain_std [0.01, nan] of the response"),
+        ({"pattern_std": (0.1, 0.1, 0.1)}, "Invalid pattern_std of shape (3,)"),
+        ({"blackbody_emissivity": 1.1}, "Invalid blackbody_emissivity 1.1 of the response"),
+        ({"blackbody_accuracy": -1.0}, "Invalid blackbody_accuracy -1.0 of the response"),
+    ],
+)
+def test_impossible_accuracy_is_refused(stated: dict[str, Any], message: str) -> None:
+    """A deviation that is negative or not finite, or an emissivity above 1, names itself."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibration.fit_response(blackbody(), **stated)
+
+
+def test_accuracy_is_never_zero_unless_stated() -> None:
+    """A sweep states what is usual, and more drift where its counts are off the curve."""
+    usual = calibration.fit_response(blackbody())
+    assert {name: usual[name].values.max() for name in response.ACCURACY} == pytest.approx(
+        dict(response.ACCURACY), rel=1e-6
+    )
+    off = 0.8 * UNIT * np.array([[1.0], [0.1]]) * np.tile([1.0, -1.0], 7)[:13]
+    uneven = calibration.fit_response(blackbody() + off, temperature_std=2.0)
+    assert (uneven["offset_std"] > 1.001 * usual["offset_std"]).all()
+    exact = calibration.fit_response(blackbody(), None, **response.EXACT)
+    assert response.accuracy(exact, ["9.5", "8-14"]).reading(1, 330.0) == 0.0
+    older = exact.drop_vars([*response.ACCURACY])
+    assert response.accuracy(older, ["9.5"]).reading(0, 310.65) > 0.5

@@ -32,7 +32,7 @@ from dbthermal.instruments.recording import Preview, Summary, notes, open_captur
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
-TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), QUICKLY)
+TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0], accuracy: 0.05"), QUICKLY)
 
 
 def world_of(devices: Devices) -> World:
@@ -84,6 +84,8 @@ def test_sweep(recorded: tuple[Path, list[Summary]]) -> None:
     assert [step.path.name for step in steps] == names
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
     movies = recording.open_sweep(folder, "plate", frames=8)
+    assert movies.attrs["blackbody_accuracy"] == 0.05  # K, of the session; nothing else is stated
+    assert "blackbody_emissivity" not in movies.attrs
     assert movies["counts"].shape == (3, 2, 8, *SHAPE)
     assert list(movies["band"].values) == ["8-14", "9.5", "11"]
     np.testing.assert_allclose(movies["temperature"], [290.0, 300.0], rtol=0, atol=1e-4)  # [K]

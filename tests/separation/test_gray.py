@@ -10,6 +10,7 @@ from attack.scenes import counts_of
 from scenes import held
 
 from dbthermal import calibration, separation, simulation
+from dbthermal.response import EXACT
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 
@@ -68,7 +69,7 @@ def independent(noise: tuple[float, ...], emissivity: Floats, seed: int, frames:
     seen = [counts_of(name, grid) for name in names]
     blackbody = xr.DataArray(seen, label | {"temperature": grid}, ("band", "temperature"))
     levels = xr.DataArray(np.array(noise) * steps, dims="band", coords=label)
-    response = calibration.fit_response(blackbody, levels)
+    response = calibration.fit_response(blackbody, levels, **EXACT)
     value = xr.DataArray(emissivity[:, np.newaxis], dims=("band", "y", "x"), coords=label)
     scene = simulation.scene(time, x[:, np.newaxis], y[:, np.newaxis], value)
     capture = xr.Dataset(

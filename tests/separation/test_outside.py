@@ -15,6 +15,7 @@ from attack.scenes import SLOPE, Array, counts_of
 from scenes import held
 
 from dbthermal import calibration, separation
+from dbthermal.response import EXACT
 
 HIGHEST: Final = 440.0  # of the blackbody [K]
 ROOM: Final = 294.0  # K
@@ -123,7 +124,7 @@ def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Data
     label = {"band": bands, "temperature": temperature}
     blackbody = xr.DataArray(seen, label, ("band", "temperature"), attrs=units)
     stds = xr.DataArray(noise, {"band": bands}, ("band",), attrs=units)
-    return truth, capture, calibration.fit_response(blackbody).assign(noise=stds)
+    return truth, capture, calibration.fit_response(blackbody, None, **EXACT).assign(noise=stds)
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,12 @@ __dir__ = __all__.copy
 
 Region = tuple[slice, slice]
 
+# Attribute of a sweep, as of `calibration.fit_response`, by the key of the session's blackbody.
+_ACCURACY: Final = {
+    "blackbody_accuracy": "accuracy",
+    "blackbody_emissivity": "emissivity",
+    "room_temperature": "room",
+}
 _WHOLE: Final = 0.95  # share of the promised frames with which a recording is whole [1]
 
 
@@ -208,6 +214,7 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count],
         with the band of the camera without filters from the recordings through the first filter.
         `temperature` is the mean of the blackbody's readings during the recordings of a step [K].
+        Attributes as `calibration.fit_response` takes them, where the session states its accuracy.
 
     Raises
     ------
@@ -335,7 +342,10 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
                 rule = "Must be recorded to its end"
                 raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
             require_filter(path, band)
-    return steps, blackbody["stability"], {key: attrs[key] for key in ("is_simulated", "origin")}
+    shared = {key: attrs[key] for key in ("is_simulated", "origin")}
+    named = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
+    shared |= {key: value for key, value in named.items() if value is not None}
+    return steps, blackbody["stability"], shared
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:

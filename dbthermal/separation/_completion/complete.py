@@ -16,6 +16,7 @@ from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._budget import added, without_calibration
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
@@ -130,7 +131,13 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     """
     require_workers(workers)
     scope = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
-    return filled(_checked(result, corrected).copy(deep=True), corrected, response, scope, workers)
+    before = _checked(result, corrected)
+    completed = without_calibration(before).copy(deep=True)
+    completed = filled(completed, corrected, response, scope, workers)
+    for name in FILMS:  # what was measured keeps its bits
+        old, new = before[f"{name}_std"].values, completed[f"{name}_std"].values
+        np.copyto(new, old, where=np.isfinite(old))
+    return completed
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,7 @@ def filled(
     inputs = check(corrected, response, _METHOD, response_kind=kind, **shared)
     measured = result
     if context.materials is not None and not result.attrs.get("pooled"):
-        measured = solve(corrected, response, **shared)
+        measured = without_calibration(solve(corrected, response, **shared))
     scene = scenes.gather(inputs, result, measured, context.prior)
     sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
@@ -181,7 +188,7 @@ def filled(
     result["bridged"] = (variable.dims, lacking, variable.attrs)
     result["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
-    return result.assign_attrs(
+    return added(result, inputs).assign_attrs(
         frames_missing=int(np.count_nonzero(~frames)),
         frames_bridged=float(number.sum() / max(1, np.count_nonzero(number))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from dbthermal import correction, simulation
 from dbthermal.calibration import fit_response
+from dbthermal.response import EXACT
 from dbthermal.simulation import Rig
 from reproduction import disturbances
 from reproduction.experiments.nuisances import GLASS
@@ -105,10 +106,10 @@ def registration(view: Sequence[int]) -> xr.DataArray:
 
 
 def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
-    """Correction and response of the movies of a blackbody."""
+    """Correction and response of the movies of an exact blackbody, of cameras that do not drift."""
     statistics = correction.blackbody_statistics(movies)
     fitted = correction.fit_correction(statistics)
-    return fitted, fit_response(fitted["level"], statistics["noise"])
+    return fitted, fit_response(fitted["level"], statistics["noise"], **EXACT)
 
 
 def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:

@@ -1,0 +1,165 @@
+r"""Budget of a result by cause [1]_, with what its calibration is taken for.
+
+The bands show noise, and how certain the ratios are, but no wrong offset, gain or blackbody: these
+the response states (`response.accuracy`). Errors :math:`\delta_b` of the bands [K] move object and
+background by a least-squares solution of the first equation; relative errors :math:`g_b` of gains
+about :math:`T_0` keep the image formation if, with the emissivities that are found with them,
+
+.. math::
+    e_b\,\delta x + (1 - e_b)\,\delta y &= \delta_b, \qquad
+    e_b \alpha + (1 - e_b) \beta = g_b \\
+    \delta x = \alpha (x - T_0), \quad \delta y &= \beta (y - T_0), \quad
+    \delta e_b = e_b (1 - e_b) (\beta - \alpha)
+
+An error of the blackbody is one of all temperatures; what it mirrors is one of all gains.
+
+References
+----------
+.. [1] JCGM 100:2008, Guide to the expression of uncertainty in measurement,
+   doi:10.59161/JCGM100-2008E
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import response as responses
+from dbthermal import schema
+from dbthermal._arrays import Array, empty, release
+from dbthermal.response import Accuracy
+from dbthermal.schema import BUDGETS, CALIBRATION, CAUSES
+from dbthermal.separation._inputs import Inputs
+
+_FILMS: Final = tuple(BUDGETS)[:2]
+_FRAMES: Final = 16  # of a film, at least, that give its root mean square
+_SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
+_WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
+
+
+def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
+    """Result with its budgets, and with the calibration's part in its deviations, in place."""
+    if "object_temperature_std" in str(result.attrs.get("not_estimated", "")).split():
+        return result
+    names = [str(band) for band in result["band"].values]
+    reference = inputs.capture.attrs.get("level_reference")
+    accuracy = responses.accuracy(inputs.response, names, reference)
+    result = result.assign_coords(cause=[*CAUSES])
+    for name in BUDGETS.values():
+        variable = schema.OPTIONAL["separated"][name]
+        values = np.zeros([result.sizes[dim] for dim in variable.dims], np.float32)
+        result[name] = (variable.dims, values, variable.attrs)
+    for rows in inputs.blocks:
+        _add(result.isel(y=rows), inputs.noise, inputs.bands[0], accuracy)
+        release()
+    return result
+
+
+def without_calibration(result: xr.Dataset) -> xr.Dataset:
+    """Result whose deviations hold what its bands tell alone: noise and ratios, no calibration.
+
+    Parameters
+    ----------
+    result : Dataset
+        From `solve`, `separate` or `complete`; it is not changed.
+
+    Returns
+    -------
+    Dataset
+        The same values, without the variables of `schema.BUDGETS`.
+    """
+    alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
+    for name in (name for name, budget in BUDGETS.items() if budget in result):
+        parts = result[BUDGETS[name]].sel(cause=[*CALIBRATION]).values
+        variance, std = (parts.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
+        values = empty(std.shape, std.dtype)
+        for place, image in enumerate(std.values):
+            less = variance if variance.ndim == 2 else variance[place]
+            square = image.astype(np.float64) ** 2
+            values[place] = np.sqrt(np.maximum(square - less, 0.0)) if less.any() else image
+            release()
+        alone[f"{name}_std"] = std.copy(data=values)
+    return alone
+
+
+def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> None:
+    """Add the budgets of some rows, whose values are views, in place."""
+    # Where only ratios are known: any emissivities of these ratios move the object alike.
+    ratio = cut["reflection_ratio"].values.astype(np.float64)
+    assumed = 1.0 - 0.5 * ratio / np.max(np.nan_to_num(ratio, nan=1.0), axis=0, initial=1.0)
+    value = cut["emissivity"].values.astype(np.float64)
+    value = np.where(np.isfinite(value), value, assumed)
+    # What is completed as a whole is read in one band.
+    single = ((cut["status"].values & _WHOLE) != 0) | ~np.isfinite(value).all(axis=0)
+    weights = _weights(np.where(np.isfinite(value), value, 1.0), noise, single, reference)
+    films = [cut[name].values for name in _FILMS]
+    ratio_std = cut["reflection_ratio_std"].values
+    by_ratio = np.where(single, 0.0, (1.0 - value[reference]) * _rms(films[0], films[1]))
+    by_ratio = by_ratio * _combined(weights, np.where(np.isfinite(ratio_std), ratio_std, 0.0))
+    for place, (name, film) in enumerate(zip(_FILMS, films, strict=True)):
+        parts = {
+            "ratio": by_ratio[place],
+            "pattern": _combined(weights, accuracy.pattern)[place],
+            "offset": _combined(weights, accuracy.offset)[place],
+            "gain": _combined(weights, accuracy.gain)[place] * _rms(film, accuracy.centre),
+            "blackbody": np.full(single.shape, accuracy.blackbody),
+            "room": accuracy.reflected * _rms(film, accuracy.room),
+        }
+        std = cut[f"{name}_std"].values
+        _enter(cut[BUDGETS[name]].values, parts, std, _rms(std))
+    slope = np.where(single, 0.0, _combined(weights[1] - weights[0], accuracy.gain))
+    stds = cut["emissivity_std"].values
+    parts = {"gain": np.abs(value * (1.0 - value)) * slope}
+    _enter(cut[BUDGETS["emissivity"]].values, parts, stds[np.newaxis], stds.astype(np.float64))
+
+
+def _enter(budget: Array, parts: dict[str, Array], stds: Array, total: Array) -> None:
+    """Enter parts into a budget (cause, ...), and the calibration's into the deviations, in place.
+
+    Of the statistical deviation, whose root mean square is `total`, what no ratio explains is
+    noise. A part without a value, as where there is no temperature, is left out.
+    """
+    values = dict.fromkeys(CAUSES, np.zeros(total.shape)) | {
+        name: np.where(np.isfinite(part), part, 0.0) for name, part in parts.items()
+    }
+    values["ratio"] = np.minimum(values["ratio"], np.where(np.isfinite(total), total, 0.0))
+    values["noise"] = np.sqrt(total**2 - values["ratio"] ** 2)
+    budget[:] = np.stack([values[name] for name in CAUSES])
+    variance = np.sum([values[name] ** 2 for name in CALIBRATION], axis=0, dtype=np.float32)
+    with np.errstate(over="ignore"):  # a deviation beyond single precision is infinite
+        for frame in stds if np.any(variance) else ():
+            np.sqrt(frame * frame + variance, out=frame)
+
+
+def _weights(value: Array, noise: Array, single: Any, reference: int) -> Array:
+    """Weights (2, band, y, x) of the bands' errors in object and background, by emissivities.
+
+    By least squares; where `single`, or bands do not differ, of the reading in the reference band.
+    """
+    inverse, cold = 1.0 / noise[:, np.newaxis, np.newaxis] ** 2, 1.0 - value
+    pairs = ((value, value), (value, cold), (cold, cold))
+    xx, xy, yy = ((inverse * a * b).sum(axis=0) for a, b in pairs)
+    single = single | ~(xx * yy - xy**2 > _SINGULAR * xx * yy)
+    divisor = np.where(single, 1.0, xx * yy - xy**2)
+    both = np.stack([value * yy - cold * xy, cold * xx - value * xy]) * inverse / divisor
+    alone = np.zeros_like(both)
+    alone[0, reference] = 1.0 / np.where(value[reference] > 0.0, value[reference], 1.0)
+    alone[1, reference] = 1.0
+    return np.where(single, alone, both)
+
+
+def _combined(weights: Array, stds: Array) -> Array:
+    """Deviation of independent errors of bands, (band) or (band, y, x), by weights (band, y, x)."""
+    stds = stds if stds.ndim > 1 else stds[:, np.newaxis, np.newaxis]
+    return np.asarray(np.sqrt(((weights * stds) ** 2).sum(axis=-3)))
+
+
+def _rms(film: Array, zero: Array | float = 0.0) -> Array:
+    """Root mean square (y, x) over time of a film, about a number or another; NaN without any."""
+    frames = slice(None, None, max(1, len(film) // _FRAMES))
+    values = film[frames] - (zero[frames] if isinstance(zero, np.ndarray) else zero)
+    finite = np.isfinite(values)
+    number = np.where(finite.any(axis=0), finite.sum(axis=0), np.nan)
+    return np.asarray(
+        np.sqrt(np.sum(values.astype(np.float64) ** 2, axis=0, where=finite) / number)
+    )
