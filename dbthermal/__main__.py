@@ -105,6 +105,7 @@ materials text*         as listed by 'data'; all by default
 --offset-std number2    drift of the level of each camera since [K] (0.5)
 --gain-std number2      error of the gain of each camera (0.01)
 --pattern-std number2   drift of the pixels of each camera since [K] (0.1)
+--background-ratio-std number  colour of what surfaces mirror, about gray (0.02)
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
@@ -143,7 +144,7 @@ wide.seq narrow.seq --bands 8-14 9.5 -o scene.zarr
 
 calibrate steps.calibrate --at --blackbody --sweep --maker --frames --bands {_FORM} \
     --blackbody-accuracy --blackbody-emissivity --room-temperature --offset-std --gain-std \
-    --pattern-std --correction-output --output
+    --pattern-std --background-ratio-std --correction-output --output
 fit the cameras' response, and each pixel's gain and offset, to a blackbody
 --at 10C a10.tif b10.tif --at 30C a30.tif b30.tif --at 50C a50.tif b50.tif --at 70C a70.tif \
     b70.tif --bands 8-14 9.5 --unit count --clock 30 -o response.zarr --correction-output nuc.zarr

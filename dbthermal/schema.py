@@ -114,6 +114,7 @@ CAUSES: Final[Mapping[str, str]] = MappingProxyType(
         "gain": "the image",
         "blackbody": "the image",
         "room": "the image",
+        "colour": "the image",
     }
 )
 """Causes of a deviation, and what shares an error by each; all but two are the calibration's."""
@@ -240,6 +241,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "blackbody_accuracy": _of("", "K", "error that all blackbody temperatures share"),
             "blackbody_emissivity": _of("", "1", "emissivity of the blackbody"),
             "room_temperature": _of("", "K", "temperature that the blackbody mirrors"),
+            "background_ratio_std": _of("", "1", "colour of what is mirrored, about gray"),
         },
     }
 )

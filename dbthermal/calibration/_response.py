@@ -55,6 +55,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     blackbody_accuracy: float = ACCURACY["blackbody_accuracy"],
     blackbody_emissivity: float = ACCURACY["blackbody_emissivity"],
     room_temperature: float = ACCURACY["room_temperature"],
+    background_ratio_std: float = ACCURACY["background_ratio_std"],
 ) -> xr.Dataset:
     r"""Fit the response of each band to blackbody measurements.
 
@@ -89,7 +90,10 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         middle of the temperatures [1]; drift of its pixels about the level [K].
     blackbody_accuracy, blackbody_emissivity, room_temperature : float
         Error that all temperatures share [K], emissivity, for which the counts are not corrected,
-        and temperature of the room that is mirrored [K]. See `response.ACCURACY` for the defaults;
+        and temperature of the room that is mirrored [K].
+    background_ratio_std : float
+        Colour of what surfaces mirror: changes of the reflection in a band over those in the
+        quietest, about 1, standard deviation [1]. See `response.ACCURACY` for the defaults;
         ``**response.EXACT`` states a simulation without these errors.
 
     Returns
@@ -100,7 +104,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         (band, temperature) [count] and the measured `counts`; `reference_temperature`,
         `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
         `netd` (band) [K]. `offset_std`, `gain_std`, `pattern_std` (band), `blackbody_accuracy`,
-        `blackbody_emissivity` and `room_temperature` as stated. Attribute ``blackbody``, the
+        `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute ``blackbody``, the
         temperatures and their deviations in words, which results and reports repeat.
 
     Warns
@@ -170,6 +174,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         "blackbody_accuracy": blackbody_accuracy,
         "blackbody_emissivity": blackbody_emissivity,
         "room_temperature": room_temperature,
+        "background_ratio_std": background_ratio_std,
     }
     drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
     for name, drift in drifts.items():

@@ -14,15 +14,28 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter, laplace, uniform_filter
+from scipy.ndimage import (
+    gaussian_filter,
+    laplace,
+    maximum_filter,
+    minimum_filter,
+    uniform_filter,
+)
 
 from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
 _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
-_EDGE: Final = 4  # pixels at the image's edge that are left out
+# Side [pixel] of what is one material, its largest ratio over the smallest, and the share of the
+# pixels that must be so.
+_BORDER, _ALIKE, _MOSTLY = 7, 1.05, 0.2
+# Blur of both bands [pixel^2], against noise: it leaves their difference as it is.
+_COMMON: Final = 2.0
+_BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
+_EDGE: Final = 6  # pixels at the image's edge that are left out
 _NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
 _MOVING: Final = 1.0  # variance of the changes over that of noise
 _SURE, _LEAST = 6.0, 0.1  # deviations and size [pixel^2] of a difference that counts
@@ -80,6 +93,9 @@ def equalise(
             point = np.zeros((1 + 8 * int(np.ceil(deviation)),) * 2)
             point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
             factor[band] = np.sqrt(np.sum(_blurred(point, deviation) ** 2))
+            # Noise in the smooth functions stays as it was.
+            share = (1.0 - factor[band] ** 2) * HIGHEST_ORDER / len(film)
+            square += share * (weights[band] * inputs.noise[band]) ** 2
         release()
     if "noise_factor" in corrected:
         factor = factor * corrected["noise_factor"].values
@@ -131,6 +147,11 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     return 0.0
 
 
+def _details(image: Array, deviation: float) -> Array:
+    """An image blurred, less its broad part, in which rapid heat spreads."""
+    return _blurred(image, deviation) - _blurred(image, _BROAD)
+
+
 def _equations(
     inputs: Inputs, result: xr.Dataset, place: int, excess: float, rows: slice
 ) -> tuple[float, float, float]:
@@ -142,14 +163,17 @@ def _equations(
     inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
     used = inner & pixels.reshape(shape) & np.isfinite(ratio)
     ratio = np.where(used, ratio, 1.0)
-    blurs = np.sqrt([max(excess, 0.0), max(-excess, 0.0)])
+    # At the border of a material reflectivities change, not reflections.
+    within = maximum_filter(ratio, _BORDER) < _ALIKE * minimum_filter(ratio, _BORDER)
+    used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
+    blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
     basis = smooth_functions(inputs, frames)
 
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
 
     first, second = (
-        np.stack([_blurred(image, blur) for image in films[order].reshape(-1, *shape)])
+        np.stack([_details(image, blur) for image in films[order].reshape(-1, *shape)])
         for order, blur in zip((0, place), blurs, strict=True)
     )
     rest, reflection = rapid(second / ratio - first), rapid(first)
@@ -157,7 +181,7 @@ def _equations(
     # Noise in the products: that of the first band, in all three.
     rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
     noise = np.stack(
-        [_blurred(image, blurs[0]) for image in rng.standard_normal((_NUMBER, *shape))]
+        [_details(image, blurs[0]) for image in rng.standard_normal((_NUMBER, *shape))]
     )
     bent = laplace(noise, axes=(1, 2))
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2

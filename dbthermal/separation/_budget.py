@@ -11,7 +11,8 @@ about :math:`T_0` keep the image formation if, with the emissivities that are fo
     \delta x = \alpha (x - T_0), \quad \delta y &= \beta (y - T_0), \quad
     \delta e_b = e_b (1 - e_b) (\beta - \alpha)
 
-An error of the blackbody is one of all temperatures; what it mirrors is one of all gains.
+An error of the blackbody is one of all temperatures; what it mirrors is one of all gains; coloured
+reflections are errors of the ratios.
 
 References
 ----------
@@ -33,6 +34,9 @@ from dbthermal.separation._inputs import Inputs
 
 _FILMS: Final = tuple(BUDGETS)[:2]
 _FRAMES: Final = 16  # of a film, at least, that give its root mean square
+# Mean of a reflection [K] below which it is the sky's, whose changes in bands from 8.5 to 12.1 um are
+# 0.62 to 1.48 times those in 8-14 um (spectra of the ARM program, see data_manifest.yaml).
+_COLD, _SKY = 278.15, 0.4
 _SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
 _WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
 
@@ -94,8 +98,13 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     weights = _weights(np.where(np.isfinite(value), value, 1.0), noise, single, reference)
     films = [cut[name].values for name in _FILMS]
     ratio_std = cut["reflection_ratio_std"].values
-    by_ratio = np.where(single, 0.0, (1.0 - value[reference]) * _rms(films[0], films[1]))
-    by_ratio = by_ratio * _combined(weights, np.where(np.isfinite(ratio_std), ratio_std, 0.0))
+    contrast = np.where(single, 0.0, (1.0 - value[reference]) * _rms(films[0], films[1]))
+    by_ratio = contrast * _combined(weights, np.where(np.isfinite(ratio_std), ratio_std, 0.0))
+    # Coloured reflections are taken for another ratio; those colder than a room are of the sky.
+    cold = _mean(films[1]) < _COLD
+    colour = np.nan_to_num(ratio) * np.where(cold & (accuracy.colour > 0.0), _SKY, accuracy.colour)
+    colour[reference] = 0.0
+    by_colour = contrast * _combined(weights, colour)
     for place, (name, film) in enumerate(zip(_FILMS, films, strict=True)):
         parts = {
             "ratio": by_ratio[place],
@@ -104,6 +113,7 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
             "gain": _combined(weights, accuracy.gain)[place] * _rms(film, accuracy.centre),
             "blackbody": np.full(single.shape, accuracy.blackbody),
             "room": accuracy.reflected * _rms(film, accuracy.room),
+            "colour": by_colour[place],
         }
         std = cut[f"{name}_std"].values
         _enter(cut[BUDGETS[name]].values, parts, std, _rms(std))
@@ -152,6 +162,14 @@ def _combined(weights: Array, stds: Array) -> Array:
     """Deviation of independent errors of bands, (band) or (band, y, x), by weights (band, y, x)."""
     stds = stds if stds.ndim > 1 else stds[:, np.newaxis, np.newaxis]
     return np.asarray(np.sqrt(((weights * stds) ** 2).sum(axis=-3)))
+
+
+def _mean(film: Array) -> Array:
+    """Mean (y, x) over time of a film; NaN without any."""
+    values = film[:: max(1, len(film) // _FRAMES)]
+    finite = np.isfinite(values)
+    number = np.where(finite.any(axis=0), finite.sum(axis=0), np.nan)
+    return np.asarray(np.sum(values, axis=0, where=finite, dtype=np.float64) / number)
 
 
 def _rms(film: Array, zero: Array | float = 0.0) -> Array:

@@ -10,7 +10,6 @@ bodies, unlike blurs, a camera that shakes), and by changes that no reflection e
 that the model misses, pixels that drift).
 """
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, Final
@@ -35,7 +34,7 @@ _AROUND: Final = 5  # blocks along a side of a neighbourhood
 # Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
 # noise. In plain scenes the bars stay as they are.
 _SURE, _ROUGH = 3.0, 0.1
-_MUCH: Final = 0.2  # share of the pixels whose remainders have a cause in common; plain: to 0.02
+_MUCH: Final = 0.1  # share of the pixels whose remainders have a cause in common; plain: to 0.05
 _MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
 # Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
 _OCTAVES: Final = float(np.log2(HIGHEST_ORDER))
@@ -48,6 +47,7 @@ class Misfit:
 
     leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
+    single: Array  # the same, by noise of single pixels that is not white (y, x) [K]
 
     @property
     def size(self) -> float:
@@ -75,11 +75,9 @@ class _Blocks:
 _NAMES: Final = tuple(field.name for field in fields(_Blocks))
 
 
-def measure(
-    inputs: Inputs, result: xr.Dataset, apply: Callable[..., Iterable[Any]] = map
-) -> Misfit:
+def measure(inputs: Inputs, result: xr.Dataset) -> Misfit:
     """What a result leaves in the bands of its pixels without a flag, in one reading."""
-    parts = list(apply(partial(_of_rows, inputs, result), inputs.blocks))
+    parts = [_of_rows(inputs, result, rows) for rows in inputs.blocks]
     blocks = _Blocks(
         *(np.concatenate([getattr(part, name) for part in parts], axis=-2) for name in _NAMES)
     )
@@ -90,7 +88,7 @@ def measure(
         [start + np.arange(size) // _BLOCK for start, size in zip(first, sizes, strict=True)]
     )
     place = np.ix_(rows, np.arange(result.sizes["x"]) // _BLOCK)
-    return Misfit(_leak(blocks)[place], _change(blocks)[place])
+    return Misfit(_leak(blocks)[place], _change(blocks)[place], _single(blocks)[place])
 
 
 def _around(blocks: _Blocks, values: Array) -> Array:
@@ -110,16 +108,17 @@ def _number(blocks: _Blocks) -> Array:
 
 def _change(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by changes that no reflection explains."""
-    # What blocks share: means in time, an octave beyond the smooth functions.
     variance, noise = _around(blocks, blocks.rough)
     freedom = _number(blocks) * HIGHEST_ORDER
     more = variance - noise
-    shared = np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0)
-    # What is each pixel's, as 1/f noise, of which smooth functions hold all octaves.
+    return np.sqrt(np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0))
+
+
+def _single(blocks: _Blocks) -> Array:
+    """Deviation (row, column) [K] by noise of single pixels, as 1/f noise, alike in all octaves."""
     variance, noise = _around(blocks, blocks.single)
     more = variance - noise
-    single = np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0)
-    return np.asarray(np.sqrt(np.maximum(shared, single)))
+    return np.sqrt(np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0))
 
 
 def _leak(blocks: _Blocks) -> Array:
@@ -196,6 +195,9 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
         deviations = result["object_temperature_std"].values[:, rows].reshape(len(frames), -1)
         held[divided] = np.nanmean(np.square(deviations[:, divided]), axis=0)
     held = np.bincount(place[pixels], held[pixels], number.size) / filled
+    if np.any(inputs.capture.get("noise_factor", np.ones(1)) < 1.0):  # neighbours share noise
+        jumps = np.diff(rest, 2, axis=0)
+        noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
     events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
@@ -384,7 +386,8 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
     """Widen the deviations of a result by what the model leaves, in place."""
     first = inputs.bands[0]
     emissivity, ratio = result["emissivity"].values[first], result["reflection_ratio"].values
-    sound = (result["status"].values == 0) & ((misfit.leak > 0.0) | (misfit.change > 0.0))
+    everything = np.maximum(misfit.change, misfit.single)
+    sound = (result["status"].values == 0) & ((misfit.leak > 0.0) | (everything > 0.0))
     # Of the ratios, whose error makes a leak, and of the emissivities that follow from them.
     ratios = np.where(sound, misfit.leak * (1.0 - ratio), 0.0)
     emissivities = (1.0 - emissivity) * ratios
@@ -399,7 +402,7 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
         columns = np.flatnonzero(sound[row])
         chosen = [film[:, row, columns].astype(np.float64) for film in films]
         leak, change, share = (
-            values[row, columns] for values in (misfit.leak, misfit.change, emissivity)
+            values[row, columns] for values in (misfit.leak, everything, emissivity)
         )
         slope = curve.slope(chosen[0].mean(axis=0))
         contrast = (1.0 - share) * (chosen[0] - chosen[2])

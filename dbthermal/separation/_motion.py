@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import shift as shifted
 
-from dbthermal._arrays import Array, empty, release
+from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
 
@@ -24,6 +24,7 @@ _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the band
 # Mean square of a motion over its variance, from which it is undone: of 10^5 frames without motion
 # none has a mean over 250 of more than 1.5.
 _SURE: Final = 3.0
+_SLOW: Final = 3  # smooth functions in which the image's gradients change
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
 
 
@@ -55,19 +56,21 @@ def stabilise(
     if not misfit.common(result["status"].values == 0):
         return None
     count = len(inputs.bands)
-    form, forces = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, corrected.sizes["time"]))
+    size, frames = 2 * count, corrected.sizes["time"]
+    form, forces = np.zeros((frames, size, size)), np.zeros((frames, size))
     for rows in inputs.blocks:
         _add_equations(inputs, result, rows, form, forces)
     # Is there any?
     level, axes = np.linalg.eigh(form)
-    seen = level > _SEEN * level.max()
-    square = np.mean((axes[:, seen].T @ forces) ** 2, axis=1) / level[seen]
+    pull = np.einsum("tba,tb->ta", axes, forces)
+    seen = level > _SEEN * level[:, -1:]
+    square = np.sum(quotient(pull**2, level * seen, 0.0), axis=0) / np.maximum(seen.sum(axis=0), 1)
     if not np.any(square > _SURE):
         return None
     prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
     precision = np.kron(np.linalg.inv(prior), np.eye(2))
-    steps = np.linalg.solve(form + precision, forces).reshape(count, 2, -1)
-    steps = np.swapaxes(steps[np.argsort(inputs.bands)], 1, 2)
+    steps = np.linalg.solve(form + precision, forces[..., np.newaxis]).reshape(-1, count, 2)
+    steps = np.swapaxes(steps, 0, 1)[np.argsort(inputs.bands)]
     motion = np.asarray(steps if before is None else steps + before)
     counts = empty(corrected["counts"].shape, np.float32)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
@@ -80,18 +83,25 @@ def stabilise(
 def _add_equations(
     inputs: Inputs, result: xr.Dataset, rows: slice, form: Array, forces: Array
 ) -> None:
-    """Add the normal equations of all bands' motion over some rows, in place."""
+    """Add the normal equations of all bands' motion over some rows, by frame, in place."""
     signals, films, frames, pixels, gain = reflected(inputs, result, rows)
     weights = object_weights(inputs, result)[inputs.bands][:, rows].reshape(len(signals), -1)
     used = pixels & (weights[0] != 0.0)
-    images = signals.mean(axis=1).reshape(len(signals), -1, result.sizes["x"])
-    slopes = np.stack(np.gradient(images, axis=(1, 2)), axis=1).reshape(len(signals), 2, -1)
-    slopes = (weights[:, np.newaxis] * slopes)[..., used].reshape(2 * len(signals), -1)
+    basis = smooth_functions(inputs, frames)
+    # Gradients of the image, which changes slowly.
+    shape = (_SLOW, *films.shape[:1], -1, result.sizes["x"])
+    images = np.einsum("tj,btp->jbp", basis[:, :_SLOW], signals).reshape(shape)
+    slopes = np.stack(np.gradient(images, axis=(2, 3)), axis=2)
+    slopes = slopes.reshape(_SLOW, len(signals), 2, -1) * weights[:, np.newaxis]
+    slopes = slopes[..., used].reshape(_SLOW * 2 * len(signals), -1)
     noise = inputs.noise[inputs.bands, np.newaxis] * gain
     weighted = slopes / np.sum((weights * noise)[:, used] ** 2, axis=0)
     rest = np.einsum("bp,btp->tp", weights[:, used], films[..., used])
-    basis = smooth_functions(inputs, frames)
     pull = weighted @ rest.T
-    forces[:, frames] += pull - pull @ basis @ basis.T
-    form += weighted @ slopes.T
+    pull -= pull @ basis @ basis.T
+    # In each frame the gradients are sums over these functions of time.
+    course = basis[:, :_SLOW]
+    forces[frames] += np.einsum("tj,jbt->tb", course, pull.reshape(_SLOW, -1, len(course)))
+    products = (weighted @ slopes.T).reshape(_SLOW, 2 * len(signals), _SLOW, -1)
+    form[frames] += np.einsum("tj,tk,jbkc->tbc", course, course, products, optimize=True)
     release()

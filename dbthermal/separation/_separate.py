@@ -41,7 +41,7 @@ _UNEXPLAINED: Final = (
     "small."
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
-_ROUNDS, _BETTER = 2, 0.7
+_ROUNDS, _BETTER = 3, 0.7
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
 
 
@@ -149,8 +149,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if alike is not None:
         retry = separated_again(alike.capture, None)
         if retry[1].size < _BETTER * misfit.size:
+            single = misfit.single  # noise that is not white: a blur takes only rapid noise
             corrected, (parts, misfit) = alike.capture, retry
-            misfit = replace(misfit, change=np.hypot(misfit.change, alike.detail))
+            change = np.hypot(misfit.change, alike.detail)
+            misfit = replace(misfit, change=change, single=single)
             sentences.append(alike.sentence)
     result, materials = parts.result, parts.materials
     if result is alone:  # which is the caller's

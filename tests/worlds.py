@@ -1,0 +1,136 @@
+"""Scenes as the world has them: optics, people, cameras and noise that the paper does not assume.
+
+A maker of its own, beside the library's: films by Gaussian optics and splines, and people as soft
+upright shapes. Glass is warmed up, and on the right coated, before five or six people.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import gaussian_filter, shift
+
+from dbthermal import response as responses
+from dbthermal import schema, simulation
+
+Array = np.ndarray[Any, np.dtype[Any]]
+Pair = tuple[float, float]
+
+RIG: Final = simulation.Rig()
+RESPONSE: Final = RIG.response()
+CURVES: Final = responses.curves(RESPONSE, list(RIG.bands))
+SHAPE, MARGIN, FRAMES, RATE = (48, 64), 6, 280, 10.0
+ROOM: Final = 295.0  # K
+
+
+@dataclass(frozen=True)
+class World:
+    """What a scene has beside the paper's assumptions."""
+
+    blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
+    roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
+    shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
+    detail: float = 0.0  # of the emissivity [1]
+    fabric: Pair | None = None  # emissivities of every second person [1]
+    flicker: float = 0.0  # corner frequency of 1/f noise of each pixel [Hz]
+    lamp: float = 0.0  # amplitude of a spot that is heated at 0.4 Hz [K]
+    behind: Pair | None = None  # transmittances, with other people behind [1]
+    breath: float = 0.0  # motion of the object at 0.25 Hz [pixel]
+    surface: tuple[Pair, Pair] = ((0.86, 0.72), (0.93, 0.82))  # emissivities, left and right
+
+
+def people(rng: np.random.Generator, number: int) -> Iterator[tuple[Array, float]]:
+    """Yield the share (time, y, x) of each pixel that shows a person, and its warmth [K]."""
+    time = np.arange(FRAMES) / RATE
+    y, x = np.indices([size + 2 * MARGIN for size in SHAPE])
+    for _ in range(number):
+        speed = rng.uniform(8.0, 20.0) * rng.choice([-1.0, 1.0])
+        center = 0.5 * x.shape[1] + speed * (time - rng.uniform(0.03, 0.92) * time[-1])
+        center += 1.5 * np.sin(np.pi * time + rng.uniform(0.0, 6.0))
+        half, top = rng.uniform(4.0, 8.0), rng.uniform(-0.1, 0.4) * len(y)
+        beside = np.abs(x - center[:, np.newaxis, np.newaxis]) - half
+        shape = 1.0 / (1.0 + np.exp(beside / 0.7)) / (1.0 + np.exp((top - y) / 0.7))
+        yield shape, rng.uniform(5.0, 10.0)
+
+
+def paths(rng: np.random.Generator, sizes: Pair) -> Array:
+    """Motion (camera, time, axis) [pixel]; cameras of one size move together."""
+    memory = np.exp(-1.0 / RATE / 0.15)
+    steps = rng.normal(0.0, 1.0, (2, FRAMES, 2))
+    for frame in range(1, FRAMES):
+        steps[:, frame] = memory * steps[:, frame - 1] + np.sqrt(1 - memory**2) * steps[:, frame]
+    steps[1] = steps[0] if sizes[0] == sizes[1] else steps[1]
+    return np.asarray(steps * np.reshape(sizes, (2, 1, 1)))
+
+
+def moved(image: Array, step: Array) -> Array:
+    """Image at a place [pixel], between its pixels by cubic splines."""
+    return np.asarray(shift(image, step, order=3, mode="nearest")) if np.any(step) else image
+
+
+def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
+    """Capture of a world, and the object's temperature (time, y, x) [K]."""
+    rng = np.random.default_rng(seed)
+    size = tuple(side + 2 * MARGIN for side in SHAPE)
+    y, x = np.indices(size)
+    time = np.arange(FRAMES) / RATE
+    # The object: two materials, warmed unevenly.
+    coated = x > 0.55 * size[1] + 3.0 * np.sin(y / 9.0)
+    texture = gaussian_filter(rng.standard_normal(size), 1.2)
+    texture *= world.detail / texture.std()
+    emissivity = [
+        np.where(coated, right, left) + (1.0 + 0.3 * band) * texture
+        for band, (left, right) in enumerate(zip(*world.surface, strict=True))
+    ]
+    warmth = gaussian_filter(rng.standard_normal(size), 9.0)
+    warmth = 5.0 + 20.0 * (warmth - warmth.min()) / np.ptp(warmth)
+    rise = 1.0 - np.exp(-2.0 * time / time[-1]) + 0.08 * np.sin(5.0 * time / time[-1])
+    truth = ROOM + 1.5 + rise[:, np.newaxis, np.newaxis] * warmth
+    spot = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) / 12.0)
+    truth += world.lamp * np.sin(0.8 * np.pi * time)[:, np.newaxis, np.newaxis] * spot
+    # What it mirrors, and what is behind it.
+    before, beyond = list(people(rng, 6)), list(people(rng, 4))
+    motion = paths(rng, world.shake)
+    breath = world.breath * np.outer(np.sin(0.5 * np.pi * time), [1.0, 0.3])
+    film = np.empty((2, FRAMES, *SHAPE), dtype=np.float32)
+    inside = slice(MARGIN, -MARGIN)
+    for band, curve in enumerate(CURVES):
+        room = curve.counts(ROOM)
+        views = []
+        for group, fabric in ((before, world.fabric), (beyond, None)):
+            view = np.full(truth.shape, room)
+            for number, (share, warmer) in enumerate(group):
+                skin = fabric[band] if fabric is not None and number % 2 == 0 else 1.0
+                view += share * (room + skin * (curve.counts(ROOM + warmer) - room) - view)
+            views.append(view)
+        clear = world.behind[band] if world.behind is not None else 0.0
+        noise = noise_of(rng, world.flicker) * float(RESPONSE["noise"][band])
+        for frame in range(FRAMES):
+            share, warm = (
+                moved(image, breath[frame]) for image in (emissivity[band], truth[frame])
+            )
+            front = gaussian_filter(views[0][frame], world.roughness[band])
+            image = share * curve.counts(warm) + (1.0 - share - clear) * front
+            image = gaussian_filter(image + clear * views[1][frame], world.blur[band])
+            film[band, frame] = moved(image, motion[band, frame])[inside, inside] + noise[frame]
+    coordinates = {
+        "band": list(RIG.bands),
+        "time": ("time", time, {"units": "s"}),
+        "y": np.arange(SHAPE[0]),
+        "x": np.arange(SHAPE[1]),
+    }
+    capture = xr.Dataset(schema.variables("corrected", {"counts": film}), coordinates)
+    return capture.assign_attrs(origin="simulated"), truth[:, inside, inside]
+
+
+def noise_of(rng: np.random.Generator, corner: float) -> Array:
+    """White noise (time, y, x) of 1, and 1/f noise that is as strong at a frequency [Hz]."""
+    white = rng.standard_normal((FRAMES, *SHAPE))
+    if corner == 0.0:
+        return white
+    frequency = np.fft.rfftfreq(FRAMES, 1.0 / RATE)[:, np.newaxis, np.newaxis]
+    spectrum = np.fft.rfft(rng.standard_normal(white.shape), axis=0)
+    spectrum *= np.sqrt(np.where(frequency > 0.0, corner / np.maximum(frequency, 1e-9), 0.0))
+    return white + np.fft.irfft(spectrum, FRAMES, axis=0)
