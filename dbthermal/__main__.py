@@ -6,6 +6,7 @@ standard error.
 """
 
 import argparse
+import difflib
 import json
 import os
 import re
@@ -16,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
 from dbthermal._cli import is_source, leaves
@@ -69,78 +70,99 @@ _KINDS: Final[dict[str, Any]] = {
     "point": _kelvin_or_path,
 }
 _ARGUMENTS: Final = """
-files path+             files of one camera, then a '+' and the other's; or a store
-session path            YAML file, see dbthermal.instruments.session
-folder path             where the recordings go
-capture path            store of a capture
-correction path?        store of gain and offset
---corrected-by-camera flag  in place of it: each camera corrects gain and offset itself
-response path           store of the cameras' response
-result path             store of a result
-shown path*             its capture, and the cameras' response, to be shown beside it
-materials text*         as listed by 'data'; all by default
---output path!          what is made: store *.zarr, or of the kind that the examples below have
---overwrite flag        replace the output
---dry-run flag          only say what would be read, with sizes, and written
---json flag             print the summary as JSON
---traceback flag        show where an error was raised
---bands text2           names of both bands: 8-14 9.5
---unit text             of the numbers in TIFF, raw files and arrays: must be 'count'
---clock number          frame rate [Hz]; FLIR's files have their own times
---shape whole2          rows and columns of raw files [pixel]
---byte-order little|big of the numbers in raw files
---header whole=0        before the first frame of raw files [byte]
---frame-header whole=0  before each frame of raw files [byte]
---simulated flag        no camera has recorded it: all that is made of it says so
---variable text         name of an array in a file of several, or in a result
---offset number         how much later the second camera began, or was exposed [s]; else found
---simulate flag         use emulated devices
---at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
---blackbody path        in place of --at: a store of all temperatures
---sweep text2           in place of --at: folder and session of a sweep by 'record'
---maker path            in place of --at: a capture of FLIR's files, for the maker's constants
---frames whole=64       at most, of each temperature
---correction-output path   store of gain and offset, where the blackbody fills the view
---no-shutter flag       no camera has a shutter
---time-constant number  thermal, of the pixels [s]
---register none|translation|affine|homography   between the views (homography); none: on one grid
---search whole=5        largest delay that is sought, either way [frame]
---reference text        band whose frames are left as they are in time
---correction path       store of gain and offset: all steps of a raw capture, by rows
---method text           one step alone, by rows: subspace, calibrated, dbvt, apparent
---emissivity number+    of each band, for the method 'calibrated'
---surroundings kelvin   temperature of what is reflected, as 22C
---prior text            material of pixels that cannot be measured, as listed by 'data'
---workers whole=2       number of threads
---noise number!         of the camera without a filter [K]
---seconds number=35     length of the capture
---rate number=10        frame rate [Hz]
---span number=25        rise of the object's temperature [K]
---amplitude number=3    height of the reflected changes [K]
---pixel whole2&         y x of a curve; repeated
---region whole4&        y0 y1 x0 x1 of a curve; repeated
+files FILE path+            files of one camera, then a '+' and the other's; or a store
+session FILE path           YAML file, see dbthermal.instruments.session
+folder FOLDER path          new folder for what is written
+capture CAPTURE path        store of a capture
+correction CORRECTION path?    store of gain and offset
+--corrected-by-camera - flag   in place of it: each camera corrects gain and offset itself
+response RESPONSE path       store of the cameras' response
+result RESULT path         store of a result
+shown STORE path*           its capture, and the cameras' response, to be shown beside it
+materials NAME text*        as listed by 'data'; all by default
+--output OUTPUT path!       new {output}
+--overwrite - flag          replace the output
+--dry-run - flag            only say what would be read, with sizes, and written
+--json - flag               print the summary as JSON
+--traceback - flag          show where an error was raised
+--bands NAME text+          names of both bands: 8-14 9.5
+--unit count text           of the numbers in TIFF, raw files and arrays: 'count' if not stated
+--clock HZ number+          frame rate, for each camera if they differ: 12 10; FLIR tells times
+--shape N whole2            rows and columns of raw files [pixel]
+--byte-order - little|big   of the numbers in raw files
+--header N whole=0          before the first frame of raw files [byte]
+--frame-header N whole=0    before each frame of raw files [byte]
+--simulated - flag          no camera has recorded it: all that is made of it says so
+--variable NAME text        name of an array in a file of several, or in a result
+--offset SECONDS number     start of the second camera after the first's; else by dates or images
+--simulate - flag           use emulated devices
+--side-by-side - flag       cameras side by side, in place of one window for both
+--at TEMPERATURE,FILE point+& of a blackbody, as 20C or 293.15K, and its files; repeated
+--blackbody STORE path      in place of --at: a store of all temperatures
+--sweep FOLDER,SESSION text2   in place of --at: folder and session of a sweep by 'record'
+--maker STORE path          in place of --at: a capture of FLIR's files, for the maker's constants
+--frames N whole+           first N frames alone, or from A up to B: A B; 64 of each temperature
+--every N whole=1           one frame of so many
+--rows Y0,Y1 whole2         rows of the image from Y0 up to Y1 alone
+--correction-output STORE path  store of gain and offset, where the blackbody fills the view
+--no-shutter - flag         no camera has a shutter
+--time-constant SECONDS number  thermal, of the pixels
+--register - none|translation|affine|homography  between the views (homography); none: one grid
+--search N whole=5          largest delay that is sought, either way [frame]
+--reference NAME text       band whose frames are left as they are in time
+--correction STORE path     store of gain and offset: all steps of a raw capture, by rows
+--method NAME text          one step alone, by rows: {methods}
+--emissivity E number+      of each band, for the method 'calibrated'
+--surroundings TEMPERATURE kelvin  temperature of what is reflected, as 22C
+--prior NAME text           material of pixels that cannot be measured, as listed by 'data'
+--workers N whole=2         number of threads
+--title TEXT text           heading of the report
+--author TEXT text          name below it
+--noise KELVIN number!      of the camera without a filter
+--seconds S number=35       length of the capture
+--rate HZ number=10         frame rate
+--span KELVIN number=25     rise of the object's temperature
+--amplitude KELVIN number=3 height of the reflected changes
+--pixel Y,X whole2&         row and column of a curve; repeated
+--region Y0,Y1,X0,X1 whole4&  rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
 """
-"""Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
+"""Argument, its value, kind and help: ``!`` is required, ``&`` repeated, ``=`` the default."""
+
+_METHODS: Final = (
+    "subspace (what the default call begins with), calibrated (emissivities as stated), dbvt (the "
+    "paper's optimisation), apparent (temperature as of a black body)"
+)
+_OUTPUTS: Final = {
+    "export": "file *.csv, *.tif, *.nc, *.png, *.pdf or *.svg",
+    "explore": "notebook *.ipynb",
+    "report": "page *.html",
+}
+"""Command -> kind of its output, if that is no store."""
 
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"
 _COMMANDS: Final = f"""
-info files.info files {_FORM}
-say what a store or recording is: sizes, clock, bands, provenance, shares of the status
-capture.zarr
-video.seq
-a.tif --unit count --clock 30
+demo demo.demo folder --side-by-side
+write the files of a simulated rig, to try everything without cameras, and say what to do next
+try-it
+try-it --side-by-side
 
-import files.make_capture files --bands --offset {_FORM} --output
+info files.info files {_FORM}
+say what a store or recording is, and of a result how hot, how sure and how much of it
+result.zarr
+video.seq
+a.tif --clock 30
+
+import files.make_capture files --bands --offset {_FORM} --frames --every --rows --output
 make a capture of two cameras' files: FLIR, TIFF, raw, NumPy, HDF5, NetCDF, zarr
-a.tif b.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
-a*.tif + b*.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
-wide.seq narrow.seq --bands 8-14 9.5 -o scene.zarr
+a.tif b.tif --bands 8-14 9.5 --clock 30 --offset 0 -o scene.zarr
+a*.tif + b*.tif --bands 8-14 9.5 --clock 12 10 --offset 0 -o scene.zarr
+wide.seq narrow.seq --bands 8-14 9.5 --frames 0 3000 --every 3 -o scene.zarr
 
 calibrate steps.calibrate --at --blackbody --sweep --maker --frames --bands {_FORM} \
     --correction-output --output
 fit the cameras' response, and each pixel's gain and offset, to a blackbody
 --at 10C a10.tif b10.tif --at 30C a30.tif b30.tif --at 50C a50.tif b50.tif --at 70C a70.tif \
-    b70.tif --bands 8-14 9.5 --unit count --clock 30 -o response.zarr --correction-output nuc.zarr
+    b70.tif --bands 8-14 9.5 --clock 30 -o response.zarr --correction-output nuc.zarr
 --sweep recordings response -o response.zarr
 --maker scene.zarr -o response.zarr
 
@@ -185,7 +207,7 @@ explore export.explore result shown --output
 make a notebook to look around in a result or a capture, for JupyterLab
 result.zarr aligned.zarr response.zarr -o look.ipynb
 
-report export.report result shown --region --output
+report export.report result shown --region --title --author --output
 write a report on a result, one HTML file that needs no network
 result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 
@@ -200,15 +222,28 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 """Command, its function and arguments; its summary; examples."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser that asks after the name that was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the message, and exit."""
+        options = re.findall(r"(?m)^--[\w-]+", _ARGUMENTS)
+        for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
+            listed = ", ".join(f"'{option}'" for option in options)
+            message += _suggestion(f"'{wrong}': choose from {listed}")
+        super().error(message + _suggestion(message))
+
+
 def _parser() -> argparse.ArgumentParser:
     """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
     # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
+    order = "In this order: demo (or import), calibrate, correct, align, separate, report, explore."
+    parser = _Parser("dbthermal", description=f"{__doc__}\n{order}", **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
-    for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
+    table = {line.split()[0]: line.split(maxsplit=3)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
+    for block in re.sub(" {2,}", " ", _COMMANDS).strip().split("\n\n"):
         # A block of the table: the command with its arguments, its summary, its examples.
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
@@ -225,12 +260,15 @@ def _parser() -> argparse.ArgumentParser:
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []
-            command.add_argument(*short, argument, **_options(*table[argument]))
+            value, kind, text = table[argument]
+            output = _OUTPUTS.get(name, "store *.zarr")
+            text = text.format(output=output, methods=_METHODS)
+            command.add_argument(*short, argument, **_options(value, kind, text))
     return parser
 
 
-def _options(kind: str, text: str) -> dict[str, Any]:
-    """Options of argparse for a kind and a help; see `_ARGUMENTS`."""
+def _options(value: str, kind: str, text: str) -> dict[str, Any]:
+    """Options of argparse for a value, a kind and a help; see `_ARGUMENTS`."""
     if kind == "flag":
         return {"action": "store_true", "help": text}
     if "|" in kind:
@@ -239,6 +277,9 @@ def _options(kind: str, text: str) -> dict[str, Any]:
     options: dict[str, Any] = {"type": _KINDS[name], "help": text}
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
+    values = tuple(value.split(","))
+    size = options["nargs"] if isinstance(number, str) and number.isdigit() else len(values)
+    options["metavar"] = values if len(values) > 1 else values * size if size > 1 else value
     if "!" in kind:
         options["required"] = True
     if "&" in kind:
@@ -267,6 +308,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, reason = 1, _reason(error, options.command)
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
+        reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
+        reason += _suggestion(reason)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
@@ -283,6 +326,18 @@ def _reason(error: Exception, command: str) -> str:
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
         return message
     return f"{type(error).__name__}: {message} (--traceback shows where)"
+
+
+def _suggestion(reason: str) -> str:
+    """Question after the name that is most like an unknown one, of those that a message lists."""
+    unknown = re.search(r"'([^']+)'.*(?:Must be one of|choose from)\s(.*)", reason)
+    if unknown is None or "Did you mean" in reason:
+        return ""
+    wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))
+    names = names or unknown.group(2).strip(" .)").split(", ")
+    words = [name for name in names if wrong.lower() in name.lower()]
+    like = [*difflib.get_close_matches(wrong, names, 1), *words]
+    return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
 
 
 def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -317,7 +372,8 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
     """Paths that a command reads, which must exist, and writes, which must be free."""
     arguments = vars(options).items()
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
-    targets = [value for name, value in arguments if name.endswith("output") and value]
+    written = ("output", "folder")
+    targets = [value for name, value in arguments if name.endswith(written) and value]
     for path in sources:
         if not path.exists():
             raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
@@ -328,7 +384,7 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
             label = f"Invalid output '{path}': it is another one, or it is read"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
-        if path.exists() and not options.overwrite:
+        if path.exists() and not getattr(options, "overwrite", path.is_dir()):
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     return sources, targets
 
@@ -357,9 +413,18 @@ def _plain(value: Any) -> Any:
 
 
 def _lines(summary: Any, indent: str = "") -> Iterator[str]:
-    """Summary as text: a line for each entry that is not empty, numbers in one line."""
+    """Summary as text: a line for each entry that is not empty, numbers in one line.
+
+    Sentences (`answer`) and commands (`next`) have a line each; `numbers` repeat those of the
+    sentences, for programs.
+    """
     for key, value in summary.items():
+        if key in {"answer", "next"}:
+            yield from (f"{indent}{line}" for line in value)
+            continue
         entries = value if isinstance(value, dict) else dict[str, Any]()
+        if key == "numbers":
+            continue
         if any(isinstance(entry, dict | list | str) for entry in entries.values()):
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")

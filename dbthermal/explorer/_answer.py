@@ -1,0 +1,162 @@
+"""Answer of a result in a few sentences: how hot, how sure, how much of it, which materials."""
+
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from scipy.constants import zero_Celsius
+
+from dbthermal import emissivity, schema
+from dbthermal._arrays import Array, Mask
+from dbthermal.schema import Status
+from dbthermal.separation._doubts import hardly_measured
+
+SPREAD: Final = 0.02  # of emissivities of samples of one material
+_ALIKE: Final = 3.0  # standard deviations up to which a material of the table is named
+_VAGUE: Final = 0.15  # deviation from which most is alike: the demonstration's tape has 0.18
+_RANGE: Final = (1.0, 99.0)  # percentiles of the temperatures that are said
+_ROWS, _TIMES = 64, 60  # of the image and the film that are looked at, at most
+_COMMON: Final = 0.02  # share of the pixels from which a material is listed
+_DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
+
+
+def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[list[str], Any]:
+    """Sentences on a result for whoever asks how hot it is and how sure, and their numbers.
+
+    Parameters
+    ----------
+    result : Dataset
+        Stage `separated`, also a lazy one: some rows and frames of its films are read.
+    materials : Dataset, optional
+        Stage `emissivity_table`; `emissivity.embedded_table` if not given.
+
+    Returns
+    -------
+    list of str, dict
+        Sentences, and `object_temperature_degC` (two), `object_temperature_std_K`, by cause,
+        `measured` and `completed` as shares of the pixels, and the list `materials`.
+    """
+    table = emissivity.embedded_table() if materials is None else materials
+    height = result.sizes["y"]
+    status = result["status"].values if "status" in result else None
+    measured = np.ones((height, result.sizes["x"]), bool) if status is None else status == 0
+    numbers: dict[str, Any] = {"measured": float(measured.mean())}
+    # Temperatures of measured pixels, or of all where none is.
+    limits = ((height, _ROWS), (result.sizes["time"], _TIMES))
+    rows, times = (slice(0, None, -(-size // most)) for size, most in limits)
+    part = result.isel(time=times, y=rows)
+    film = part["object_temperature"].values
+    valid = np.isfinite(film) & (measured[rows] if measured[rows].any() else True)
+    sentences = list[str]()
+    if valid.any():
+        low, high = np.percentile(film[valid], _RANGE) - zero_Celsius
+        deviations = _deviations(part, valid)
+        numbers |= {"object_temperature_degC": [float(low), float(high)]}
+        numbers |= {"object_temperature_std_K": deviations}
+        bars = " and ".join(f"+- {value:.2g} K ({cause})" for cause, value in deviations.items())
+        name = "Object" if measured.any() else "Object, completed and not measured,"
+        typical = f"typically {bars}" if bars else "without a standard deviation"
+        sentences.append(f"{name} from {low:.1f} to {high:.1f} degC, {typical}.")
+    else:
+        sentences.append("No object temperature at any pixel.")
+    # Shares of the pixels.
+    shares = f"Measured: {measured.mean():.0%} of the pixels"
+    if status is not None:
+        completed = (status & int(schema.COMPLETED)) != 0
+        numbers["completed"] = float(completed.mean())
+        shares += f"; completed from what else is known: {completed.mean():.0%}"
+    sentences.append(f"{shares}.")
+    # Materials, and what to watch out for.
+    numbers["materials"] = listed = by_material(result, measured, table)
+    for entry in listed:
+        pairs = zip(entry["emissivity"].items(), entry["emissivity_std"].values(), strict=True)
+        values = ", ".join(f"{value:.3f} +- {std:.3f} ({band})" for (band, value), std in pairs)
+        name = (
+            "like " + " or ".join(entry["nearest"]) if entry["nearest"] else "like many materials"
+        )
+        sentences.append(f"Emissivity at {entry['pixels']} pixels, {name}: {values}.")
+    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
+    if status is not None:
+        flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
+        doubts += [
+            f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
+            for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])
+            if share >= _DOUBTED and not bit & schema.COMPLETED
+        ]
+    return sentences + [f"Watch out: {doubt}" for doubt in dict.fromkeys(doubts)], numbers
+
+
+def _deviations(part: xr.Dataset, valid: Mask) -> dict[str, float]:
+    """Typical deviation of the object temperature [K] by cause, as far as the result has them."""
+    causes = {"noise": part.get("object_temperature_std")}
+    budget = part.get("uncertainty")
+    if budget is not None and "cause" in budget.dims:
+        causes |= {str(name): budget.sel(cause=name) for name in budget["cause"].values}
+    typical = dict[str, float]()
+    for cause, array in causes.items():
+        if array is not None:
+            values = np.broadcast_to(array.values, valid.shape)[valid]
+            values = values[np.isfinite(values)]
+            typical |= {cause: float(np.median(values))} if values.size else {}
+    return typical
+
+
+def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[dict[str, Any]]:
+    """Emissivities of the measured pixels, by the nearest material of a table.
+
+    Pixels that the separation took for one material (`material`) are judged by their median. The
+    commonest first; ``nearest`` is empty where many materials of the table are alike.
+    """
+    if not {"emissivity", "emissivity_std"} <= {*result.data_vars}:
+        return []
+    bands = [str(band) for band in result["band"].values]
+    values, stds = (
+        result[name].transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
+        for name in ("emissivity", "emissivity_std")
+    )
+    finite = np.isfinite(values + stds).all(axis=1)
+    values, stds = values[finite], stds[finite]
+    vague = stds.max(axis=1, initial=0.0) >= _VAGUE
+    # Medians of each label, which tell materials apart that single pixels do not.
+    judged, deviations = values.copy(), stds.copy()
+    labels = result["material"].values[measured][finite] if "material" in result else []
+    for label in set(labels) - {-1}:
+        judged[labels == label] = np.median(values[labels == label], axis=0)
+        deviations[labels == label] = 0.0
+    # Groups of pixels alike the commonest nearest material, then of the rest.
+    groups, free = [vague], ~vague
+    if {*bands} <= {*table["band"].values}:
+        distances = distance(bands, judged, deviations, table)
+        first, free = distances.argmin(axis=1), free & (distances.min(axis=1) < _ALIKE)
+        while free.sum() >= max(1, _COMMON * len(values)):
+            commonest = np.bincount(first[free]).argmax()
+            groups.append(free & (distances[:, commonest] < _ALIKE))
+            free = free & ~groups[-1]
+    # Medians of each, and the materials within a deviation.
+    listed = []
+    for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
+        middle, std = (np.median(array[pixels], axis=0) for array in (values, stds))
+        entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
+        entry |= {"emissivity": dict(zip(bands, middle.tolist(), strict=True))}
+        entry |= {"emissivity_std": dict(zip(bands, std.tolist(), strict=True))}
+        if pixels is not groups[0]:
+            entry["nearest"] = [name for name, far in nearest(bands, middle, std, table) if far < 1]
+        listed.append(entry)
+    return sorted(listed, key=lambda entry: -entry["pixels"])
+
+
+def nearest(
+    bands: list[str], values: Array, stds: Array, table: xr.Dataset, number: int = 3
+) -> list[tuple[str, float]]:
+    """Materials of a table that are nearest to emissivities (band), and how far they are."""
+    if not {*bands} <= {*table["band"].values} or not np.isfinite(values + stds).all():
+        return []
+    far, names = distance(bands, values, stds, table), table["material"].values
+    return [(str(names[at]), float(far[at])) for at in np.argsort(far)[:number]]
+
+
+def distance(bands: list[str], values: Array, stds: Array, table: xr.Dataset) -> Array:
+    """Distance (..., material) of emissivities (..., band), root mean square in deviations [1]."""
+    library = table["emissivity"].sel(band=bands).transpose("material", "band").values
+    ratio = (library - values[..., None, :]) / np.hypot(stds, SPREAD)[..., None, :]
+    return np.asarray(np.sqrt(np.mean(ratio**2, axis=-1)))
