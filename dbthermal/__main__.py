@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves
+from dbthermal._cli import is_source, leaves, progress
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -348,19 +348,27 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
-    _command("unused", "refuse")(options, arguments)
-    sources, targets = _sources_and_targets(options)
-    if options.dry_run:
-        summary = _command("steps", "foreseen")(options, sources, targets)
-    else:
-        start = time.monotonic()
-        summary = _command(module, function)(options)
-        if not sys.stderr.isatty():  # where no bar was shown
-            print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    with progress.shown(options.command):
+        summary = _summary(module, function, options, arguments)
     # The summary, for programs or for people.
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
+
+
+def _summary(
+    module: str, function: str, options: argparse.Namespace, arguments: Sequence[str]
+) -> Any:
+    """Summary of a command that is carried out, or only foreseen."""
+    _command("unused", "refuse")(options, arguments)
+    sources, targets = _sources_and_targets(options)
+    if options.dry_run:
+        return _command("steps", "foreseen")(options, sources, targets)
+    start = time.monotonic()
+    summary = _command(module, function)(options)
+    if not sys.stderr.isatty():  # where nothing was shown
+        print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    return summary
 
 
 def _command(module: str, function: str) -> Any:

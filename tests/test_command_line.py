@@ -130,6 +130,27 @@ def test_two_stacks_to_temperatures(
     assert provenance["inputs"]["capture 0"] == store.checksum(results / "aligned.zarr")
 
 
+def test_a_terminal_is_told_the_stage(results: Path) -> None:
+    """On a terminal a command says what it does, and ends with a line of its own."""
+    reading, writing = os.openpty()
+    code = "import sys; from dbthermal.__main__ import main; sys.exit(main())"
+    names = ["scene.zarr", "response.zarr", "--correction", "nuc.zarr", "-o", "terminal.zarr"]
+    command = [sys.executable, "-c", code, "separate", *names]
+    subprocess.run(command, cwd=results, stderr=writing, stdout=subprocess.PIPE, check=True)
+    os.close(writing)
+    text, piece = b"", b" "
+    while piece:
+        try:
+            piece = os.read(reading, 4096)
+        except OSError:  # the terminal is closed, and read to its end
+            break
+        text += piece
+    os.close(reading)
+    lines = text.decode().replace("\r\n", "\n").split("\r")
+    assert any(re.match(r"separate: [a-z ]+, \d+ s\x1b\[K", line) for line in lines), lines
+    assert re.match(r"separate: \d+\.\d s\x1b\[K\n$", lines[-1]), lines[-1]
+
+
 def test_raw_capture_in_one_command(results: Path) -> None:
     """All steps of a raw capture by rows give what the steps one by one give."""
     names = ["separate", "scene.zarr", "response.zarr", "--correction", "nuc.zarr"]
@@ -215,6 +236,7 @@ def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
         np.testing.assert_array_equal(store.open_dataset(results / f"{name}.zarr")["counts"], whole)
 
 
+@pytest.mark.slow
 def test_long_recordings_are_read_without_their_memory(tmp_path: Path) -> None:
     """More than a gigabyte is imported and looked at by some frames at a time, via files."""
     shape, sizes = (1700, 512, 640), np.random.default_rng(1)

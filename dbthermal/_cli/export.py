@@ -4,6 +4,7 @@ import argparse
 import json
 import math
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -148,7 +149,10 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
 
     result, *shown = _shown(options, "separated")
     regions = _regions(result, options.region)
-    named = {name: vars(options)[name] for name in ("title", "author") if vars(options)[name]}
+    named = {"title": options.title} if options.title else {}
+    named["author"] = ", ".join(
+        filter(None, [options.author, f"reported on {datetime.now().astimezone():%Y-%m-%d}"])
+    )
     reporting.report(result, options.output, *shown, regions=regions, **named)
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 

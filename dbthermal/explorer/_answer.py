@@ -71,10 +71,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     for entry in listed:
         pairs = zip(entry["emissivity"].items(), entry["emissivity_std"].values(), strict=True)
         values = ", ".join(f"{value:.3f} +- {std:.3f} ({band})" for (band, value), std in pairs)
-        name = (
-            "like " + " or ".join(entry["nearest"]) if entry["nearest"] else "like many materials"
-        )
-        sentences.append(f"Emissivity at {entry['pixels']} pixels, {name}: {values}.")
+        name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
+        sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
     if status is not None:
         flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
@@ -140,19 +138,21 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
         entry |= {"emissivity": dict(zip(bands, middle.tolist(), strict=True))}
         entry |= {"emissivity_std": dict(zip(bands, std.tolist(), strict=True))}
         if pixels is not groups[0]:
-            entry["nearest"] = [name for name, far in nearest(bands, middle, std, table) if far < 1]
+            near = nearest(bands, middle, std, table)
+            entry["nearest"] = [place for place in near if place["distance"] < 1]
         listed.append(entry)
     return sorted(listed, key=lambda entry: -entry["pixels"])
 
 
 def nearest(
     bands: list[str], values: Array, stds: Array, table: xr.Dataset, number: int = 3
-) -> list[tuple[str, float]]:
+) -> list[dict[str, Any]]:
     """Materials of a table that are nearest to emissivities (band), and how far they are."""
     if not {*bands} <= {*table["band"].values} or not np.isfinite(values + stds).all():
         return []
     far, names = distance(bands, values, stds, table), table["material"].values
-    return [(str(names[at]), float(far[at])) for at in np.argsort(far)[:number]]
+    order = np.argsort(far)[:number]
+    return [{"material": str(names[at]), "distance": float(far[at])} for at in order]
 
 
 def distance(bands: list[str], values: Array, stds: Array, table: xr.Dataset) -> Array:

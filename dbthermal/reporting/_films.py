@@ -16,6 +16,7 @@ from markupsafe import Markup
 
 from dbthermal import figures, store
 from dbthermal.explorer import View
+from dbthermal.explorer._view import COMPLETED
 from dbthermal.reporting._page import film_tag, viewer_tag
 
 FILMS: Final = ("object_temperature", "background_temperature")
@@ -24,12 +25,13 @@ _FASTEST: Final = 30.0  # Hz
 _SAMPLES: Final = 1_300_000  # of each film in the viewer, at most, and of these frames:
 VIEWED: Final = 100
 _NO_VALUE: Final = 65535  # of 16 bits
+_LEAST: Final = 0.01  # between both ends of the colours [K]
 
 
 def _films(view: View) -> list[str]:
-    """Names of the panes that are shown as films: inputs, object and reflected temperature."""
-    named = [name for name in view.panes if name.startswith("input ")]
-    return named + [name for name in FILMS if name in view.panes]
+    """Names of the panes that are shown as films: object and reflected temperature, inputs."""
+    inputs = [name for name in view.panes if name.startswith("input ")]
+    return [*(name for name in FILMS if name in view.panes), *inputs]
 
 
 def sampled(view: View, name: str, frames: int, samples: int) -> tuple[xr.DataArray, int]:
@@ -80,6 +82,8 @@ def viewer(view: View, *, celsius: bool) -> Markup:
         values, time = film.values.astype(np.float64) - zero, film["time"].values
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+        shown = np.percentile(finite, [1, 99]).tolist() if finite.size else [low, high]
+        shown = [0.0 if name in stds else shown[0], max(shown[1], shown[0] + _LEAST)]
         high = high if high > low else low + 1.0
         scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
         codes = np.where(np.isfinite(values), np.rint(scaled), _NO_VALUE).astype("<u2")
@@ -90,12 +94,17 @@ def viewer(view: View, *, celsius: bool) -> Markup:
                 "unit": unit,
                 "low": float(low),
                 "high": float(high),
-                "shown": [float(limit - zero) for limit in view.limits(name)],
+                "shown": shown,
                 "data": base64.b64encode(codes.tobytes()).decode(),
             }
         )
     colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
+    # Pixels that are completed (1), or have another flag (2).
+    status = view.status[::step, ::step]
+    completed = (status & COMPLETED) != 0
+    marks = np.where(completed, 1, np.where(status != 0, 2, 0)).astype(np.uint8)
     content = {
+        "marks": base64.b64encode(marks.tobytes()).decode(),
         "height": -(-view.shape[0] // step),
         "width": -(-view.shape[1] // step),
         "step": step,
@@ -104,5 +113,8 @@ def viewer(view: View, *, celsius: bool) -> Markup:
         "quantities": quantities,
     }
     share = f"one row and column of {step}, " if step > 1 else ""
-    note = f"Click a pixel for its curve. Shown: {share}{time.size} of {view.time.size} frames."
+    note = (
+        "Click a pixel for its curve. White lines: completed, not measured. Black lines: flagged. "
+        f"Shown: {share}{time.size} of {view.time.size} frames."
+    )
     return viewer_tag(content, note)
