@@ -191,6 +191,8 @@ def test_info_of_stores_and_files(results: Path) -> None:
 @pytest.mark.parametrize("option", [[], ["--side-by-side"]])
 def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[str]) -> None:
     """At most five printed commands take its files to a report and the explorer, near the truth."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "\ndbthermal demo try-it   # or --side-by-side\n" in readme
     _, out, _ = said(tmp_path, "demo", "try-it", *option)
     commands = [line for line in out.splitlines() if line.startswith("dbthermal ")]
     assert "simulated" in out
@@ -225,7 +227,11 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
 def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
     """A clock for each camera; frames, every so many of them, and rows alone."""
     form = ["--bands", "8-14", "9.5", "--offset", "0"]
-    done(results, "import", "a.tif", "b.tif", *form, "--clock", "12", "10", "-o", "rates.zarr")
+    with warnings.catch_warnings(action="always"):
+        rates = ["--clock", "12", "10", "-o", "rates.zarr"]
+        status, _, error = said(results, "import", "a.tif", "b.tif", *form, *rates)
+    assert status == 0
+    assert "Warning: The cameras end at 16.6 s and 19.9 s. Must end together" in error
     times = store.open_dataset(results / "rates.zarr")["exposure_time"]
     np.testing.assert_allclose(times[:, -1], [199 / 12, 19.9], rtol=0, atol=1e-9)  # [s]
     part = ["--frames", "20", "120", "--every", "3", "--rows", "4", "10", "--clock", "10"]
@@ -486,6 +492,7 @@ separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> M
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
+export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock: 'a.tif' does not tell
 import a.tif b.tif --bands 8-14 9.5 10.6 --clock 10 -o x.zarr -> --bands of 3 names.* Must be two
@@ -521,7 +528,7 @@ calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
 separate aligned.zarr response.zarr --method dbvt --workers 2 -o x -> workers --met
-separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method
+separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method calibrated
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc
 """.strip()

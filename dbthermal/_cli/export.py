@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
-from dbthermal._cli.files import opened, provenance, staged
+from dbthermal._cli.files import PICTURES, opened, provenance, staged
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
-    if suffix in (".tif", *_PICTURES) and "status" in result and options.variable != "status":
+    if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
         outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
     summary = {}
     for path, options.variable in outputs.items():
@@ -174,6 +174,5 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
 
 
 _DECIMALS = 4  # of the values in a table: a tenth of a millikelvin
-_PICTURES = (".png", ".pdf", ".svg")
 _WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
-_WRITERS |= dict.fromkeys(_PICTURES, _picture)
+_WRITERS |= dict.fromkeys(PICTURES, _picture)

@@ -32,6 +32,8 @@ READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
     "raw files": (readers.raw, ()),
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
+PICTURES: Final = (".png", ".pdf", ".svg")
+_UNEQUAL: Final = 0.05  # of the duration, by which one camera may end before the other
 _BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
@@ -150,6 +152,11 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
         scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
         scene = scene.isel(time=frames_of(options), y=_rows_of(options))
+    # What speaks against separating it later.
+    ends = scene["exposure_time"].max("time").values
+    if np.ptp(ends) > _UNEQUAL * ends.max():
+        label = f"The cameras end at {' and '.join(f'{end:.1f} s' for end in ends)}"
+        scene = warned(scene, f"{label}. Must end together: is a part of one missing?")
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"

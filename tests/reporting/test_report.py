@@ -16,6 +16,11 @@ from dbthermal.explorer import Region
 from dbthermal.schema import Status, status_attrs
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+COLORS = """() => {{
+    const canvas = document.querySelector('[data-part={part}]');
+    const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+    return new Set(new Uint32Array(data.buffer)).size;
+}}"""
 HOSTILE = "</script><script>document.title = 'taken'</script><img src=x onerror=alert(1)>"
 
 
@@ -67,6 +72,26 @@ def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)  # all of the page is in it
     assert sources
     assert all(one.startswith(("data:", "#")) for one in sources)
+
+
+def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
+    """How hot, how sure, how much, and emissivities of two materials each by its own pixels."""
+    data = scene(source="a.tif and b.tif")
+    data["emissivity"].values[:, :, 8:] = np.array([0.928, 0.871])[:, None, None]
+    dbthermal.report(data, tmp_path / "scene.html", title="Wall", author="A. Tester")
+    page = (tmp_path / "scene.html").read_text("utf-8")
+    head = page.partition("<h2")[0]
+    assert "A. Tester, a.tif and b.tif" in head
+    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically \N{PLUS-MINUS SIGN} 0.03 K" in head
+    assert "Measured: 95% of the pixels; completed from what else is known: 4%." in head
+    found = numbers(page)["answer"]
+    assert found["measured"] == pytest.approx(1 - 9 / 192)
+    materials = {entry["nearest"][0]["material"]: entry for entry in found["materials"]}
+    assert materials["construction concrete"]["pixels"] == 96
+    assert materials["plate window glass"]["pixels"] == 87
+    assert materials["plate window glass"]["emissivity"]["9.5"] == pytest.approx(0.718)
+    assert "96 pixels alike" in page
+    assert "construction concrete (0.0)" in page
 
 
 def test_only_measured_pixels_count(tmp_path: Path) -> None:
@@ -137,5 +162,22 @@ def test_page_works_without_a_network(tmp_path: Path) -> None:
         assert "4.75 s" in readout.inner_text()
         page.locator("[data-part=picture]").click(position={"x": 3, "y": 3})
         assert "row 0, column 0: no value" in readout.inner_text()
+        assert readout.inner_text().endswith(", flagged")
+        page.locator("[data-part=picture]").click(position={"x": 50, "y": 50})  # of row 1
+        assert readout.inner_text().endswith(", completed and not measured")
+        # The object first, with colours by a bar, and round ticks without -0.0.
+        assert page.locator("[data-part=quantity]").input_value() == "object_temperature"
+        assert page.evaluate(COLORS.format(part="bar")) > 40
+        assert page.evaluate(COLORS.format(part="picture")) > 2
+        # A narrow page has no part outside; a printed one has the picture of the film.
+        page.set_viewport_size({"width": 390, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        for part in ("picture", "bar", "curve"):
+            box = page.locator(f"[data-part={part}]").bounding_box()
+            assert box is not None
+            assert box["x"] + box["width"] <= 390
+        page.emulate_media(media="print")
+        assert page.locator(".film img").is_visible()
+        assert not page.locator("video").is_visible()
         browser.close()
     assert errors == []
