@@ -11,7 +11,6 @@ import json
 import os
 import re
 import sys
-import time
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -88,7 +87,7 @@ materials NAME text*        as listed by 'data'; all by default
 --bands NAME text+          names of both bands: 8-14 9.5
 --unit count text           of the numbers in TIFF, raw files and arrays: 'count' if not stated
 --clock HZ number+          frame rate, for each camera if they differ: 12 10; FLIR tells times
---shape N whole2            rows and columns of raw files [pixel]
+--shape ROWS,COLUMNS whole2         of raw files [pixel]
 --byte-order - little|big   of the numbers in raw files
 --header N whole=0          before the first frame of raw files [byte]
 --frame-header N whole=0    before each frame of raw files [byte]
@@ -277,9 +276,7 @@ def _options(value: str, kind: str, text: str) -> dict[str, Any]:
     options: dict[str, Any] = {"type": _KINDS[name], "help": text}
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
-    values = tuple(value.split(","))
-    size = options["nargs"] if isinstance(number, str) and number.isdigit() else len(values)
-    options["metavar"] = values if len(values) > 1 else values * size if size > 1 else value
+    options["metavar"] = tuple(value.split(",")) if "," in value else value
     if "!" in kind:
         options["required"] = True
     if "&" in kind:
@@ -349,26 +346,16 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.command == "record":
         return int(_command(module, function)(options))
     with progress.shown(options.command):
-        summary = _summary(module, function, options, arguments)
+        _command("unused", "refuse")(options, arguments)
+        sources, targets = _sources_and_targets(options)
+        if options.dry_run:
+            summary = _command("steps", "foreseen")(options, sources, targets)
+        else:
+            summary = _command(module, function)(options)
     # The summary, for programs or for people.
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
-
-
-def _summary(
-    module: str, function: str, options: argparse.Namespace, arguments: Sequence[str]
-) -> Any:
-    """Summary of a command that is carried out, or only foreseen."""
-    _command("unused", "refuse")(options, arguments)
-    sources, targets = _sources_and_targets(options)
-    if options.dry_run:
-        return _command("steps", "foreseen")(options, sources, targets)
-    start = time.monotonic()
-    summary = _command(module, function)(options)
-    if not sys.stderr.isatty():  # where nothing was shown
-        print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
-    return summary
 
 
 def _command(module: str, function: str) -> Any:
@@ -427,12 +414,10 @@ def _lines(summary: Any, indent: str = "") -> Iterator[str]:
     sentences, for programs.
     """
     for key, value in summary.items():
-        if key in {"answer", "next"}:
-            yield from (f"{indent}{line}" for line in value)
+        if key in {"answer", "next", "numbers"}:
+            yield from (f"{indent}{line}" for line in value if key != "numbers")
             continue
         entries = value if isinstance(value, dict) else dict[str, Any]()
-        if key == "numbers":
-            continue
         if any(isinstance(entry, dict | list | str) for entry in entries.values()):
             yield f"{indent}{key}:"
             yield from _lines(value, indent + "  ")

@@ -25,6 +25,7 @@ from dbthermal import __main__ as command_line
 from dbthermal import __version__, schema, simulation, store
 
 FRAMES = 200
+LABELS = ("mean [degC]", "std [K]", "status")
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "own_captures.md").read_text(encoding="utf-8")
 STATED = ["--bands", "8-14", "9.5", "--unit", "count", "--clock", "10"]
@@ -314,7 +315,7 @@ def test_curves_films_pictures(results: Path) -> None:
         rows = [*csv.reader(stream)]
     assert rows[0] == [
         "time [s]",
-        *(f"pixel 12 16 {it}" for it in ("mean [degC]", "std [K]", "status")),
+        *(f"pixel 12 16 {it}" for it in LABELS),
     ]
     assert len(rows) == FRAMES + 1
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16] - 273.15, abs=1e-3)  # [degC]

@@ -79,6 +79,6 @@ def _stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) -> di
     kelvin = np.array(_CELSIUS) + zero_Celsius
     movies = simulation.blackbody_movies(rig, kelvin, _SWEEP, detector, rng)
     stacks = dict(zip("ab", shown["counts"].values, strict=True))
-    for camera, sweep in zip("ab", movies["counts"].values, strict=True):
-        stacks |= {f"{camera}{step}": film for step, film in zip(_CELSIUS, sweep, strict=True)}
+    for name, sweep in zip("ab", movies["counts"].values, strict=True):
+        stacks |= {f"{name}{step}": film for step, film in zip(_CELSIUS, sweep, strict=True)}
     return stacks

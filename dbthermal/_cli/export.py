@@ -62,9 +62,9 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
         single = bottom - top == right - left == 1
         curve = view.curve(options.variable, region, pixels="all" if single else "measured")
         place = f"pixel {top} {left}" if single else f"{label.replace(',', '')} measured"
-        for name, values in curve[["mean", "std"] if single else [*curve]].items():
+        for name, values in curve.drop_vars([*_EXTREMES, "pixels"] if single else []).items():
             unit, zero = values.attrs.get("units", "1"), 0.0
-            if name not in {"std", "pixels"} and pane.absolute:
+            if name in {"mean", *_EXTREMES} and pane.absolute:
                 unit, zero = "degC", zero_Celsius
             columns[f"{place} {name} [{unit}]"] = (values.astype(float) - zero).round(_DECIMALS)
         bits = schema.Status(int(view.status[top, left]) if single else 0)
@@ -173,6 +173,7 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     return {str(options.output): f"opened by: {install}jupyter lab {options.output}"}
 
 
+_EXTREMES = ("minimum", "maximum")  # of the pixels of a region
 _DECIMALS = 4  # of the values in a table: a tenth of a millikelvin
 _WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
 _WRITERS |= dict.fromkeys(PICTURES, _picture)

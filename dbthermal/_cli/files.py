@@ -1,7 +1,6 @@
 """Stores and files of the commands: read, written, and summarised."""
 
 import argparse
-import sys
 from collections.abc import Callable
 from inspect import Parameter, signature
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
 from dbthermal._arrays import on_disk, release
@@ -103,13 +101,13 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
 
 def frames_of(options: argparse.Namespace, most: int | None = None) -> slice:
     """Frames that are selected: the first N, or from A up to B, and every so many of them."""
-    ends = options.frames or [most]
-    if len(ends) > 2 or min([end for end in ends if end is not None], default=1) < 0 or ends == [0]:
+    ends: list[int] = options.frames or []
+    first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
+    if len(ends) > 2 or first < 0 or (end is not None and end <= first):
         raise ValueError(f"Invalid --frames {ends}. Must be a number, or first and end: 100 400.")
-    every = vars(options).get("every", 1)
-    if every < 1:
+    if (every := vars(options).get("every", 1)) < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
-    return slice(*ends, every) if len(ends) == 2 else slice(0, *ends, every)
+    return slice(first, end, every)
 
 
 def _rows_of(options: argparse.Namespace) -> slice:
@@ -171,8 +169,7 @@ def saved(
     path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
         blocks = [*_rows.blocks(result["counts"].shape)]
-    bar = tqdm(blocks, desc=options.command, unit="block", disable=not sys.stderr.isatty())
-    rows = (result.isel(y=block, missing_dims="ignore") for block in bar)
+    rows = (result.isel(y=block, missing_dims="ignore") for block in blocks)
     store.save_rows(map(_let_go, rows), path, provenance(options))
     return described(path)
 
@@ -210,7 +207,14 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     unknown = options.clock is None and kind_of(paths[0], options) != "FLIR"
     options.clock = [1.0] if unknown else options.clock
     with TemporaryDirectory() as folder, on_disk(Path(folder)):
-        lines = summary(recording(paths, options), everything=True)
+        try:
+            lines = summary(recording(paths, options), everything=True)
+        except ValueError as error:
+            if unknown and "Invalid times" in str(error):  # the file's contradict what is made up
+                raise ValueError(
+                    f"Missing --clock, as by the times in the file: {error}"
+                ) from error
+            raise
     if unknown:
         lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
         lines["clock"] = "not in the file: state the frame rate by --clock"

@@ -9,17 +9,15 @@ from typing import Any, Final
 
 _QUIET, _STEP = 1.5, 0.5  # without a word, and between two looks [s]
 _STAGES: Final = {
-    "numba.core": "compiling",
+    "numba.core": "compiling, once after an installation for about a minute",
     "dbthermal.separation._completion": "completing",
     "dbthermal.separation._pooling": "grouping pixels by material",
     "dbthermal.separation": "separating",
     "dbthermal.alignment": "aligning",
     "dbthermal.correction": "correcting",
-    "dbthermal.calibration": "calibrating",
     "dbthermal.readers": "reading",
     "dbthermal.store": "reading or writing",
     "dbthermal.figures": "drawing",
-    "dbthermal.simulation": "simulating",
 }
 """Modules -> what is done in them; the innermost of a thread counts."""
 
@@ -41,12 +39,14 @@ class _Stream:
 
 @contextmanager
 def shown(command: str) -> Iterator[None]:
-    """Show the stage of this thread and its seconds on the terminal, until the command ends."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    thread, start, ended = threading.get_ident(), time.monotonic(), threading.Event()
-    stream, plain = _Stream(sys.stderr), sys.stderr
+    """Show the stage of this thread on the terminal, and at the end the seconds that it took."""
+    thread, start, ended, plain = (
+        threading.get_ident(),
+        time.monotonic(),
+        threading.Event(),
+        sys.stderr,
+    )
+    stream: Any = _Stream(plain)
 
     def show() -> None:
         while not ended.wait(_STEP):
@@ -55,15 +55,20 @@ def shown(command: str) -> Iterator[None]:
                 plain.write(f"\r{command}: {_stage(thread)}, {seconds:.0f} s\x1b[K")
                 plain.flush()
 
-    sys.stderr, showing = stream, threading.Thread(target=show, daemon=True)  # type: ignore[assignment]
-    showing.start()
+    showing = threading.Thread(target=show, daemon=True)
+    if is_terminal := plain.isatty():
+        sys.stderr = stream
+        showing.start()
     try:
         yield
+        seconds = time.monotonic() - start
     finally:
         ended.set()
-        showing.join()
-        sys.stderr = plain
-        plain.write(f"\r{command}: {time.monotonic() - start:.1f} s\x1b[K\n")
+        if is_terminal:
+            showing.join()
+            sys.stderr = plain
+            plain.write("\r\x1b[K")
+    plain.write(f"{command}: {seconds:.1f} s\n")
 
 
 def _stage(thread: int) -> str:
@@ -75,4 +80,4 @@ def _stage(thread: int) -> str:
             if module.startswith(name):
                 return stage
         frame = frame.f_back
-    return "starting"
+    return "working"

@@ -4,7 +4,6 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +126,6 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
     source, response, *fitted = files.staged(options, **stages)
-    announce_compiling()
     response.load()
     progress = {"progress": sys.stderr.isatty()}
     if options.correction:  # all steps of a raw capture, by rows
@@ -159,32 +157,10 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     return files.described(options.output)
 
 
-def announce_compiling() -> None:
-    """Announce the first compilation of the separation, once."""
-    from numba.core import event  # noqa: PLC0415 - takes long
-
-    class CompilerListener(event.Listener):
-        """Listener to the compiler."""
-
-        def on_start(self, _: event.Event) -> None:
-            _announce()
-
-        def on_end(self, _: event.Event) -> None:
-            """Stay silent: a listener must have this function."""
-
-    event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
-
-
-@cache
-def _announce() -> None:
-    sys.stderr.write("Compiling the separation, once after an installation: about a minute.\n")
-
-
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
-    announce_compiling()
     named = {**accepted(separation.complete, options), "materials": result.get("material")}
     return files.saved(separation.complete(result, source, response, **named), options)
 

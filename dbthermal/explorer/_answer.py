@@ -16,6 +16,7 @@ _ALIKE: Final = 3.0  # standard deviations up to which a material of the table i
 _VAGUE: Final = 0.15  # deviation from which most is alike: the demonstration's tape has 0.18
 _RANGE: Final = (1.0, 99.0)  # percentiles of the temperatures that are said
 _ROWS, _TIMES = 64, 60  # of the image and the film that are looked at, at most
+_NOISE: Final = ("noise", "ratio")  # causes that both bands show; all else is the calibration's
 _COMMON: Final = 0.02  # share of the pixels from which a material is listed
 _DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
 
@@ -37,10 +38,11 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         `measured` and `completed` as shares of the pixels, and the list `materials`.
     """
     table = emissivity.embedded_table() if materials is None else materials
-    height = result.sizes["y"]
-    status = result["status"].values if "status" in result else None
-    measured = np.ones((height, result.sizes["x"]), bool) if status is None else status == 0
+    height, width = result.sizes["y"], result.sizes["x"]
+    status = result["status"].values if "status" in result else np.zeros((height, width), np.uint32)
+    measured, completed = status == 0, (status & np.uint32(schema.COMPLETED)) != 0
     numbers: dict[str, Any] = {"measured": float(measured.mean())}
+    numbers["completed"] = float(completed.mean())
     # Temperatures of measured pixels, or of all where none is.
     limits = ((height, _ROWS), (result.sizes["time"], _TIMES))
     rows, times = (slice(0, None, -(-size // most)) for size, most in limits)
@@ -60,12 +62,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     else:
         sentences.append("No object temperature at any pixel.")
     # Shares of the pixels.
-    shares = f"Measured: {measured.mean():.0%} of the pixels"
-    if status is not None:
-        completed = (status & int(schema.COMPLETED)) != 0
-        numbers["completed"] = float(completed.mean())
-        shares += f"; completed from what else is known: {completed.mean():.0%}"
-    sentences.append(f"{shares}.")
+    rest = f"completed from what else is known: {completed.mean():.0%}"
+    sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {rest}.")
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:
@@ -74,28 +72,30 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
         sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
-    if status is not None:
-        flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
-        doubts += [
-            f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
-            for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])
-            if share >= _DOUBTED and not bit & schema.COMPLETED
-        ]
+    flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
+    doubts += [
+        f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
+        for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])
+        if share >= _DOUBTED and not bit & schema.COMPLETED
+    ]
     return sentences + [f"Watch out: {doubt}" for doubt in dict.fromkeys(doubts)], numbers
 
 
 def _deviations(part: xr.Dataset, valid: Mask) -> dict[str, float]:
-    """Typical deviation of the object temperature [K] by cause, as far as the result has them."""
-    causes = {"noise": part.get("object_temperature_std")}
-    budget = part.get("uncertainty")
-    if budget is not None and "cause" in budget.dims:
-        causes |= {str(name): budget.sel(cause=name) for name in budget["cause"].values}
+    """Typical deviation of the object temperature [K]: noise, and calibration if it is known."""
+    if "object_temperature_std" not in part:
+        return {}
+    squares = {"noise": part["object_temperature_std"] ** 2}
+    if "uncertainty" in part:  # by cause, of each pixel
+        causes = part["uncertainty"] ** 2
+        by_noise = causes["cause"].isin(_NOISE)
+        squares = {"noise": causes.where(by_noise).sum("cause", min_count=1)}
+        squares["calibration"] = causes.where(~by_noise).sum("cause", min_count=1)
     typical = dict[str, float]()
-    for cause, array in causes.items():
-        if array is not None:
-            values = np.broadcast_to(array.values, valid.shape)[valid]
-            values = values[np.isfinite(values)]
-            typical |= {cause: float(np.median(values))} if values.size else {}
+    for name, square in squares.items():
+        values = np.broadcast_to(square.values, valid.shape)[valid]
+        if np.isfinite(values).any():
+            typical[name] = float(np.sqrt(np.nanmedian(values)))
     return typical
 
 
@@ -117,8 +117,10 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     vague = stds.max(axis=1, initial=0.0) >= _VAGUE
     # Medians of each label, which tell materials apart that single pixels do not.
     judged, deviations = values.copy(), stds.copy()
-    labels = result["material"].values[measured][finite] if "material" in result else []
-    for label in set(labels) - {-1}:
+    labels = np.full(len(values), -1)
+    if "material" in result:
+        labels = result["material"].values[measured][finite]
+    for label in np.unique(labels[labels >= 0]):
         judged[labels == label] = np.median(values[labels == label], axis=0)
         deviations[labels == label] = 0.0
     # Groups of pixels alike the commonest nearest material, then of the rest.

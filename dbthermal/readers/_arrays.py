@@ -101,7 +101,7 @@ def array(
 
     # The array, checked before it is read.
     with ExitStack() as stack:
-        values = source
+        values: Any = source
         if not isinstance(source, str | Path):
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             times = [axis for axis in coords if containers.are_times(axis.name, axis)]
@@ -111,11 +111,9 @@ def array(
         else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
-        counts = values if isinstance(source, str | Path) else recordings.film(values)
+        counts: Any = values if isinstance(source, str | Path) else recordings.film(values)
     # The numbers: byte order, and values that stand for missing counts.
-    judged = isinstance(source, str | Path) and any(
-        np.any(f & 0xFF) for f in counts
-    )  # others tell nothing
+    judged = isinstance(source, str | Path) and any(np.any(frame & 0xFF) for frame in counts)
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")

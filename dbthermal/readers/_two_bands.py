@@ -100,7 +100,8 @@ def two_bands(
     # Two cameras, not a file named twice.
     shared = min(recording.sizes["time"] for recording in pair)
     overlapping = [recording["counts"].values[:shared] for recording in pair]
-    if all(np.array_equal(*(film[at] for film in overlapping)) for at in parts(overlapping[0])):
+    film, second_film = overlapping
+    if all(np.array_equal(film[at], second_film[at]) for at in parts(film)):
         raise ValueError(
             f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
             "is one file named twice?"
