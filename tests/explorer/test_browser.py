@@ -37,6 +37,7 @@ explorer = dbthermal.explore({arguments})
 explorer"""
 
 
+EXPLORER = "document.querySelector('[data-testid=explorer]').explorer"
 STEPS = """async () => {
     const explorer = document.querySelector('[data-testid=explorer]').explorer, times = [];
     for (let i = 1; i <= 60; i++) {
@@ -234,6 +235,21 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     level = float(np.nanmedian(frame))
     sides = np.reshape(page.evaluate(SIDES, level - 273.15), view.shape)
     np.testing.assert_array_equal(sides, np.where(np.isnan(frame), 0, 1 + (frame > level)))
+    # A profile across the picture, at the frame; hottest and coldest pixel; undo and Delete.
+    page.locator("[data-tool=line]").click()
+    drag(page, canvas, (0.02, 0.52), (0.98, 0.52))
+    page.wait_for_function(f"{EXPLORER}.profile?.length > 25")
+    profile = page.evaluate(f"Array.from({EXPLORER}.profile)")
+    assert set(np.float32(profile)) <= set(frame[12])
+    spots = page.evaluate(f"{EXPLORER}.pictures.get('object_temperature').spots")
+    measured = np.where(view.counted("measured"), frame, np.nan)
+    expected = [np.nanmin(measured), np.nanmax(measured)]
+    np.testing.assert_allclose([value for *_, value in spots], expected, rtol=0, atol=1e-4)  # [K]
+    for key, left in (("Delete", 0), ("Control+z", 1), ("Control+z", 1), ("Control+z", 0)):
+        page.keyboard.press(key)
+        assert page.evaluate(f"{EXPLORER}.regions.size") == left
+        if key == "Control+z" and left:
+            assert page.evaluate(f"{EXPLORER}.regions.has('region 1')")
     if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
         page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
     assert (lab.outside, lab.errors) == ([], [])
