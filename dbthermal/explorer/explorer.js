@@ -660,7 +660,7 @@ class Explorer {
   }
   listRegions(regions) {
     const digits = DIGITS[this.plotted?.units] ?? 2;
-    const lines = regions.map(([name, color, { mean, low, high, std, counts }]) => {
+    const lines = regions.map(([name, color, { mean, low, high, std, counts }], order) => {
       const [i, line] = [this.index, make(null, "div", "dbt-region")];
       make(line, "i", "dbt-swatch").style.background = color;
       make(line, "b", "", { textContent: name });
@@ -668,6 +668,8 @@ class Explorer {
       const bar = Number.isNaN(std(i)) ? "" : ` \u00b1 ${std(i).toFixed(digits + (std(i) < 0.05 ? 1 : 0))}`;
       make(line, "div", "", { textContent: `mean ${mean(i).toFixed(digits)}${bar} ${this.unit(this.plotted)}` });
       make(line, "div", "dbt-faint", { textContent: `${low(i).toFixed(digits)} to ${high(i).toFixed(digits)}; ${counts[1]} of ${counts[0]} pixels` });
+      const unit = this.plotted?.absolute ? "K" : this.unit(this.plotted);
+      if (order) make(line, "div", "dbt-faint", { textContent: `less ${regions[0][0]}: ${(mean(i) - regions[0][2].mean(i)).toFixed(digits)} ${unit}` });
       return line;
     });
     if (lines.length) lines.push(make(null, "div", "dbt-faint", { textContent: "line: mean, with its 95 % interval; dotted: least and greatest pixel" }));
