@@ -69,63 +69,78 @@ _KINDS: Final[dict[str, Any]] = {
     "point": _kelvin_or_path,
 }
 _ARGUMENTS: Final = """
-files FILE path+            files of one camera, then a '+' and the other's; or a store
-session FILE path           YAML file, see dbthermal.instruments.session
-folder FOLDER path          new folder for what is written
-capture CAPTURE path        store of a capture
-correction CORRECTION path?    store of gain and offset
---corrected-by-camera - flag   in place of it: each camera corrects gain and offset itself
-response RESPONSE path       store of the cameras' response
-result RESULT path         store of a result
-shown STORE path*           its capture, and the cameras' response, to be shown beside it
-materials NAME text*        as listed by 'data'; all by default
---output OUTPUT path!       new {output}
---overwrite - flag          replace the output
---dry-run - flag            only say what would be read, with sizes, and written
---json - flag               print the summary as JSON
---traceback - flag          show where an error was raised
---bands NAME text+          names of both bands: 8-14 9.5
---unit count text           of the numbers in TIFF, raw files and arrays: 'count' if not stated
---clock HZ number+          frame rate, for each camera if they differ: 12 10; FLIR tells times
---shape ROWS,COLUMNS whole2         of raw files [pixel]
---byte-order - little|big   of the numbers in raw files
---header N whole=0          before the first frame of raw files [byte]
---frame-header N whole=0    before each frame of raw files [byte]
---simulated - flag          no camera has recorded it: all that is made of it says so
---variable NAME text        name of an array in a file of several, or in a result
---offset SECONDS number     start of the second camera after the first's; else by dates or images
---simulate - flag           use emulated devices
---side-by-side - flag       cameras side by side, in place of one window for both
---at TEMPERATURE,FILE point+& of a blackbody, as 20C or 293.15K, and its files; repeated
---blackbody STORE path      in place of --at: a store of all temperatures
---sweep FOLDER,SESSION text2   in place of --at: folder and session of a sweep by 'record'
---maker STORE path          in place of --at: a capture of FLIR's files, for the maker's constants
---frames N whole+           first N frames alone, or from A up to B: A B; 64 of each temperature
---every N whole=1           one frame of so many
---rows Y0,Y1 whole2         rows of the image from Y0 up to Y1 alone
---correction-output STORE path  store of gain and offset, where the blackbody fills the view
---no-shutter - flag         no camera has a shutter
---time-constant SECONDS number  thermal, of the pixels
---register - none|translation|affine|homography  between the views (homography); none: one grid
---search N whole=5          largest delay that is sought, either way [frame]
---reference NAME text       band whose frames are left as they are in time
---correction STORE path     store of gain and offset: all steps of a raw capture, by rows
---method NAME text          one step alone, by rows: {methods}
---emissivity E number+      of each band, for the method 'calibrated'
---surroundings TEMPERATURE kelvin  temperature of what is reflected, as 22C
---prior NAME text           material of pixels that cannot be measured, as listed by 'data'
---workers N whole=2         number of threads
---title TEXT text           heading of the report
---author TEXT text          name below it
---noise KELVIN number!      of the camera without a filter
---seconds S number=35       length of the capture
---rate HZ number=10         frame rate
---span KELVIN number=25     rise of the object's temperature
---amplitude KELVIN number=3 height of the reflected changes
---pixel Y,X whole2&         row and column of a curve; repeated
---region Y0,Y1,X0,X1 whole4&  rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
+files path+             files of one camera, then a '+' and the other's; or a store
+session path            YAML file, see dbthermal.instruments.session
+folder path             new folder for what is written
+capture path            store of a capture
+correction path?        store of gain and offset
+--corrected-by-camera flag  in place of it: each camera corrects gain and offset itself
+response path           store of the cameras' response
+result path             store of a result
+shown path*             its capture, and the cameras' response, to be shown beside it
+materials text*         as listed by 'data'; all by default
+--output path!          new {output}
+--overwrite flag        replace the output
+--dry-run flag          only say what would be read, with sizes, and written
+--json flag             print the summary as JSON
+--traceback flag        show where an error was raised
+--bands text+           names of both bands: 8-14 9.5
+--unit text             of the numbers in TIFF, raw files and arrays: 'count' if not stated
+--clock number+         frame rate [Hz], of each camera if they differ; FLIR's files have times
+--shape whole2          rows and columns of raw files [pixel]
+--byte-order little|big of the numbers in raw files
+--header whole=0        before the first frame of raw files [byte]
+--frame-header whole=0  before each frame of raw files [byte]
+--simulated flag        no camera has recorded it: all that is made of it says so
+--variable text         name of an array in a file of several, or in a result
+--offset number         start of the second camera after the first's [s]; else found
+--simulate flag         use emulated devices
+--side-by-side flag     cameras side by side, in place of one window for both
+--at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
+--blackbody path        in place of --at: a store of all temperatures
+--sweep text2           in place of --at: folder and session of a sweep by 'record'
+--maker path            in place of --at: a capture of FLIR's files, for the maker's constants
+--frames whole+         the first N, or from A up to B: A B; of each temperature 64
+--every whole=1         take one frame of so many
+--rows whole2           take rows Y0 up to Y1 of the image
+--correction-output path   store of gain and offset, where the blackbody fills the view
+--no-shutter flag       no camera has a shutter
+--time-constant number  thermal, of the pixels [s]
+--register none|translation|affine|homography   between the views (homography); none: on one grid
+--search whole=5        largest delay that is sought, either way [frame]
+--reference text        band whose frames are left as they are in time
+--correction path       store of gain and offset: all steps of a raw capture, by rows
+--method text           one step alone, by rows: {methods}
+--emissivity number+    of each band, for the method 'calibrated'
+--surroundings kelvin   temperature of what is reflected, as 22C
+--prior text            material of pixels that cannot be measured, as listed by 'data'
+--workers whole=2       number of threads
+--title text            heading of the report
+--author text           name below it
+--noise number!         of the camera without a filter [K]
+--seconds number=35     length of the capture
+--rate number=10        frame rate [Hz]
+--span number=25        rise of the object's temperature [K]
+--amplitude number=3    height of the reflected changes [K]
+--pixel whole2&         row and column of a curve; repeated
+--region whole4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
 """
-"""Argument, its value, kind and help: ``!`` is required, ``&`` repeated, ``=`` the default."""
+"""Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
+
+_VALUES: Final = {
+    "--at": "TEMPERATURE FILE",
+    "--sweep": "FOLDER SESSION",
+    "--shape": "ROWS COLUMNS",
+    "--pixel": "Y X",
+    "--region": "Y0 Y1 X0 X1",
+    "--rows": "Y0 Y1",
+    "path": "PATH",
+    "text": "NAME",
+    "number": "NUMBER",
+    "whole": "N",
+    "kelvin": "TEMPERATURE",
+}
+"""Option, or its kind -> names of its values in the help."""
 
 _METHODS: Final = (
     "subspace (what the default call begins with), calibrated (emissivities as stated), dbvt (the "
@@ -241,7 +256,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser("dbthermal", description=f"{__doc__}\n{order}", **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    table = {line.split()[0]: line.split(maxsplit=3)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
+    table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
     for block in re.sub(" {2,}", " ", _COMMANDS).strip().split("\n\n"):
         # A block of the table: the command with its arguments, its summary, its examples.
         head, summary, *lines = block.splitlines()
@@ -259,15 +274,14 @@ def _parser() -> argparse.ArgumentParser:
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []
-            value, kind, text = table[argument]
-            output = _OUTPUTS.get(name, "store *.zarr")
-            text = text.format(output=output, methods=_METHODS)
-            command.add_argument(*short, argument, **_options(value, kind, text))
+            kind, text = table[argument]
+            text = text.format(output=_OUTPUTS.get(name, "store *.zarr"), methods=_METHODS)
+            command.add_argument(*short, argument, **_options(argument, kind, text))
     return parser
 
 
-def _options(value: str, kind: str, text: str) -> dict[str, Any]:
-    """Options of argparse for a value, a kind and a help; see `_ARGUMENTS`."""
+def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
+    """Options of argparse for an argument, its kind and its help; see `_ARGUMENTS`."""
     if kind == "flag":
         return {"action": "store_true", "help": text}
     if "|" in kind:
@@ -276,7 +290,9 @@ def _options(value: str, kind: str, text: str) -> dict[str, Any]:
     options: dict[str, Any] = {"type": _KINDS[name], "help": text}
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
-    options["metavar"] = tuple(value.split(",")) if "," in value else value
+    if argument.startswith("-"):
+        values = _VALUES.get(argument, _VALUES.get(name, "VALUE")).split()
+        options["metavar"] = tuple(values) if len(values) > 1 else values[0]
     if "!" in kind:
         options["required"] = True
     if "&" in kind:
