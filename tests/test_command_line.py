@@ -148,8 +148,8 @@ def test_a_terminal_is_told_the_stage(results: Path) -> None:
         text += piece
     os.close(reading)
     lines = text.decode().replace("\r\n", "\n").split("\r")
-    assert any(re.match(r"separate: [a-z ]+, \d+ s\x1b\[K", line) for line in lines), lines
-    assert re.match(r"separate: \d+\.\d s\x1b\[K\n$", lines[-1]), lines[-1]
+    assert any(re.match(r"separate: [a-z, ]+, \d+ s\x1b\[K", line) for line in lines), lines
+    assert re.fullmatch(r"\x1b\[Kseparate: \d+\.\d s\n", lines[-1]), lines[-1]
 
 
 def test_raw_capture_in_one_command(results: Path) -> None:
@@ -313,10 +313,9 @@ def test_curves_films_pictures(results: Path) -> None:
     object_ = result["object_temperature"].values
     with (results / "curve.csv").open(encoding="utf-8", newline="") as stream:
         rows = [*csv.reader(stream)]
-    assert rows[0] == [
-        "time [s]",
-        *(f"pixel 12 16 {it}" for it in LABELS),
-    ]
+    assert rows[0][0] == "time [s]"
+    assert {f"pixel 12 16 {label}" for label in LABELS} <= {*rows[0]}
+    assert not any("imum" in label for label in rows[0])  # of one pixel
     assert len(rows) == FRAMES + 1
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16] - 273.15, abs=1e-3)  # [degC]
     assert [row[0] for row in rows[1:4]] == ["0.0", "0.1", "0.2"]

@@ -118,7 +118,7 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
 
 def film(values: Any) -> Counts:
     """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time."""
-    counts = empty(values.shape, np.uint16)
+    counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
     for frames in parts(counts):
         counts[frames] = values[frames]
     return counts
