@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import h5py
 import nbformat
 import numpy as np
 import pytest
@@ -184,6 +185,16 @@ def test_info_of_stores_and_files(results: Path) -> None:
     status = store.open_dataset(results / "result.zarr")["status"].values
     assert found["status_shares"]["no_flag"] == pytest.approx((status == 0).mean(), abs=1e-6)
     assert found["provenance"]["parameters"]["command"] == "separate"
+    made = done(results, "info", "a.tif")["a.tif"]
+    assert made["sizes"] == {"time": FRAMES, "y": 24, "x": 32}
+    assert "seconds" not in made
+    assert "--clock" in made["clock"]
+    film = tifffile.imread(results / "a.tif")
+    with h5py.File(results / "timed.h5", "w") as file:
+        file["counts"], file["time"] = film, np.arange(FRAMES) / 10  # [s]
+        file["time"].make_scale("time")
+        file["counts"].dims[0].attach_scale(file["time"])
+    assert done(results, "info", "timed.h5")["timed.h5"]["frame_rate_Hz"] == pytest.approx(10)
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording of one band"
     assert one["attributes"]["byte_order"] == "little"
@@ -232,7 +243,7 @@ def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
         rates = ["--clock", "12", "10", "-o", "rates.zarr"]
         status, _, error = said(results, "import", "a.tif", "b.tif", *form, *rates)
     assert status == 0
-    assert "Warning: The cameras end at 16.6 s and 19.9 s. Must end together" in error
+    assert "Warning: The cameras recorded 16.6 s and 19.9 s. Must be the same time" in error
     times = store.open_dataset(results / "rates.zarr")["exposure_time"]
     np.testing.assert_allclose(times[:, -1], [199 / 12, 19.9], rtol=0, atol=1e-9)  # [s]
     part = ["--frames", "20", "120", "--every", "3", "--rows", "4", "10", "--clock", "10"]

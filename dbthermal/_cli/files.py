@@ -1,10 +1,11 @@
 """Stores and files of the commands: read, written, and summarised."""
 
 import argparse
+import re
 from collections.abc import Callable
 from inspect import Parameter, signature
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +32,7 @@ READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
 PICTURES: Final = (".png", ".pdf", ".svg")
-_UNEQUAL: Final = 0.05  # of the duration, by which one camera may end before the other
+_UNEQUAL: Final = 0.05  # of the duration, by which two cameras' recordings may differ
 _BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
@@ -93,7 +94,8 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     several = kind in {"FLIR", "TIFF"}
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
-    movie = reader(paths if several else paths[0], **stated).isel(selected)
+    with on_disk(_room(options)):  # films that are large
+        movie = reader(paths if several else paths[0], **stated).isel(selected)
     if not all(movie.sizes.values()):
         raise ValueError(f"No frame or row of '{paths[0].name}' selected. Must be at least one.")
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
@@ -138,23 +140,30 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
         raise ValueError(f"{label}. Must be two, of two cameras.")
     cameras = enumerate((paths[:place], paths[place + 1 :]))
     first, second = (recording(files, options, camera) for camera, files in cameras)
-    return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
+    with on_disk(_room(options)):
+        return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
+
+
+def _room(options: argparse.Namespace) -> Path:
+    """Folder for films on disk: beside the output, or that of the system."""
+    output: Path | None = vars(options).get("output")
+    beside = output.absolute().parent if output else Path(gettempdir())
+    return beside if beside.is_dir() else Path(gettempdir())
 
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     """Command `import`."""
     from dbthermal import separation  # noqa: PLC0415 - takes long
 
-    options.output.absolute().parent.mkdir(parents=True, exist_ok=True)
-    with on_disk(options.output.absolute().parent):
-        scene = capture(options.files, options, options.offset)
+    scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
         scene = scene.isel(time=frames_of(options), y=_rows_of(options))
     # What speaks against separating it later.
-    ends = scene["exposure_time"].max("time").values
-    if np.ptp(ends) > _UNEQUAL * ends.max():
-        label = f"The cameras end at {' and '.join(f'{end:.1f} s' for end in ends)}"
-        scene = warned(scene, f"{label}. Must end together: is a part of one missing?")
+    stamps = scene.get("exposure_time", scene["time"])
+    lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
+    if np.ptp(lengths) > _UNEQUAL * lengths.max():
+        label = f"The cameras recorded {' and '.join(f'{length:.1f} s' for length in lengths)}"
+        scene = warned(scene, f"{label}. Must be the same time: is a part of one missing?")
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
@@ -206,15 +215,15 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     # A recording; without a clock its sizes can be said all the same.
     unknown = options.clock is None and kind_of(paths[0], options) != "FLIR"
     options.clock = [1.0] if unknown else options.clock
-    with TemporaryDirectory() as folder, on_disk(Path(folder)):
-        try:
-            lines = summary(recording(paths, options), everything=True)
-        except ValueError as error:
-            if unknown and "Invalid times" in str(error):  # the file's contradict what is made up
-                raise ValueError(
-                    f"Missing --clock, as by the times in the file: {error}"
-                ) from error
+    try:
+        dataset = recording(paths, options)
+    except ValueError as error:
+        stamp = re.search(r"frame (\d+) at (\S+) s, by clock=", str(error)) if unknown else None
+        if stamp is None:
             raise
+        options.clock, unknown = [int(stamp[1]) / float(stamp[2])], False  # as in the file
+        dataset = recording(paths, options)
+    lines = summary(dataset, everything=True)
     if unknown:
         lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
         lines["clock"] = "not in the file: state the frame rate by --clock"
