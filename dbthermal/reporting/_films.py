@@ -2,6 +2,7 @@
 
 import base64
 import math
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +21,11 @@ from dbthermal.explorer._view import COMPLETED
 from dbthermal.reporting._page import film_tag, viewer_tag
 
 FILMS: Final = ("object_temperature", "background_temperature")
-_FILMED: Final = 240  # frames of the video, at most
+_FILMED: Final = 240  # frames of the video, at most; half as many while it is larger than:
+_LARGEST: Final = 3_000_000  # [byte]
 _FASTEST: Final = 30.0  # Hz
-_SAMPLES: Final = 1_300_000  # of each film in the viewer, at most, and of these frames:
-VIEWED: Final = 100
+_SAMPLES: Final = 600_000  # of each film in the viewer, at most, and of these frames:
+VIEWED: Final = 80
 _NO_VALUE: Final = 65535  # of 16 bits
 _LEAST: Final = 0.01  # between both ends of the colours [K]
 
@@ -44,12 +46,19 @@ def sampled(view: View, name: str, frames: int, samples: int) -> tuple[xr.DataAr
     return xr.DataArray(values, {"time": time}, ("time", "y", "x")), step
 
 
-def video(view: View, title: str, codec: Literal["vp9", "h264"], *, celsius: bool) -> Markup:
-    """Film of the inputs, the object and what it reflects."""
+def video(
+    view: View,
+    title: str,
+    codec: Literal["vp9", "h264"],
+    *,
+    celsius: bool,
+    number: int = _FILMED,
+) -> Markup:
+    """Film of the object, what it reflects, and the inputs."""
     panels = []
     for name in _films(view):
         pane = view.panes[name]
-        values, _ = sampled(view, name, _FILMED, _FILMED * 100_000)
+        values, _ = sampled(view, name, number, number * 100_000)
         unit, zero = pane.unit(celsius=celsius)
         panels.append(figures.FilmPanel(values - zero, pane.label, f"[{unit}]"))
     span = float(view.time[-1] - view.time[0])
@@ -58,17 +67,25 @@ def video(view: View, title: str, codec: Literal["vp9", "h264"], *, celsius: boo
 
     def frames() -> Iterator[npt.NDArray[np.uint8]]:
         """Frames of the film, of which the middle one is kept."""
-        number = panels[0].values.sizes["time"]
+        half = panels[0].values.sizes["time"] // 2
         for index, frame in enumerate(figures.film(panels, title=title)):
-            if index == number // 2:
+            if index == half:
                 middle.append(frame)
             yield frame
 
     with TemporaryDirectory() as folder:
         path, poster = Path(folder) / "film.mp4", Path(folder) / "middle.png"
         store.save_video(frames(), path, {}, rate=rate, codec=codec)
+        if path.stat().st_size > _LARGEST and number > 2:
+            return video(view, title, codec, celsius=celsius, number=number // 2)
         mpl.image.imsave(poster, middle[0])
         return film_tag(path, "The scene. Gray: no value.", poster)
+
+
+def _changes(codes: npt.NDArray[np.uint16]) -> bytes:
+    """Changes of codes (time, y, x) from frame to frame, low bytes before high ones."""
+    changes = np.diff(codes, axis=0, prepend=np.zeros_like(codes[:1]))
+    return changes.astype("<u2").view("u1").reshape(-1, 2).T.tobytes()
 
 
 def viewer(view: View, *, celsius: bool) -> Markup:
@@ -95,7 +112,7 @@ def viewer(view: View, *, celsius: bool) -> Markup:
                 "low": float(low),
                 "high": float(high),
                 "shown": shown,
-                "data": base64.b64encode(codes.tobytes()).decode(),
+                "data": base64.b64encode(zlib.compress(_changes(codes), 9)).decode(),
             }
         )
     colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)

@@ -6,7 +6,14 @@
   const NOTHING = 65535; // of 16 bits: no value here
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const lut = bytes(palette);
-  for (const each of quantities) each.codes = new Uint16Array(bytes(each.data).buffer);
+  // Codes are stored as their changes from frame to frame, low bytes before high ones, deflated.
+  async function unpack(quantity) {
+    const stream = new Blob([bytes(quantity.data)]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const planes = new Uint8Array(await new Response(stream).arrayBuffer()), number = planes.length / 2, size = height * width;
+    const codes = new Uint16Array(number);
+    for (let at = 0; at < number; at++) codes[at] = planes[at] + 256 * planes[number + at] + (at < size ? 0 : codes[at - size]);
+    quantity.codes = codes;
+  }
   const find = (name) => root.querySelector(`[data-part=${name}]`);
   const [picture, bar, curve, slider, choice, readout, play] =
     ["picture", "bar", "curve", "time", "quantity", "readout", "play"].map(find);
@@ -57,6 +64,7 @@
   }
 
   function draw() {
+    if (quantities.some((each) => !each.codes)) return;
     const quantity = shown(), frame = Number(slider.value);
     const context = picture.getContext("2d"), image = small.getContext("2d").createImageData(width, height);
     for (let row = 0, at = 0; row < height; row++) {
@@ -162,5 +170,5 @@
     play.textContent = "Pause";
     timer = setInterval(() => { slider.value = (Number(slider.value) + 1) % times.length; draw(); }, 80);
   });
-  draw();
+  Promise.all(quantities.map(unpack)).then(draw);
 }

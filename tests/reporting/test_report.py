@@ -107,6 +107,22 @@ def test_only_measured_pixels_count(tmp_path: Path) -> None:
         assert text in page
 
 
+def test_a_large_scene_fits_into_a_letter(tmp_path: Path) -> None:
+    """A report of many pixels and frames of noise, with both inputs, has at most 8 MB."""
+    rng = np.random.default_rng(1)
+    place = {"time": np.arange(120) // 6, "y": np.arange(120) // 10, "x": np.arange(160) // 10}
+    large = scene().isel(place).assign_coords(time=np.arange(120) / 4)
+    for name in ("object_temperature", "background_temperature"):
+        large[name] = large[name] + rng.normal(0, 0.1, large[name].shape).astype(np.float32)
+    counts = rng.normal(20000, 10, (2, 120, 120, 160)) + 5.0 * np.arange(160)
+    parts = {"counts": (("band", "time", "y", "x"), counts.astype("f4"), {"units": "count"})}
+    capture = xr.Dataset(parts, {"time": large["time"], "band": large["band"]})
+    dbthermal.report(large, tmp_path / "scene.html", capture)
+    size = (tmp_path / "scene.html").stat().st_size
+    print(f"{size / 1e6:.1f} MB")
+    assert size < 8e6  # [byte]
+
+
 def test_same_result_gives_same_bytes(tmp_path: Path) -> None:
     """A result in memory and its store give the same page, twice."""
     store.save(scene(), tmp_path / "scene.zarr", {"commit": "unknown"})
