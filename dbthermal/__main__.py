@@ -6,20 +6,20 @@ standard error.
 """
 
 import argparse
+import difflib
 import json
 import os
 import re
 import sys
-import time
 import warnings
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves
+from dbthermal._cli import is_source, leaves, progress
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -70,7 +70,7 @@ _KINDS: Final[dict[str, Any]] = {
 _ARGUMENTS: Final = """
 files path+             files of one camera, then a '+' and the other's; or a store
 session path            YAML file, see dbthermal.instruments.session
-folder path             where the recordings go
+folder path             new folder for what is written
 capture path            store of a capture
 correction path?        store of gain and offset
 --corrected-by-camera flag  in place of it: each camera corrects gain and offset itself
@@ -78,27 +78,30 @@ response path           store of the cameras' response
 result path             store of a result
 shown path*             its capture, and the cameras' response, to be shown beside it
 materials text*         as listed by 'data'; all by default
---output path!          what is made: store *.zarr, or of the kind that the examples below have
+--output path!          new {output}
 --overwrite flag        replace the output
 --dry-run flag          only say what would be read, with sizes, and written
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
---bands text2           names of both bands: 8-14 9.5
---unit text             of the numbers in TIFF, raw files and arrays: must be 'count'
---clock number          frame rate [Hz]; FLIR's files have their own times
+--bands text+           names of both bands: 8-14 9.5
+--unit text             of the numbers in TIFF, raw files and arrays: 'count' if not stated
+--clock number+         frame rate [Hz], of each camera if they differ; FLIR's files have times
 --shape whole2          rows and columns of raw files [pixel]
 --byte-order little|big of the numbers in raw files
 --header whole=0        before the first frame of raw files [byte]
 --frame-header whole=0  before each frame of raw files [byte]
 --simulated flag        no camera has recorded it: all that is made of it says so
 --variable text         name of an array in a file of several, or in a result
---offset number         how much later the second camera began, or was exposed [s]; else found
+--offset number         start of the second camera after the first's [s]; else found
 --simulate flag         use emulated devices
+--side-by-side flag     cameras side by side, in place of one window for both
 --at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
 --blackbody path        in place of --at: a store of all temperatures
 --sweep text2           in place of --at: folder and session of a sweep by 'record'
 --maker path            in place of --at: a capture of FLIR's files, for the maker's constants
---frames whole=64       at most, of each temperature
+--frames whole+         the first N, or from A up to B: A B; of each temperature 64
+--every whole=1         take one frame of so many
+--rows whole2           take rows Y0 up to Y1 of the image
 --blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
 --blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
 --room-temperature kelvin  of that room, as 22C
@@ -113,41 +116,74 @@ materials text*         as listed by 'data'; all by default
 --search whole=5        largest delay that is sought, either way [frame]
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
---method text           one step alone, by rows: subspace, calibrated, dbvt, apparent
+--method text           one step alone, by rows: {methods}
 --emissivity number+    of each band, for the method 'calibrated'
 --surroundings kelvin   temperature of what is reflected, as 22C
 --prior text            material of pixels that cannot be measured, as listed by 'data'
 --workers whole=2       number of threads
+--title text            heading of the report
+--author text           name below it
 --noise number!         of the camera without a filter [K]
 --seconds number=35     length of the capture
 --rate number=10        frame rate [Hz]
 --span number=25        rise of the object's temperature [K]
 --amplitude number=3    height of the reflected changes [K]
---pixel whole2&         y x of a curve; repeated
---region whole4&        y0 y1 x0 x1 of a curve; repeated
+--pixel whole2&         row and column of a curve; repeated
+--region whole4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
+_VALUES: Final = {
+    "--at": "TEMPERATURE FILE",
+    "--sweep": "FOLDER SESSION",
+    "--shape": "ROWS COLUMNS",
+    "--pixel": "Y X",
+    "--region": "Y0 Y1 X0 X1",
+    "--rows": "Y0 Y1",
+    "path": "PATH",
+    "text": "NAME",
+    "number": "NUMBER",
+    "whole": "N",
+    "kelvin": "TEMPERATURE",
+}
+"""Option, or its kind -> names of its values in the help."""
+
+_METHODS: Final = (
+    "subspace (what the default call begins with), calibrated (emissivities as stated), dbvt (the "
+    "paper's optimisation), apparent (temperature as of a black body)"
+)
+_OUTPUTS: Final = {
+    "export": "file *.csv, *.tif, *.nc, *.png, *.pdf or *.svg",
+    "explore": "notebook *.ipynb",
+    "report": "page *.html",
+}
+"""Command -> kind of its output, if that is no store."""
+
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"
 _COMMANDS: Final = f"""
-info files.info files {_FORM}
-say what a store or recording is: sizes, clock, bands, provenance, shares of the status
-capture.zarr
-video.seq
-a.tif --unit count --clock 30
+demo demo.demo folder --side-by-side
+write the files of a simulated rig, to try everything without cameras, and say what to do next
+try-it
+try-it --side-by-side
 
-import files.make_capture files --bands --offset {_FORM} --output
+info files.info files {_FORM}
+say what a store or recording is, and of a result how hot, how sure and how much of it
+result.zarr
+video.seq
+a.tif --clock 30
+
+import files.make_capture files --bands --offset {_FORM} --frames --every --rows --output
 make a capture of two cameras' files: FLIR, TIFF, raw, NumPy, HDF5, NetCDF, zarr
-a.tif b.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
-a*.tif + b*.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
-wide.seq narrow.seq --bands 8-14 9.5 -o scene.zarr
+a.tif b.tif --bands 8-14 9.5 --clock 30 --offset 0 -o scene.zarr
+a*.tif + b*.tif --bands 8-14 9.5 --clock 12 10 --offset 0 -o scene.zarr
+wide.seq narrow.seq --bands 8-14 9.5 --frames 0 3000 --every 3 -o scene.zarr
 
 calibrate steps.calibrate --at --blackbody --sweep --maker --frames --bands {_FORM} \
     --blackbody-accuracy --blackbody-emissivity --room-temperature --offset-std --gain-std \
     --pattern-std --background-ratio-std --correction-output --output
 fit the cameras' response, and each pixel's gain and offset, to a blackbody
 --at 10C a10.tif b10.tif --at 30C a30.tif b30.tif --at 50C a50.tif b50.tif --at 70C a70.tif \
-    b70.tif --bands 8-14 9.5 --unit count --clock 30 -o response.zarr --correction-output nuc.zarr
+    b70.tif --bands 8-14 9.5 --clock 30 -o response.zarr --correction-output nuc.zarr
 --sweep recordings response -o response.zarr
 --maker scene.zarr -o response.zarr
 
@@ -192,7 +228,7 @@ explore export.explore result shown --output
 make a notebook to look around in a result or a capture, for JupyterLab
 result.zarr aligned.zarr response.zarr -o look.ipynb
 
-report export.report result shown --region --output
+report export.report result shown --region --title --author --output
 write a report on a result, one HTML file that needs no network
 result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 
@@ -207,15 +243,28 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 """Command, its function and arguments; its summary; examples."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser that asks after the name that was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the message, and exit."""
+        options = re.findall(r"(?m)^--[\w-]+", _ARGUMENTS)
+        for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
+            listed = ", ".join(f"'{option}'" for option in options)
+            message += _suggestion(f"'{wrong}': choose from {listed}")
+        super().error(message + _suggestion(message))
+
+
 def _parser() -> argparse.ArgumentParser:
     """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
     # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
+    order = "In this order: demo (or import), calibrate, correct, align, separate, report, explore."
+    parser = _Parser("dbthermal", description=f"{__doc__}\n{order}", **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
-    for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
+    for block in re.sub(" {2,}", " ", _COMMANDS).strip().split("\n\n"):
         # A block of the table: the command with its arguments, its summary, its examples.
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
@@ -232,12 +281,14 @@ def _parser() -> argparse.ArgumentParser:
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []
-            command.add_argument(*short, argument, **_options(*table[argument]))
+            kind, text = table[argument]
+            text = text.format(output=_OUTPUTS.get(name, "store *.zarr"), methods=_METHODS)
+            command.add_argument(*short, argument, **_options(argument, kind, text))
     return parser
 
 
-def _options(kind: str, text: str) -> dict[str, Any]:
-    """Options of argparse for a kind and a help; see `_ARGUMENTS`."""
+def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
+    """Options of argparse for an argument, its kind and its help; see `_ARGUMENTS`."""
     if kind == "flag":
         return {"action": "store_true", "help": text}
     if "|" in kind:
@@ -246,6 +297,9 @@ def _options(kind: str, text: str) -> dict[str, Any]:
     options: dict[str, Any] = {"type": _KINDS[name], "help": text}
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
+    if argument.startswith("-"):
+        values = _VALUES.get(argument, _VALUES.get(name, "VALUE")).split()
+        options["metavar"] = tuple(values) if len(values) > 1 else values[0]
     if "!" in kind:
         options["required"] = True
     if "&" in kind:
@@ -274,6 +328,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, reason = 1, _reason(error, options.command)
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
+        reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
+        reason += _suggestion(reason)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
@@ -292,6 +348,18 @@ def _reason(error: Exception, command: str) -> str:
     return f"{type(error).__name__}: {message} (--traceback shows where)"
 
 
+def _suggestion(reason: str) -> str:
+    """Question after the name that is most like an unknown one, of those that a message lists."""
+    unknown = re.search(r"'([^']+)'.*(?:Must be one of|choose from)\s(.*)", reason)
+    if unknown is None or "Did you mean" in reason:
+        return ""
+    wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))
+    names = names or unknown.group(2).strip(" .)").split(", ")
+    words = [name for name in names if wrong.lower() in name.lower()]
+    like = [*difflib.get_close_matches(wrong, names, 1), *words]
+    return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
+
+
 def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Check the options, and what is read and written; run the command; print its summary."""
     if options.command == "completion":
@@ -300,15 +368,13 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
-    _command("unused", "refuse")(options, arguments)
-    sources, targets = _sources_and_targets(options)
-    if options.dry_run:
-        summary = _command("steps", "foreseen")(options, sources, targets)
-    else:
-        start = time.monotonic()
-        summary = _command(module, function)(options)
-        if not sys.stderr.isatty():  # where no bar was shown
-            print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    with progress.shown(options.command):
+        _command("unused", "refuse")(options, arguments)
+        sources, targets = _sources_and_targets(options)
+        if options.dry_run:
+            summary = _command("steps", "foreseen")(options, sources, targets)
+        else:
+            summary = _command(module, function)(options)
     # The summary, for programs or for people.
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
@@ -324,7 +390,8 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
     """Paths that a command reads, which must exist, and writes, which must be free."""
     arguments = vars(options).items()
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
-    targets = [value for name, value in arguments if name.endswith("output") and value]
+    written = ("output", "folder")
+    targets = [value for name, value in arguments if name.endswith(written) and value]
     for path in sources:
         if not path.exists():
             raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
@@ -335,7 +402,7 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
             label = f"Invalid output '{path}': it is another one, or it is read"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
-        if path.exists() and not options.overwrite:
+        if path.exists() and not getattr(options, "overwrite", path.is_dir()):
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     return sources, targets
 
@@ -364,8 +431,15 @@ def _plain(value: Any) -> Any:
 
 
 def _lines(summary: Any, indent: str = "") -> Iterator[str]:
-    """Summary as text: a line for each entry that is not empty, numbers in one line."""
+    """Summary as text: a line for each entry that is not empty, numbers in one line.
+
+    Sentences (`answer`) and commands (`next`) have a line each; `numbers` repeat those of the
+    sentences, for programs.
+    """
     for key, value in summary.items():
+        if key in {"answer", "next", "numbers"}:
+            yield from (f"{indent}{line}" for line in value if key != "numbers")
+            continue
         entries = value if isinstance(value, dict) else dict[str, Any]()
         if any(isinstance(entry, dict | list | str) for entry in entries.values()):
             yield f"{indent}{key}:"

@@ -93,7 +93,10 @@ def shown(value: object) -> str:
 def missing_library(name: str | None, extra: str) -> str:
     """Message that a library is not installed, with the command that installs its extra."""
     command = f"python -m pip install 'dbthermal[{extra}]'"
-    return f"Missing library '{name}', of the extra '{extra}'. Must be installed: {command}."
+    clone = f"in a clone: python -m pip install '.[{extra}]'"
+    return (
+        f"Missing library '{name}', of the extra '{extra}'. Must be installed: {command}; {clone}."
+    )
 
 
 def repeated(values: Iterable[Any]) -> list[Any]:

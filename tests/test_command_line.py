@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import h5py
 import nbformat
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from dbthermal import __main__ as command_line
 from dbthermal import __version__, schema, simulation, store
 
 FRAMES = 200
+LABELS = ("mean [degC]", "std [K]", "status")
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "own_captures.md").read_text(encoding="utf-8")
 STATED = ["--bands", "8-14", "9.5", "--unit", "count", "--clock", "10"]
@@ -130,6 +132,27 @@ def test_two_stacks_to_temperatures(
     assert provenance["inputs"]["capture 0"] == store.checksum(results / "aligned.zarr")
 
 
+def test_a_terminal_is_told_the_stage(results: Path) -> None:
+    """On a terminal a command says what it does, and ends with a line of its own."""
+    reading, writing = os.openpty()
+    code = "import sys; from dbthermal.__main__ import main; sys.exit(main())"
+    names = ["scene.zarr", "response.zarr", "--correction", "nuc.zarr", "-o", "terminal.zarr"]
+    command = [sys.executable, "-c", code, "separate", *names]
+    subprocess.run(command, cwd=results, stderr=writing, stdout=subprocess.PIPE, check=True)
+    os.close(writing)
+    text, piece = b"", b" "
+    while piece:
+        try:
+            piece = os.read(reading, 4096)
+        except OSError:  # the terminal is closed, and read to its end
+            break
+        text += piece
+    os.close(reading)
+    lines = text.decode().replace("\r\n", "\n").split("\r")
+    assert any(re.match(r"separate: [a-z, ]+, \d+ s\x1b\[K", line) for line in lines), lines
+    assert re.fullmatch(r"\x1b\[Kseparate: \d+\.\d s\n", lines[-1]), lines[-1]
+
+
 def test_raw_capture_in_one_command(results: Path) -> None:
     """All steps of a raw capture by rows give what the steps one by one give."""
     names = ["separate", "scene.zarr", "response.zarr", "--correction", "nuc.zarr"]
@@ -162,9 +185,91 @@ def test_info_of_stores_and_files(results: Path) -> None:
     status = store.open_dataset(results / "result.zarr")["status"].values
     assert found["status_shares"]["no_flag"] == pytest.approx((status == 0).mean(), abs=1e-6)
     assert found["provenance"]["parameters"]["command"] == "separate"
+    made = done(results, "info", "a.tif")["a.tif"]
+    assert made["sizes"] == {"time": FRAMES, "y": 24, "x": 32}
+    assert "seconds" not in made
+    assert "--clock" in made["clock"]
+    film = tifffile.imread(results / "a.tif")
+    with h5py.File(results / "timed.h5", "w") as file:
+        file["counts"], file["time"] = film, np.arange(FRAMES) / 10  # [s]
+        file["time"].make_scale("time")
+        file["counts"].dims[0].attach_scale(file["time"])
+    assert done(results, "info", "timed.h5")["timed.h5"]["frame_rate_Hz"] == pytest.approx(10)
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording of one band"
     assert one["attributes"]["byte_order"] == "little"
+
+
+@pytest.mark.parametrize("option", [[], ["--side-by-side"]])
+def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[str]) -> None:
+    """At most five printed commands take its files to a report and the explorer, near the truth."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "\ndbthermal demo try-it   # or --side-by-side\n" in readme
+    _, out, _ = said(tmp_path, "demo", "try-it", *option)
+    commands = [line for line in out.splitlines() if line.startswith("dbthermal ")]
+    assert "simulated" in out
+    assert len(commands) <= 5
+    assert len([*(tmp_path / "try-it").glob("*.tif")]) == 10
+    assert "There is something at" in refused(tmp_path, "demo", "try-it", *option)
+    texts = []
+    for command in commands:
+        with warnings.catch_warnings(action="always"):
+            status, out, error = said(tmp_path / "try-it", *shlex.split(command)[1:])
+        assert status == 0, error
+        texts.append(out)
+    assert {"report.html", "look.ipynb"} <= {path.name for path in (tmp_path / "try-it").iterdir()}
+    result = store.open_dataset(tmp_path / "try-it" / "result.zarr")
+    assert result.attrs["origin"] == "simulated"
+    # The answer comes first, and holds the truth: 22 to 60 degC, a third of it measured or more.
+    head = re.search(r"Object from (\S+) to (\S+) degC, typically \+- (\S+) K \(noise", texts[2])
+    assert head, texts[2]
+    low, high, std = map(float, head.groups())
+    assert abs(low - 22) < 1
+    assert 45 < high < 60.5
+    assert std < 0.3
+    assert float(re.findall(r"Measured: (\d+)% of the pixels", texts[2])[0]) > 35
+    assert re.search(r"Emissivity at \d+ pixels, like .*plate window glass.*: 0\.8[56]", texts[2])
+    assert "Watch out:" in texts[2]
+    if option:  # displaced by the 2 rows and 4 columns, and 3 columns, that were put in
+        made = done(tmp_path / "try-it", "info", "result.zarr")["result.zarr"]
+        np.testing.assert_allclose(made["view_shift_pixel"]["9.5"], [-2, -4], rtol=0, atol=0.2)
+        assert abs(abs(made["reflection_shift_pixel"]["columns"]) - 3) < 0.2  # [pixel]
+
+
+def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
+    """A clock for each camera; frames, every so many of them, and rows alone."""
+    form = ["--bands", "8-14", "9.5", "--offset", "0"]
+    with warnings.catch_warnings(action="always"):
+        rates = ["--clock", "12", "10", "-o", "rates.zarr"]
+        status, _, error = said(results, "import", "a.tif", "b.tif", *form, *rates)
+    assert status == 0
+    assert "Warning: The cameras recorded 16.6 s and 19.9 s. Must be the same time" in error
+    times = store.open_dataset(results / "rates.zarr")["exposure_time"]
+    np.testing.assert_allclose(times[:, -1], [199 / 12, 19.9], rtol=0, atol=1e-9)  # [s]
+    part = ["--frames", "20", "120", "--every", "3", "--rows", "4", "10", "--clock", "10"]
+    done(results, "import", "a.tif", "b.tif", *form, *part, "-o", "part.zarr")
+    done(results, "import", "scene.zarr", *part[:-2], "-o", "part2.zarr")
+    whole = store.open_dataset(results / "scene.zarr")["counts"][:, 20:120:3, 4:10]
+    for name in ("part", "part2"):
+        np.testing.assert_array_equal(store.open_dataset(results / f"{name}.zarr")["counts"], whole)
+
+
+@pytest.mark.slow
+def test_long_recordings_are_read_without_their_memory(tmp_path: Path) -> None:
+    """More than a gigabyte is imported and looked at by some frames at a time, via files."""
+    shape, sizes = (1700, 512, 640), np.random.default_rng(1)
+    frame = sizes.integers(18000, 18500, shape[1:], dtype=np.uint16)
+    for name in "ab":
+        film = np.lib.format.open_memmap(tmp_path / f"{name}.npy", "w+", np.uint16, shape)
+        for number in range(shape[0]):
+            film[number] = frame + number % 200 + (name == "b")
+        del film
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_DATA, (3 * 2**29,) * 2); "
+    form = ["--bands", "8-14", "9.5", "--clock", "30", "--offset", "0", "-o", "scene.zarr"]
+    for command in (["info", "a.npy"], ["import", "a.npy", "b.npy", *form]):
+        found = run(tmp_path, *command, before=limit)
+        assert found.returncode == 0, found.stderr
+        assert "time 1700, y 512, x 640" in found.stdout
 
 
 def test_simulated_files_make_simulated_results(results: Path) -> None:
@@ -235,10 +340,13 @@ def test_curves_films_pictures(results: Path) -> None:
     object_ = result["object_temperature"].values
     with (results / "curve.csv").open(encoding="utf-8", newline="") as stream:
         rows = [*csv.reader(stream)]
-    assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
+    assert rows[0][0] == "time [s]"
+    assert {f"pixel 12 16 {label}" for label in LABELS} <= {*rows[0]}
+    assert not any("imum" in label for label in rows[0])  # of one pixel
     assert len(rows) == FRAMES + 1
-    assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
-    assert rows[0][-1] == "pixel 12 16 status"
+    assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16] - 273.15, abs=1e-3)  # [degC]
+    assert [row[0] for row in rows[1:4]] == ["0.0", "0.1", "0.2"]
+    assert max(len(cell) for row in rows[1:] for cell in row[:3]) < 9
     assert {row[-1] for row in rows[1:]} == {"no_flag"}
     status = result["status"].values
     worst = np.argwhere(status & schema.Status.DEAD_PIXEL)[0].tolist()
@@ -247,7 +355,7 @@ def test_curves_films_pictures(results: Path) -> None:
     with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
         last = [*csv.DictReader(stream)][-1]
     assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
-    whole = "rows 0 to 24, columns 0 to 32, measured"
+    whole = "rows 0 to 24 columns 0 to 32 measured"
     assert last[f"{whole} status"] == "no_flag"
     assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc"):
@@ -283,8 +391,9 @@ def test_report_and_explorer(results: Path) -> None:
 def test_plan_and_data(tmp_path: Path) -> None:
     """The plan names the filter for glass; the list has it; an unknown material is refused."""
     _, out, _ = said(tmp_path, "plan", "plate window glass", "brass plate", "--noise", "0.03")
-    assert "best_filter: 9.5\n" in out
-    assert "best_filter: none\n" in out
+    assert "Assumed: 35 s at 10 Hz; the object rises by 25 K" in out
+    assert re.search(r"(?m)^plate window glass  9.5 +0\.706 +0\.173 ", out)
+    assert re.search(r"(?m)^brass plate +none .*\n.*Best none: no filter", out)
     listed = done(tmp_path, "data")
     assert listed["filters_um"]["9.5"] == [9.25, 9.75]
     assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
@@ -410,13 +519,21 @@ separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> M
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
+export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
-info a.tif -> Missing --unit: 'a.tif' does not tell
-seperate a b -> invalid choice: 'seperate' .choose from
-align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset
-align a.zarr --register homograph -o x.zarr -> 'homograph' .choose from .*homography
-export result.zarr --variable emisivity -o x.tif -> 'emisivity' for .tif. Must be one of
-plan plate_window_glas --noise 0.03 -> 'plate_window_glas'. Must be one of
+import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock: 'a.tif' does not tell
+import a.tif b.tif --bands 8-14 9.5 10.6 --clock 10 -o x.zarr -> --bands of 3 names.* Must be two
+import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 rates
+{ONE} --offset 0 --frames 0 -o x.zarr -> Invalid --frames .* first and end
+{ONE} --offset 0 --frames 300 400 -o x.zarr -> No frame or row of 'a.tif' selected
+{ONE} --offset 0 --every 0 -o x.zarr -> Invalid --every 0
+{ONE} --offset 0 --rows 9 3 -o x.zarr -> Invalid --rows 9 3
+seperate a b -> invalid choice: 'seperate' .choose from .*Did you mean 'separate'
+align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset 0 Did you mean '--offset'
+align a.zarr --register homograph -o x.zarr -> 'homograph' .*Did you mean 'homography'
+export result.zarr --variable object -o x.tif -> 'object' for .tif.*mean 'object_temperature'
+plan plate_window_glas --noise 0.03 -> 'plate_window_glas'.*Did you mean 'plate window glass'
+plan glass --noise 0.03 -> Did you mean 'plate window glass'
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C
 calibrate --at 5c a.tif b.tif -o a.zarr -> temperature '5c'. Must be a number, with a decimal point
@@ -439,7 +556,7 @@ calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
 separate aligned.zarr response.zarr --method dbvt --workers 2 -o x -> workers --met
-separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method
+separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method calibrated
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc
 """.strip()

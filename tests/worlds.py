@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter, shift
+from scipy.special import expit
 
 from dbthermal import response as responses
 from dbthermal import schema, simulation
@@ -51,7 +52,7 @@ def people(rng: np.random.Generator, number: int) -> Iterator[tuple[Array, float
         center += 1.5 * np.sin(np.pi * time + rng.uniform(0.0, 6.0))
         half, top = rng.uniform(4.0, 8.0), rng.uniform(-0.1, 0.4) * len(y)
         beside = np.abs(x - center[:, np.newaxis, np.newaxis]) - half
-        shape = 1.0 / (1.0 + np.exp(beside / 0.7)) / (1.0 + np.exp((top - y) / 0.7))
+        shape = expit(-beside / 0.7) * expit((y - top) / 0.7)
         yield shape, rng.uniform(5.0, 10.0)
 
 

@@ -17,7 +17,7 @@ def leaves(value: Any) -> Iterator[Any]:
 
 def is_source(name: str, value: Any) -> bool:
     """Tell whether a value of an argument is a path that is read."""
-    return isinstance(value, Path) and value != PLUS and not name.endswith("output")
+    return isinstance(value, Path) and value != PLUS and not name.endswith(("output", "folder"))
 
 
 def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]:

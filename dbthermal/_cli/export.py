@@ -2,7 +2,9 @@
 
 import argparse
 import json
+import math
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
-from dbthermal._cli.files import opened, provenance, staged
+from dbthermal._cli.files import PICTURES, opened, provenance, staged
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -34,7 +36,7 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
-    if suffix in (".tif", *_PICTURES) and "status" in result and options.variable != "status":
+    if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
         outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
     summary = {}
     for path, options.variable in outputs.items():
@@ -48,24 +50,31 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
 def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Mean, extremes, deviation, number of pixels and status of each place over time.
 
-    Without a place, of the image. A single pixel counts with its flags, which a column names; in a
-    region the measured pixels count, which have none.
+    Without a place, of the image; temperatures in degrees Celsius. A single pixel counts with its
+    flags, which a column names; in a region the measured pixels count, which have none.
     """
     view, columns = explorer.View(result), dict[str, xr.DataArray]()
     height, width = view.shape
     boxes = [(y, y + 1, x, x + 1) for y, x in options.pixel] + [*map(tuple, options.region)]
+    pane = view.panes[options.variable]
     for top, bottom, left, right in boxes or [(0, height, 0, width)]:
         ((label, region),) = _regions(result, [(top, bottom, left, right)]).items()
         single = bottom - top == right - left == 1
         curve = view.curve(options.variable, region, pixels="all" if single else "measured")
-        place = f"pixel {top} {left}" if single else f"{label}, measured"
-        for name, values in curve.items():
-            columns[f"{place} {name} [{values.attrs.get('units', '1')}]"] = values
+        place = f"pixel {top} {left}" if single else f"{label.replace(',', '')} measured"
+        for name, values in curve.drop_vars([*_EXTREMES, "pixels"] if single else []).items():
+            unit, zero = values.attrs.get("units", "1"), 0.0
+            if name in {"mean", *_EXTREMES} and pane.absolute:
+                unit, zero = "degC", zero_Celsius
+            columns[f"{place} {name} [{unit}]"] = (values.astype(float) - zero).round(_DECIMALS)
         bits = schema.Status(int(view.status[top, left]) if single else 0)
         flags = " ".join(bit.label for bit in bits) or "no_flag"
         flags = flags if "status" in view.panes else "unknown"
         columns[f"{place} status"] = xr.full_like(curve["mean"], flags, dtype=object)
-    xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
+    # Times to a thousandth of a frame.
+    table, period = xr.Dataset(columns), float(np.median(np.diff(view.time, prepend=-1.0)))
+    time = np.round(view.time, 3 - math.floor(math.log10(period))) + 0.0  # no -0.0
+    table.assign_coords(time=time).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
 
 
@@ -139,7 +148,12 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
     from dbthermal import reporting  # noqa: PLC0415 - optional
 
     result, *shown = _shown(options, "separated")
-    reporting.report(result, options.output, *shown, regions=_regions(result, options.region))
+    regions = _regions(result, options.region)
+    named = {"title": options.title} if options.title else {}
+    named["author"] = ", ".join(
+        filter(None, [options.author, f"reported on {datetime.now().astimezone():%Y-%m-%d}"])
+    )
+    reporting.report(result, options.output, *shown, regions=regions, **named)
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 
 
@@ -159,6 +173,7 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     return {str(options.output): f"opened by: {install}jupyter lab {options.output}"}
 
 
-_PICTURES = (".png", ".pdf", ".svg")
+_EXTREMES = ("minimum", "maximum")  # of the pixels of a region
+_DECIMALS = 4  # of the values in a table: a tenth of a millikelvin
 _WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
-_WRITERS |= dict.fromkeys(_PICTURES, _picture)
+_WRITERS |= dict.fromkeys(PICTURES, _picture)

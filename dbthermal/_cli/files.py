@@ -1,19 +1,21 @@
 """Stores and files of the commands: read, written, and summarised."""
 
 import argparse
-import sys
+import re
 from collections.abc import Callable
 from inspect import Parameter, signature
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from tqdm import tqdm
 
 from dbthermal import _rows, readers, schema, store
+from dbthermal._arrays import on_disk, release
 from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal._warnings import warned
+from dbthermal.explorer._answer import answer
 
 _MADE_BY = {
     "capture": "import",
@@ -29,6 +31,9 @@ READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
     "raw files": (readers.raw, ()),
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
+PICTURES: Final = (".png", ".pdf", ".svg")
+_UNEQUAL: Final = 0.05  # of the duration, by which two cameras' recordings may differ
+_BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
 
@@ -63,13 +68,19 @@ def kind_of(path: Path, options: argparse.Namespace) -> str:
     return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
 
 
-def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
-    """Recording of one camera, by the kind of its files, with its origin."""
+def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -> xr.Dataset:
+    """Recording of one camera, by the kind of its files, with its origin; large ones on disk."""
     kind = kind_of(paths[0], options)
     reader, _ = READERS[kind]
     # Arguments of the reader, by the options of the same names.
     parameters, stated = signature(reader).parameters, accepted(reader, options)
-    stated.pop("frames", None)  # of a calibration
+    selected = {"time": frames_of(options), "y": _rows_of(options)} if "rows" in options else {}
+    if stated.pop("frames", None) and selected and "frames" in parameters:
+        stated["frames"] = selected.pop("time")
+    if "unit" in parameters:
+        stated.setdefault("unit", "count")
+    if options.clock:
+        stated["clock"] = options.clock[min(camera, len(options.clock) - 1)]
     if "shape" in stated:
         stated["shape"] = tuple(options.shape)
     if "name" in parameters:
@@ -83,8 +94,30 @@ def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
     several = kind in {"FLIR", "TIFF"}
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
-    movie = reader(paths if several else paths[0], **stated)
+    with on_disk(_room(options)):  # films that are large
+        movie = reader(paths if several else paths[0], **stated).isel(selected)
+    if not all(movie.sizes.values()):
+        raise ValueError(f"No frame or row of '{paths[0].name}' selected. Must be at least one.")
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
+
+
+def frames_of(options: argparse.Namespace, most: int | None = None) -> slice:
+    """Frames that are selected: the first N, or from A up to B, and every so many of them."""
+    ends: list[int] = options.frames or []
+    first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
+    if len(ends) > 2 or first < 0 or (end is not None and end <= first):
+        raise ValueError(f"Invalid --frames {ends}. Must be a number, or first and end: 100 400.")
+    if (every := vars(options).get("every", 1)) < 1:
+        raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
+    return slice(first, end, every)
+
+
+def _rows_of(options: argparse.Namespace) -> slice:
+    """Rows of the image that are selected."""
+    first, end = options.rows or (0, None)
+    if first < 0 or (end is not None and end <= first):
+        raise ValueError(f"Invalid --rows {first} {end}. Must be from 0 on, and rise.")
+    return slice(first, end)
 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: float | None) -> xr.Dataset:
@@ -99,8 +132,23 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
         raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name both, such as: --bands 8-14 9.5.")
-    first, second = (recording(files, options) for files in (paths[:place], paths[place + 1 :]))
-    return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
+    if len(options.clock or ()) > 2:
+        label = f"Invalid --clock of {len(options.clock)} rates"
+        raise ValueError(f"{label}. Must be one, or one for each camera.")
+    if len(options.bands) != 2:
+        label = f"Invalid --bands of {len(options.bands)} names: {', '.join(options.bands)}"
+        raise ValueError(f"{label}. Must be two, of two cameras.")
+    cameras = enumerate((paths[:place], paths[place + 1 :]))
+    first, second = (recording(files, options, camera) for camera, files in cameras)
+    with on_disk(_room(options)):
+        return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
+
+
+def _room(options: argparse.Namespace) -> Path:
+    """Folder for films on disk: beside the output, or that of the system."""
+    output: Path | None = vars(options).get("output")
+    beside = output.absolute().parent if output else Path(gettempdir())
+    return beside if beside.is_dir() else Path(gettempdir())
 
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
@@ -108,6 +156,14 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     from dbthermal import separation  # noqa: PLC0415 - takes long
 
     scene = capture(options.files, options, options.offset)
+    if options.files[0].is_dir() and len(options.files) == 1:
+        scene = scene.isel(time=frames_of(options), y=_rows_of(options))
+    # What speaks against separating it later.
+    stamps = scene.get("exposure_time", scene["time"])
+    lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
+    if np.ptp(lengths) > _UNEQUAL * lengths.max():
+        label = f"The cameras recorded {' and '.join(f'{length:.1f} s' for length in lengths)}"
+        scene = warned(scene, f"{label}. Must be the same time: is a part of one missing?")
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
@@ -122,10 +178,15 @@ def saved(
     path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
         blocks = [*_rows.blocks(result["counts"].shape)]
-    bar = tqdm(blocks, desc=options.command, unit="block", disable=not sys.stderr.isatty())
-    rows = (result.isel(y=block, missing_dims="ignore") for block in bar)
-    store.save_rows(rows, path, provenance(options))
+    rows = (result.isel(y=block, missing_dims="ignore") for block in blocks)
+    store.save_rows(map(_let_go, rows), path, provenance(options))
     return described(path)
+
+
+def _let_go(rows: xr.Dataset) -> xr.Dataset:
+    """Free the memory of films on disk; return the rows that come next."""
+    release()
+    return rows
 
 
 def described(path: Path) -> dict[str, Any]:
@@ -149,8 +210,24 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     """Command `info`."""
     paths: list[Path] = options.files
     is_store = len(paths) == 1 and (paths[0] / "zarr.json").is_file() and options.unit is None
-    dataset = opened(paths[0]) if is_store else recording(paths, options)
-    return {str(paths[0]): summary(dataset, everything=True)}
+    if is_store:
+        return {str(paths[0]): summary(opened(paths[0]), everything=True)}
+    # A recording; without a clock its sizes can be said all the same.
+    unknown = options.clock is None and kind_of(paths[0], options) != "FLIR"
+    options.clock = [1.0] if unknown else options.clock
+    try:
+        dataset = recording(paths, options)
+    except ValueError as error:
+        stamp = re.search(r"frame (\d+) at (\S+) s, by clock=", str(error)) if unknown else None
+        if stamp is None:
+            raise
+        options.clock, unknown = [int(stamp[1]) / float(stamp[2])], False  # as in the file
+        dataset = recording(paths, options)
+    lines = summary(dataset, everything=True)
+    if unknown:
+        lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
+        lines["clock"] = "not in the file: state the frame rate by --clock"
+    return {str(paths[0]): lines}
 
 
 def outline(dataset: xr.Dataset) -> dict[str, Any]:
@@ -168,6 +245,9 @@ def outline(dataset: xr.Dataset) -> dict[str, Any]:
 def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     """Outline, flags, clocks, views and medians of a dataset; with everything its attributes."""
     lines, attrs = outline(dataset), dataset.attrs
+    if lines["stage"] == "separated" and "x" in dataset.sizes:
+        sentences, numbers = answer(dataset)
+        lines = {"answer": sentences, "numbers": numbers, **lines}
     # Shares of the flags, frames that were lost or bridged, and the offset of the clocks.
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
@@ -178,10 +258,7 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
         if attrs.get(name) is not None:
             unit = "_s" if name.startswith("time") else ""
             lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
-    # The offset of the views: a matrix for each band.
-    views = len(attrs.get("transform", ())) / 9
-    if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
-        lines["view_shift_pixel"] = _view_shifts(dataset)
+    lines |= _shifts(dataset)
     # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
@@ -215,6 +292,17 @@ def _stage(dataset: xr.Dataset) -> str:
         if stage not in {"capture", "corrected"} or raw == (stage == "capture"):
             fitting.append(stage)
     return fitting[-1]
+
+
+def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
+    """Shifts of the views, of which there is a matrix for each band, and of the reflections."""
+    lines, views = dict[str, Any](), len(dataset.attrs.get("transform", ())) / 9
+    if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
+        lines["view_shift_pixel"] = _view_shifts(dataset)
+    if "reflection_shift" in dataset:
+        shifts = dataset["reflection_shift"].median(("y", "x")).values.round(2).tolist()
+        lines["reflection_shift_pixel"] = dict(zip(("rows", "columns"), shifts, strict=True))
+    return lines
 
 
 def _view_shifts(dataset: xr.Dataset) -> dict[str, list[float]]:

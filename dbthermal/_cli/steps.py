@@ -3,7 +3,7 @@
 import argparse
 import math
 import sys
-from functools import cache
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from dbthermal._warnings import warned
 from dbthermal.response import ACCURACY
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
+
+_SWEEP = 64  # frames of each temperature of a blackbody that are taken
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, Any]:
@@ -60,14 +62,13 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     # A store, or the recordings of a sweep.
+    frames_of = files.frames_of(options, most=_SWEEP)
     if options.blackbody:
         return files.opened(options.blackbody).load()
     if options.sweep:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
-        return recording.open_sweep(*options.sweep, frames=options.frames)
-    if options.frames < 1:
-        raise ValueError(f"Invalid --frames {options.frames}. Must be at least 1.")
+        return recording.open_sweep(*options.sweep, frames=frames_of.stop)
     # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
@@ -77,7 +78,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
-        frames = still["counts"].isel(time=good[: options.frames]).load()
+        frames = still["counts"].isel(time=good[frames_of]).load()
         movie = frames.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
@@ -128,7 +129,6 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         stages |= {"capture": "capture|corrected", "correction": "correction"}
         options.register = options.register or "homography"
     source, response, *fitted = files.staged(options, **stages)
-    announce_compiling()
     response.load()
     progress = {"progress": sys.stderr.isatty()}
     if options.correction:  # all steps of a raw capture, by rows
@@ -160,32 +160,10 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     return files.described(options.output)
 
 
-def announce_compiling() -> None:
-    """Announce the first compilation of the separation, once."""
-    from numba.core import event  # noqa: PLC0415 - takes long
-
-    class CompilerListener(event.Listener):
-        """Listener to the compiler."""
-
-        def on_start(self, _: event.Event) -> None:
-            _announce()
-
-        def on_end(self, _: event.Event) -> None:
-            """Stay silent: a listener must have this function."""
-
-    event.register("numba:compile", CompilerListener())  # type: ignore[no-untyped-call]
-
-
-@cache
-def _announce() -> None:
-    sys.stderr.write("Compiling the separation, once after an installation: about a minute.\n")
-
-
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
-    announce_compiling()
     named = {**accepted(separation.complete, options), "materials": result.get("material")}
     return files.saved(separation.complete(result, source, response, **named), options)
 
@@ -226,13 +204,36 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
     plans = limits.plan(table, noise, design)
     deviations = plans["object_temperature_std"].transpose("filter", "material").to_pandas()
-    return {
-        name: {
+    numbers = {
+        str(name): {
             "best_filter": str(best),
             "object_temperature_std_K": deviations[name].round(4).to_dict(),
         }
         for name, best in plans["best"].to_series().items()
     }
+    return {"answer": [*_table(numbers, noise, design)], "numbers": numbers}
+
+
+def _table(
+    numbers: dict[str, Any], noise: xr.DataArray, design: limits.CaptureDesign
+) -> Iterator[str]:
+    """Yield the lines of a plan: what it assumes, and a row for each material."""
+    filters = [*next(iter(numbers.values()))["object_temperature_std_K"]]
+    yield (
+        f"Assumed: {design.seconds:g} s at {design.rate:g} Hz; the object rises by {design.span:g} "
+        f"K, the reflections by {design.amplitude:g} K for {design.duration:g} s in every "
+        f"{design.period:g} s."
+    )
+    behind = ", ".join(f"{float(noise.sel(band=name)):.2g} K ({name} um)" for name in filters)
+    yield f"Noise of a frame behind a filter: {behind}."
+    yield "Deviation of the object's temperature [K], second band behind the filter [um]:"
+    wide = max(len(name) for name in [*numbers, "material"])
+    yield "  ".join(["material".ljust(wide), "best", *(name.rjust(8) for name in filters)])
+    for name, entry in numbers.items():
+        cells = [f"{value:8.3f}" for value in entry["object_temperature_std_K"].values()]
+        yield "  ".join([name.ljust(wide), entry["best_filter"].ljust(4), *cells])
+    if any(entry["best_filter"] == "none" for entry in numbers.values()):
+        yield "Best none: no filter tells more than the range of the temperatures does."
 
 
 def data(_: argparse.Namespace) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import READERS, kind_of
+from dbthermal._cli.files import PICTURES, READERS, kind_of
 from dbthermal.response import ACCURACY
 
 _FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
@@ -29,7 +29,7 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return _of_files(options)
     if options.command == "align" and options.offset is not None:
         return {"with --offset": "search"}
-    if options.command == "export" and options.output.suffix != ".csv":
+    if options.command == "export" and options.output.suffix in {".tif", ".nc", *PICTURES}:
         suffix = options.output.suffix
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":
@@ -38,7 +38,9 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return {"with --correction": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
     completing = {"with --method: 'dbthermal complete'": "surroundings prior workers"}
-    return aligned | (completing if options.method else {"without --method": "emissivity"})
+    return aligned | (
+        completing if options.method else {"without --method calibrated": "emissivity"}
+    )
 
 
 def _of_files(options: argparse.Namespace) -> dict[str, str]:

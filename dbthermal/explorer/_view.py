@@ -214,7 +214,8 @@ class View:
     def limits(self, name: str) -> tuple[float, float]:
         """Range of colour of a pane: the 1st and 99th percentile of some measured values.
 
-        Of all values if none is measured; a deviation begins at 0.
+        Of all values if none is measured; a deviation begins at 0, and that of emissivities is
+        wider by their median deviation.
         """
         pane, (frames, pixels) = self.pane(name), _RANGE
         times = slice(0, None, -(-self.time.size // frames))
@@ -225,6 +226,9 @@ class View:
             if finite.size:
                 low, high = np.percentile(finite, [1, 99])
                 low = 0.0 if "_std" in name else low
+                if pane.std and not pane.absolute:  # differences within the bars are no colours
+                    bars = self.pane(pane.std).read(times, every, every)[np.isfinite(values)]
+                    low, high = low - np.median(bars), high + np.median(bars)
                 return float(low), float(high if high > low else low + (1e-3 * abs(low) or 1.0))
         return 0.0, 1.0
 

@@ -14,13 +14,14 @@ import xarray as xr
 from matplotlib import colormaps
 
 from dbthermal import schema
+from dbthermal._arrays import Mask
 from dbthermal.explorer import _export
 from dbthermal.explorer._films import Values
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import COMPLETED, FILMS, View
 from dbthermal.figures import drawing
 
-PALETTES: Final = ("inferno", "cividis", "gray")
+PALETTES: Final = ("inferno", "cividis", "gray", "gnuplot2", "turbo")
 _DPI: Final = 80
 _HERE: Final = Path(__file__).parent
 _REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError, ValueError)
@@ -31,6 +32,15 @@ def quantised(values: Values, low: float, high: float) -> npt.NDArray[np.uint8]:
     with np.errstate(invalid="ignore", over="ignore"):
         codes = (values - np.float32(low)) * np.float32(255.0 / (high - low)) + np.float32(1.0)
     return np.where(schema.measured(values), np.clip(codes, 1.0, 255.0), 0.0).astype(np.uint8)
+
+
+def extremes(values: Values, measured: Mask) -> list[tuple[int, int, float]]:
+    """Row, column and value of the coldest and the hottest measured pixel; none without one."""
+    valid = np.where(measured & np.isfinite(values), values, np.nan)
+    if not np.isfinite(valid).any():
+        return []
+    places = [np.unravel_index(find(valid), valid.shape) for find in (np.nanargmin, np.nanargmax)]
+    return [(int(row), int(column), float(valid[row, column])) for row, column in places]
 
 
 class Explorer(anywidget.AnyWidget):
@@ -153,9 +163,20 @@ class Explorer(anywidget.AnyWidget):
             for name in lined
         ]
         self._state["index"] = request["index"]
-        answer = {"index": request["index"], "panes": names, "lined": lined}
+        measured = self.view.counted("measured")
+        spots = {name: extremes(frames[name], measured) for name in names if name in FILMS}
+        answer = {"index": request["index"], "panes": names, "lined": lined, "spots": spots}
         codes = [quantised(frames[name], *ranges[name]) for name in names]
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
+
+    def _answer_profile(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer the values of a pane along a line, about one for each pixel."""
+        start, stop = np.array(request["points"])
+        number = int(np.ceil(np.abs(stop - start).max())) + 1
+        places = np.linspace(start, stop, number).astype(int)
+        rows, columns = np.clip(places, 0, np.array(self.view.shape) - 1).T
+        frame = self.view.frame(request["pane"], request["index"])
+        return {}, [frame[rows, columns].astype(np.float32)]
 
     def _answer_probe(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer values and flags of a pixel."""

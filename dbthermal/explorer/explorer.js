@@ -4,12 +4,14 @@
 
 const ZERO_CELSIUS = 273.15;
 const DIGITS = { "": 3, count: 0 };
-const TOOLS = { move: "Move", rectangle: "Rectangle", ellipse: "Ellipse", polygon: "Polygon" };
+const TOOLS = { move: "Move", rectangle: "Rectangle", ellipse: "Ellipse", polygon: "Polygon", line: "Profile" };
+const PALETTES = { gnuplot2: "iron", turbo: "rainbow" }; // as other programs call them
 const PIXELS = { unflagged: "flagged: hatched", hidden: "flagged: hidden", measured: "measured only", all: "all pixels count" };
 const HIDDEN = { unflagged: [0, 0, 0], all: [0, 0, 0], hidden: [0, 0, 1], measured: [0, 1, 1] }; // good, completed, flagged
 const FILES = { ".csv": "curves of the regions", ".png": "these pictures", ".tiff": "frame of the chosen picture, 32-bit float", ".nc": "frames and curves" };
 const HELP = "Arrow keys: frame, with shift ten. Space: play. M: mark this time. Title: choose what is plotted. Wheel on a clicked "
-  + "picture: zoom; double click: all of it, or the end of a polygon. Hatched: flagged; dotted: completed, not measured.";
+  + "picture: zoom; double click: all of it, or the end of a polygon. Delete: remove the region last clicked or drawn. Ctrl+Z: undo. "
+  + "Hatched: flagged; dotted: completed, not measured. Triangles: hottest and coldest measured pixel.";
 
 function make(parent, tag, className = "", properties = {}) {
   const element = Object.assign(document.createElement(tag), properties);
@@ -80,6 +82,7 @@ function outline({ kind, points }, place = (column, row) => [column, row]) {
   const [[left, top], [right, bottom]] = [corners[0], corners[1] ?? corners[0]];
   if (kind === "rectangle") path.rect(left, top, right - left, bottom - top);
   else if (kind === "ellipse") path.ellipse((left + right) / 2, (top + bottom) / 2, Math.abs(right - left) / 2, Math.abs(bottom - top) / 2, 0, 0, 2 * Math.PI);
+  else if (kind === "line") path.addPath(new Path2D(`M${left} ${top}L${right} ${bottom}`));
   else path.addPath(new Path2D(`M${corners.map((corner) => corner.join(" ")).join("L")}Z`));
   return path;
 }
@@ -128,7 +131,7 @@ class Picture {
       },
     });
     this.low = number(0, "colour range begins");
-    this.bar = make(this.foot, "canvas", "dbt-bar", { width: 256, height: 1 });
+    this.bar = make(this.foot, "canvas", "dbt-bar", { width: 256, height: 24, title: "histogram of this frame, above its colours" });
     this.high = number(1, "colour range ends");
     this.unit = make(this.foot, "span");
     make(this.foot, "button", "dbt-button", { type: "button", textContent: "auto", title: "range of the whole film", onclick: () => this.rescale(null) });
@@ -137,8 +140,8 @@ class Picture {
     Object.assign(this, { limits, codes: null });
     this.explorer.goTo(this.explorer.index);
   }
-  take(codes, range, sides) {
-    Object.assign(this, { codes, range, sides });
+  take(codes, range, sides, spots) {
+    Object.assign(this, { codes, range, sides, spots });
     this.paint();
   }
   paint() {
@@ -152,9 +155,15 @@ class Picture {
   }
   paintScale(palette) {
     const { explorer, pane, range: [from, to] } = this;
-    const bar = new ImageData(256, 1);
-    new Uint32Array(bar.data.buffer).set(palette);
-    this.bar.getContext("2d").putImageData(bar, 0, 0);
+    const [bar, scale] = [this.bar.getContext("2d"), new ImageData(256, 1)], numbers = new Array(256).fill(0);
+    new Uint32Array(scale.data.buffer).set(palette);
+    bar.clearRect(0, 0, 256, 24);
+    for (let row = 16; row < 24; row++) bar.putImageData(scale, 0, row);
+    for (const code of this.codes) numbers[code] += 1;
+    numbers[0] = 0; // no value
+    const most = Math.max(1, ...numbers.slice(2, 255)); // both ends hold all that is beyond the range
+    bar.fillStyle = getComputedStyle(this.foot).color;
+    numbers.forEach((number, at) => { const high = Math.min(15, (15 * number) / most); bar.fillRect(at, 16 - high, 1, high); });
     [this.low.value, this.high.value] = [explorer.text(from, pane), explorer.text(to, pane)];
     this.unit.textContent = explorer.unit(pane);
   }
@@ -173,6 +182,14 @@ class Picture {
     if (pane.kind !== "status") context.drawImage(explorer.hatching(width, height, size), 0, 0);
     if (this.sides) stroke(context, isotherm(this.sides, shape[1], place), ["black", 3], ["#7fffd4", 1.5]);
     for (const [, region, color] of explorer.shownRegions()) stroke(context, outline(region, place), ["white", 4], [color, 2]);
+    (this.spots ?? []).forEach(([row, column, value], hot) => {
+      const [across, down] = place(column + 0.5, row + 0.5), tip = hot ? -9 : 9;
+      stroke(context, new Path2D(`M${across} ${down}l-5 ${tip}h10z`), ["black", 3], ["white", 1.5]);
+      Object.assign(context, { font: `${11 * devicePixelRatio}px sans-serif`, textAlign: across > width / 2 ? "right" : "left", lineWidth: 3, strokeStyle: "black", fillStyle: "white" });
+      const label = [explorer.text(value, pane), across + (across > width / 2 ? -8 : 8), down + (hot ? -4 : 12)];
+      context.strokeText(...label);
+      context.fillText(...label);
+    });
     if (cursor) {
       const [across, down] = place(cursor[1] + 0.5, cursor[0] + 0.5);
       const cross = (near, far) => `M${across - far} ${down}h${far - near}M${across + near} ${down}h${far - near}`
@@ -194,7 +211,7 @@ class Picture {
 
 class Explorer {
   constructor(model, el) {
-    Object.assign(this, { pictures: new Map(), shown: [], changed: new Set(), curves: new Map(), regions: new Map(), events: {}, drawn: -1, number: 1 });
+    Object.assign(this, { pictures: new Map(), shown: [], changed: new Set(), curves: new Map(), regions: new Map(), past: [], events: {}, drawn: -1, number: 1 });
     Object.assign(this, { zoom: { x: 0, y: 0, factor: 1 }, cursor: null, probed: null, selection: "unflagged", palette: 0, isotherm: null });
     this.root = make(el, "div", "dbt-explorer");
     Object.assign(this.root.dataset, { testid: "explorer", lmSuppressShortcuts: "true" }); // or JupyterLab takes the arrow keys
@@ -216,9 +233,10 @@ class Explorer {
       start: () => this.panes || this.build(message, copy),
       frames: () => {
         const sides = (name) => (message.lined.includes(name) ? bytes(message.panes.length + message.lined.indexOf(name)) : null);
-        message.panes.forEach((name, i) => this.pictures.get(name).take(bytes(i), message.ranges[i], sides(name)));
+        message.panes.forEach((name, i) => this.pictures.get(name).take(bytes(i), message.ranges[i], sides(name), message.spots[name]));
         this.shownIndex = message.index;
       },
+      profile: () => { this.profile = copy(0, Float32Array); },
       probe: () => { this.probed = message.values; },
       curves: () => {
         this.curves = new Map(message.names.map((name, i) => [name, { values: copy(i, Float32Array), counts: message.counts[i] }]));
@@ -273,7 +291,7 @@ class Explorer {
       return button;
     });
     this.useTool("move");
-    this.select(bar, "colours", { ...this.paletteNames }, (value) => { this.palette = value; this.repaint(); });
+    this.select(bar, "colours", this.paletteNames.map((name) => PALETTES[name] ?? name), (value) => { this.palette = value; this.repaint(); });
     this.select(bar, "pixels", PIXELS, (value) => { this.selection = value; this.repaint(); this.askCurves(); });
     const name = () => (this.celsius ? "\u00b0C" : "K");
     const unit = this.button(bar, name(), "kelvin or degrees Celsius", () => {
@@ -334,6 +352,7 @@ class Explorer {
       this.goTo(later < 0 ? this.time.length - 1 : later);
     };
     this.list = make(row, "div", "dbt-regions");
+    this.section = make(this.root, "canvas", "dbt-section");
   }
   arrange(statusCodes) {
     this.grid.replaceChildren(...this.shown.map((name) => {
@@ -358,6 +377,10 @@ class Explorer {
     const isotherm = this.isotherm === null ? null : this.isotherm + (this.celsius ? ZERO_CELSIUS : 0);
     this.link.ask("frames", { index: this.index, panes, limits, isotherm });
     this.askProbe();
+    this.askProfile();
+  }
+  askProfile() {
+    if (this.line) this.link.ask("profile", { index: this.index, pane: this.chosen, points: this.line.points });
   }
   askProbe() {
     if (this.cursor) this.link.ask("probe", { index: this.index, row: this.cursor[0], column: this.cursor[1], panes: this.shown });
@@ -380,6 +403,19 @@ class Explorer {
   }
   choose(pane) {
     if (pane.kind !== "status") this.chosen = pane.name;
+    this.askCurves();
+    this.askProfile();
+  }
+  remember() { this.past.push([...this.regions].map(([name, region]) => [name, { ...region }])); }
+  undo() {
+    if (!this.past.length) return;
+    this.regions = new Map(this.past.pop());
+    this.askCurves();
+  }
+  remove(name) {
+    if (!this.regions.has(name)) return;
+    this.remember();
+    this.regions.delete(name);
     this.askCurves();
   }
   setIsotherm(value) {
@@ -404,11 +440,13 @@ class Explorer {
       End: () => this.goTo(this.time.length - 1),
       " ": () => this.play(),
       m: () => this.link.ask("event", { name: `mark ${Object.keys(this.events).length + 1}`, time: this.time[this.index] }),
-      Escape: () => { this.draft = null; this.redraw(); },
+      Escape: () => { this.draft = this.line = this.profile = null; this.redraw(); },
+      Delete: () => this.remove(this.regions.has(this.selected) ? this.selected : [...this.regions.keys()].at(-1)),
+      z: () => this.undo(),
       Enter: () => this.finish(),
     };
     const pressed = [" ", "Enter"].includes(event.key) && event.target.matches("button, summary");
-    if (!actions[event.key] || event.ctrlKey || event.metaKey || pressed) return;
+    if (!actions[event.key] || (event.key === "z") !== (event.ctrlKey || event.metaKey) || pressed) return;
     actions[event.key]();
     event.preventDefault();
     event.stopPropagation();
@@ -446,7 +484,9 @@ class Explorer {
     if (this.tool === "polygon") this.draft = { kind: "polygon", points: [...(this.draft?.points ?? []), at] };
     else if (this.tool !== "move") this.draft = { kind: this.tool, points: [at, at] };
     else {
-      const region = [...this.regions.values()].reverse().find((one) => surface(1, 1).isPointInPath(outline(one), at[1], at[0]));
+      const [name, region] = [...this.regions].reverse().find(([, one]) => surface(1, 1).isPointInPath(outline(one), at[1], at[0])) ?? [];
+      if (region) this.remember();
+      this.selected = name ?? this.selected;
       this.grip = { at, region, points: region?.points };
     }
     this.redraw();
@@ -466,9 +506,15 @@ class Explorer {
   }
   finish() {
     const points = this.draft?.points.filter((one, i, all) => !i || Math.hypot(one[0] - all[i - 1][0], one[1] - all[i - 1][1]) > 0.1) ?? [];
-    const wide = [0, 1].every((i) => Math.max(...points.map((one) => one[i])) - Math.min(...points.map((one) => one[i])) > 0.5);
+    if (this.tool === "line" && points.length === 2) {
+      this.line = { kind: "line", points: points.map((point) => point.map(rounded)) };
+      this.askProfile();
+    }
+    const wide = this.tool !== "line" && [0, 1].every((i) => Math.max(...points.map((one) => one[i])) - Math.min(...points.map((one) => one[i])) > 0.5);
     if (wide && points.length >= (this.tool === "polygon" ? 3 : 2)) {
-      this.regions.set(`region ${this.number++}`, { kind: this.draft.kind, points: points.map((point) => point.map(rounded)) });
+      this.remember();
+      this.selected = `region ${this.number++}`;
+      this.regions.set(this.selected, { kind: this.draft.kind, points: points.map((point) => point.map(rounded)) });
       this.askCurves();
     }
     this.draft = null;
@@ -485,7 +531,7 @@ class Explorer {
   }
   shownRegions() {
     const all = [...this.regions].map(([name, region], i) => [name, region, this.colors[i % this.colors.length]]);
-    return this.draft ? [...all, ["", this.draft, "#000000"]] : all;
+    return [...all, ...[this.line, this.draft].filter(Boolean).map((region) => ["", region, "#000000"])];
   }
   hatching(width, height, size) {
     const key = [width, height, size, this.zoom.x, this.zoom.y, this.selection].join();
@@ -516,6 +562,7 @@ class Explorer {
       this.changed.clear();
       this.clock.textContent = `${this.time[this.index].toFixed(2)} s  (frame ${this.index}, last ${this.time.length - 1})`;
       this.drawPlot();
+      this.drawProfile();
       this.drawn = this.shownIndex;
     });
   }
@@ -574,6 +621,29 @@ class Explorer {
     line(vertical(this.time[this.index]), ink);
     for (const [, color, curve] of regions) this.drawCurve(context, color, curve, (i) => across(this.time[i]), down);
   }
+  drawProfile() {
+    // Values of the chosen picture along the line, at this frame.
+    const { section, profile, line } = this, pane = this.panes.find((one) => one.name === this.chosen);
+    section.hidden = !line || !profile;
+    if (section.hidden) return;
+    const [width, height, values] = [section.clientWidth, section.clientHeight, [...profile].map((value) => value - this.offset(pane))];
+    Object.assign(section, { width: width * devicePixelRatio, height: height * devicePixelRatio });
+    const context = section.getContext("2d"), [left, right, top, bottom] = [64, width - 12, 18, height - 32];
+    context.scale(devicePixelRatio, devicePixelRatio);
+    Object.assign(context, { font: "12px sans-serif", fillStyle: getComputedStyle(this.root).color, strokeStyle: "#8884" });
+    const finite = values.filter(Number.isFinite), [from, to] = line.points;
+    context.fillText(`${capital(pane.label)} along the line ${this.unit(pane) && `[${this.unit(pane)}]`}`, left, 12);
+    if (!finite.length) return;
+    const length = Math.hypot(to[0] - from[0], to[1] - from[1]), margin = Math.max(0.06 * (Math.max(...finite) - Math.min(...finite)), 1e-3);
+    const [low, high] = [Math.min(...finite) - margin, Math.max(...finite) + margin];
+    const across = (at) => left + (at / length) * (right - left), down = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
+    for (const [at, text] of ticks(low, high, (bottom - top) / 30)) { context.fillText(text, 8, down(at) + 4); context.stroke(new Path2D(`M${left} ${down(at)}H${right}`)); }
+    for (const [at, text] of ticks(0, length, (right - left) / 90)) { context.fillText(text, across(at) - 4, bottom + 14); context.stroke(new Path2D(`M${across(at)} ${top}V${bottom}`)); }
+    context.fillText("distance [pixel]", (left + right) / 2 - 40, height - 4);
+    Object.assign(context, { strokeStyle: this.colors[0], lineWidth: 2 });
+    const point = (value, i) => `${across((length * i) / (values.length - 1))} ${down(value)}`;
+    context.stroke(new Path2D(values.map((value, i) => (Number.isFinite(value) ? `${i && Number.isFinite(values[i - 1]) ? "L" : "M"}${point(value, i)}` : "")).join("")));
+  }
   drawCurve(context, color, { mean, low, high, std }, across, down) {
     const point = (i, value) => `${across(i)} ${down(value)}`;
     const runs = this.time.map((_, i) => i).filter((i) => Number.isFinite(mean(i)));
@@ -590,14 +660,16 @@ class Explorer {
   }
   listRegions(regions) {
     const digits = DIGITS[this.plotted?.units] ?? 2;
-    const lines = regions.map(([name, color, { mean, low, high, std, counts }]) => {
+    const lines = regions.map(([name, color, { mean, low, high, std, counts }], order) => {
       const [i, line] = [this.index, make(null, "div", "dbt-region")];
       make(line, "i", "dbt-swatch").style.background = color;
       make(line, "b", "", { textContent: name });
-      this.button(line, "\u00d7", `remove ${name}`, () => { this.regions.delete(name); this.askCurves(); });
+      this.button(line, "\u00d7", `remove ${name}`, () => this.remove(name));
       const bar = Number.isNaN(std(i)) ? "" : ` \u00b1 ${std(i).toFixed(digits + (std(i) < 0.05 ? 1 : 0))}`;
       make(line, "div", "", { textContent: `mean ${mean(i).toFixed(digits)}${bar} ${this.unit(this.plotted)}` });
       make(line, "div", "dbt-faint", { textContent: `${low(i).toFixed(digits)} to ${high(i).toFixed(digits)}; ${counts[1]} of ${counts[0]} pixels` });
+      const unit = this.plotted?.absolute ? "K" : this.unit(this.plotted);
+      if (order) make(line, "div", "dbt-faint", { textContent: `less ${regions[0][0]}: ${(mean(i) - regions[0][2].mean(i)).toFixed(digits)} ${unit}` });
       return line;
     });
     if (lines.length) lines.push(make(null, "div", "dbt-faint", { textContent: "line: mean, with its 95 % interval; dotted: least and greatest pixel" }));

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._arrays import empty, parts
 from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock
@@ -100,7 +101,7 @@ def array(
 
     # The array, checked before it is read.
     with ExitStack() as stack:
-        values = source
+        values: Any = source
         if not isinstance(source, str | Path):
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             times = [axis for axis in coords if containers.are_times(axis.name, axis)]
@@ -110,9 +111,9 @@ def array(
         else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
-        counts = np.asarray(values).astype(np.uint16)
+        counts: Any = values if isinstance(source, str | Path) else recordings.film(values)
     # The numbers: byte order, and values that stand for missing counts.
-    judged = isinstance(source, str | Path) and np.any(counts & 0xFF)  # others tell nothing
+    judged = isinstance(source, str | Path) and any(np.any(frame & 0xFF) for frame in counts)
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
@@ -175,8 +176,13 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
             shape, by_columns, dtype = headers[version](stream)
     _check(shape, dtype, memory, name)
-    size = 2 * int(np.prod(shape, dtype=object))
-    if len(content := stream.read(size + 1)) != size:
-        size_read = f"{len(content)} bytes or more of counts in '{name}'"
-        raise ValueError(f"Truncated or damaged {size_read}. Must be {size}, as its header says.")
-    return np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")
+    counts, size = empty(shape[::-1] if by_columns else shape, np.uint16), 0
+    for frames in parts(counts):
+        size += stream.readinto(counts[frames].view("u1").data)  # type: ignore[attr-defined]
+        if not dtype.isnative:
+            counts[frames].byteswap(inplace=True)
+    size += len(stream.read(1))
+    if size != counts.nbytes:
+        read = f"{size} bytes or more of counts in '{name}'"
+        raise ValueError(f"Truncated or damaged {read}. Must be {counts.nbytes}, by its header.")
+    return counts.T if by_columns else counts

@@ -68,7 +68,7 @@ def read(
         check(values, dims, times if times is not None and times.ndim == 1 else None)
         if isinstance(values, zarr.Array):
             _check_chunks(values, path)
-        return values[...]
+        return recordings.film(values)
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:

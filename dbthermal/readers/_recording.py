@@ -18,7 +18,7 @@ import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import schema
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, empty, made_on_disk, parts
 
 Counts = npt.NDArray[np.uint16]
 
@@ -98,7 +98,7 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bool = False) -> None:
     """Raise ValueError where counts are masked, or values that stand for missing ones."""
-    if masked or (fills and np.isin(counts, fills).any()):
+    if masked or (fills and any(np.isin(counts[at], fills).any() for at in parts(counts))):
         raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
 
 
@@ -108,11 +108,20 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
     if len(shape) != 3 or min(shape) < 1:
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
     frames, height, width = map(int, shape)
-    if (needed := 2 * (frames + 3) * height * width) > memory:  # 3 while one is decoded
+    needed = 2 * (frames + 3) * height * width  # 3 while one is decoded
+    if needed > memory and not made_on_disk():
         raise ValueError(
             f"Invalid size of '{name}': {frames} frames of {height} x {width} pixels take "
             f"{needed:.3g} bytes. Must be at most memory={memory:.3g}."
         )
+
+
+def film(values: Any) -> Counts:
+    """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time."""
+    counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
+    for frames in parts(counts):
+        counts[frames] = values[frames]
+    return counts
 
 
 def smoother(counts: Counts, rearranged: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:

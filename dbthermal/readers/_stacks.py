@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
+from dbthermal._arrays import empty, parts
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock, Paths
 
@@ -105,12 +106,16 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     shape = (sum(page.images for page in pages), *pages[0].shape)
     recordings.check_memory(shape, memory, name)
     # Their pixels, from the places that the pages state.
-    counts, at = np.empty(shape, dtype=np.uint16), 0
+    counts, at = empty(shape, np.uint16), 0
     values = counts.reshape(-1)
     for page in pages:
         for offset, length in page.spans:
-            form = f"{page.order}u2"
-            values[at : at + length // 2] = np.fromfile(page.path, form, length // 2, offset=offset)
+            span = values[at : at + length // 2]
+            for part in parts(span):
+                place = offset + 2 * part.start
+                span[part] = np.fromfile(
+                    page.path, f"{page.order}u2", span[part].size, offset=place
+                )
             at += length // 2
     recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
@@ -182,7 +187,7 @@ def raw(
     recordings.check_memory((frames, *shape), memory, name)
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = np.memmap(file, form, "r", offset=header)["counts"].astype(np.uint16)
+    counts = recordings.film(np.memmap(file, form, "r", offset=header)["counts"])
     if recordings.smoother(counts) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")

@@ -10,6 +10,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
+from dbthermal._arrays import empty, parts
 from dbthermal._text import shown
 from dbthermal._warnings import warned
 from dbthermal.readers import _recording as recordings
@@ -99,19 +100,21 @@ def two_bands(
     # Two cameras, not a file named twice.
     shared = min(recording.sizes["time"] for recording in pair)
     overlapping = [recording["counts"].values[:shared] for recording in pair]
-    if np.array_equal(overlapping[0], overlapping[1]):
+    film, second_film = overlapping
+    if all(np.array_equal(film[at], second_film[at]) for at in parts(film)):
         raise ValueError(
             f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
             "is one file named twice?"
         )
     # Frames of both; the shorter recording is filled up, and flagged.
     frames = max(recording.sizes["time"] for recording in pair)
-    counts = np.empty((2, frames, *shapes[0]), dtype=np.uint16)
+    counts = empty((2, frames, *shapes[0]), np.uint16)
     times = np.full((2, frames), np.nan)
     flags = np.full((2, frames), FileFlag.PADDED.value, dtype=np.uint16)
     for place, (recording, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
         length = recording.sizes["time"]
-        counts[place, :length] = recording["counts"].values
+        for at in parts(recording["counts"].values):
+            counts[place, :length][at] = recording["counts"].values[at]
         counts[place, length:] = recording["counts"].values[-1]
         times[place, :length] = recording["exposure_time"].values + shift
         flags[place, :length] = recording["frame_flags"].values

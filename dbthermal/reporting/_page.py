@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -21,6 +21,18 @@ try:
     from markupsafe import Markup
 except ImportError as error:
     raise ImportError(missing_library(error.name, "report")) from error
+
+
+# The poster is the picture that is printed; the button lies below the film and hides none of it.
+_FILM: Final = Markup("""{
+  const figure = document.currentScript.parentElement, button = figure.querySelector("button");
+  const [film, still] = [figure.querySelector("video"), figure.querySelector("img")];
+  if (still) film.poster = still.src;
+  button.onclick = film.onclick = () => (film.paused ? film.play() : film.pause());
+  film.onplay = film.onpause = () => {
+    button.textContent = film.paused ? "Play the film" : "Pause";
+  };
+}""")
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,8 @@ def save_page(
     origin: str,
     numbers: Mapping[str, Any],
     provenance: Mapping[str, Any],
+    about: str = "",
+    answer: Sequence[str] = (),
 ) -> None:
     """Save sections as one HTML file that asks for nothing else.
 
@@ -61,12 +75,18 @@ def save_page(
         In their order.
     numbers, provenance : mapping
         Numbers, kept in the page as JSON in the element ``numbers``; from `store.provenance`.
+    about : str
+        Author, date and files, beside the origin.
+    answer : sequence of str
+        Sentences above the sections.
     """
     environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True)
     text = resources.files("dbthermal.reporting").joinpath("page.html").read_text("utf-8")
     page = environment.from_string(text).render(
         title=title,
         origin=origin,
+        about=about,
+        answer=list(answer),
         sections=list(sections),
         numbers=htmlsafe_json_dumps(numbers, allow_nan=False, sort_keys=True),
         provenance=json.dumps(provenance, indent=2, sort_keys=True),
@@ -140,12 +160,12 @@ def film_tag(path: str | Path, text: str, poster: str | Path | None = None) -> M
     """
     content = base64.b64encode(Path(path).read_bytes()).decode()
     still = base64.b64encode(Path(poster).read_bytes()).decode() if poster else ""
+    picture = Markup('<img src="data:image/png;base64,{}" alt="{}">').format(still, text)
     return Markup(
-        '<figure><video controls loop muted playsinline{} src="data:video/mp4;base64,{}"></video>'
-        "<figcaption>{}</figcaption></figure>"
-    ).format(
-        Markup(' poster="data:image/png;base64,{}"').format(still) if still else "", content, text
-    )
+        '<figure class="film">{}<video loop muted playsinline src="data:video/mp4;base64,{}">'
+        '</video><figcaption><button type="button">Play the film</button> {}</figcaption>'
+        "<script>{}</script></figure>"
+    ).format(picture if still else "", content, text, _FILM)
 
 
 def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:
@@ -155,7 +175,8 @@ def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:
         '<div class="viewer"><div class="controls"><select data-part="quantity"></select>'
         '<button type="button" data-part="play">Play</button>'
         '<input type="range" min="0" value="0" step="1" data-part="time" aria-label="frame"></div>'
-        '<div class="readout" data-part="readout"></div><canvas data-part="picture"></canvas>'
+        '<div class="readout" data-part="readout"></div><div class="scaled">'
+        '<canvas data-part="picture"></canvas><canvas data-part="bar"></canvas></div>'
         '<canvas data-part="curve"></canvas><p>{}</p>'
         '<script type="application/json">{}</script><script>{}</script></div>'
     ).format(text, htmlsafe_json_dumps(film, allow_nan=False, sort_keys=True), Markup(script))

@@ -15,6 +15,7 @@ from matplotlib.patheffects import withStroke
 from dbthermal import emissivity, figures, schema
 from dbthermal._arrays import Array
 from dbthermal.explorer import Region, View
+from dbthermal.explorer._answer import SPREAD, answer, nearest
 from dbthermal.figures import drawing
 from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
 from dbthermal.reporting._page import Section, image_tag, save_page, table
@@ -23,7 +24,6 @@ from dbthermal.separation._doubts import against_response, hardly_measured
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
-_SPREAD: Final = 0.02  # of emissivities of samples of one material
 _WORDS: Final = {
     "method": "method",
     "settings": "its options",
@@ -41,7 +41,6 @@ _WORDS: Final = {
     "frames_missing": "frames without data of all bands at any pixel",
     "frames_bridged": "frames bridged in a pixel that lacks some, mean",
 }
-_NEAREST: Final = 3  # materials that are named
 
 
 def report(  # noqa: PLR0913 - what is shown beside the result, by name
@@ -53,6 +52,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     regions: Mapping[str, Region] = MappingProxyType({}),
     materials: xr.Dataset | None = None,
     title: str = "Separated thermal scene",
+    author: str = "",
     provenance: Mapping[str, Any] | None = None,
     celsius: bool = True,
     codec: Literal["vp9", "h264"] = "h264",
@@ -79,8 +79,8 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     materials : Dataset, optional
         Stage `emissivity_table`, whose nearest materials are named; `emissivity.embedded_table` if
         not given.
-    title : str
-        Heading.
+    title, author : str
+        Heading, and a name below it.
     provenance : mapping, optional
         From `store.provenance`; that of the result if not given.
     celsius : bool
@@ -142,14 +142,17 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         "uncertainty": _budget(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
+    made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
     # Film, viewer, and the sections of the page.
+    sentences, numbers["answer"] = answer(result, table_)
+    about = [author, *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
     film = video(view, title, codec, celsius=celsius)
     sections = [
         Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),
         Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
         Section("Deviation by cause", list(_causes(numbers["uncertainty"]))),
-        Section("Emissivities", list(_emissivities(numbers["regions"]))),
+        Section("Emissivities", list(_emissivities(numbers, named=bool(regions)))),
         Section("What was assumed", [_assumed(view)]),
     ]
     save_page(
@@ -158,7 +161,12 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         [section for section in sections if section.body],
         origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
         numbers=numbers,
-        provenance=result.attrs.get("provenance", {}) if provenance is None else provenance,
+        provenance=made_by,
+        about=", ".join(filter(None, about)),
+        answer=[
+            sentence.replace("+-", "\N{PLUS-MINUS SIGN}").replace("degC", "\N{DEGREE SIGN}C")
+            for sentence in sentences
+        ],
     )
 
 
@@ -303,41 +311,30 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
         )
         summary["emissivity"] = dict(zip(bands, map(_plain, values), strict=True))
         summary["emissivity_std"] = dict(zip(bands, map(_plain, stds), strict=True))
-        summary["nearest"] = _nearest(bands, values, stds, materials)
+        summary["nearest"] = nearest(bands, values, stds, materials)
     return summary
 
 
-def _nearest(
-    bands: list[str], values: Array, stds: Array, materials: xr.Dataset
-) -> list[dict[str, Any]]:
-    """Materials of a table by their distance from measured emissivities, in standard deviations."""
-    if not set(bands) <= set(materials["band"].values) or not np.isfinite(values + stds).all():
-        return []
-    library = materials["emissivity"].sel(band=bands)
-    spread = np.hypot(stds, _SPREAD)
-    distance = np.sqrt(np.mean(((library.values - values) / spread) ** 2, axis=1))
-    order = np.argsort(distance)[:_NEAREST]
-    names = materials["material"].values
-    return [{"material": str(names[at]), "distance": float(distance[at])} for at in order]
-
-
-def _emissivities(regions: Mapping[str, Mapping[str, Any]]) -> Iterator[Markup | str]:
-    """Yield the emissivities of the regions beside the nearest materials of the table."""
-    measured = {name: of for name, of in regions.items() if of.get("emissivity")}
-    if not measured:
+def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> Iterator[Markup | str]:
+    """Yield the emissivities of materials, and of named regions, beside the nearest known."""
+    places = {f"{entry['pixels']} pixels alike": entry for entry in numbers["answer"]["materials"]}
+    if named:
+        places |= {name: of for name, of in numbers["regions"].items() if of.get("emissivity")}
+    if not places:
         return
-    bands = list(next(iter(measured.values()))["emissivity"])
     rows = []
-    for name, of in measured.items():
-        pairs = [(of["emissivity"][band], of["emissivity_std"][band]) for band in bands]
+    for name, of in places.items():
+        pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
         cells = [f"{_text(value, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for value, std in pairs]
-        near = ", ".join(f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"])
-        rows.append([name, near or "-", *cells])
-    head = ["region", "nearest materials of the table (distance)"]
+        near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
+        rows.append([name, ", ".join(near) or "many", *cells])
+    head = ["measured pixels", "nearest materials of the table (distance)"]
+    bands = next(iter(places.values()))["emissivity"]
     yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
     yield (
-        "Means of the measured pixels. The distance is the root mean square over the bands, in "
-        f"standard deviations, to which {_SPREAD} is added for what samples of a material differ. "
+        "Medians of pixels that are alike, and means of regions. The distance is the root mean "
+        "square over the bands, in standard deviations, to which "
+        f"{SPREAD} is added for what samples of a material differ. "
         "A near material is no identification: many share two emissivities."
     )
 

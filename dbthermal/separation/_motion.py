@@ -23,7 +23,7 @@ from dbthermal.separation._misfit import Misfit, object_weights, reflected, smoo
 _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
 # Mean square of a motion over its variance, from which it is undone: of 10^5 frames without motion
 # none has a mean over 250 of more than 1.5.
-_SURE: Final = 3.0
+_SURE: Final = 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
 

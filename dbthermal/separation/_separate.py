@@ -41,7 +41,7 @@ _UNEXPLAINED: Final = (
     "small."
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
-_ROUNDS, _BETTER = 3, 0.7
+_ROUNDS, _BETTER = 3, 0.8
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
 
 

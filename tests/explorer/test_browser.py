@@ -37,6 +37,7 @@ explorer = dbthermal.explore({arguments})
 explorer"""
 
 
+EXPLORER = "document.querySelector('[data-testid=explorer]').explorer"
 STEPS = """async () => {
     const explorer = document.querySelector('[data-testid=explorer]').explorer, times = [];
     for (let i = 1; i <= 60; i++) {
@@ -198,6 +199,33 @@ def check_curve(page: Any, view: View, name: str) -> Region:
     return region
 
 
+def check_tools(page: Any, view: View, region: Region, index: int) -> None:
+    """Profile, hottest and coldest pixel, difference of two regions, undo and Delete at a frame."""
+    canvas = page.locator("canvas[data-pane=object_temperature]")
+    frame = view.frame("object_temperature", index)
+    page.locator("[data-tool=line]").click()
+    drag(page, canvas, (0.02, 0.52), (0.98, 0.52))
+    page.wait_for_function(f"{EXPLORER}.profile?.length > 25")
+    profile = np.float32(page.evaluate(f"Array.from({EXPLORER}.profile)"))
+    assert np.isin(profile, frame[12]).all()
+    spots = page.evaluate(f"{EXPLORER}.pictures.get('object_temperature').spots")
+    measured = np.where(view.counted("measured"), frame, np.nan)
+    expected = [np.nanmin(measured), np.nanmax(measured)]
+    np.testing.assert_allclose([value for *_, value in spots], expected, rtol=0, atol=1e-4)  # [K]
+    # A second region, less the first.
+    page.locator("[data-tool=rectangle]").click()
+    drag(page, canvas, (0.7, 0.4), (0.9, 0.8))
+    second = check_curve(page, view, "region 2")
+    curves = [view.curve("object_temperature", place)["mean"] for place in (region, second)]
+    difference = float(curves[1][index] - curves[0][index])  # [K]
+    assert f"less region 1: {difference:.2f} K" in page.locator(".dbt-regions").inner_text()
+    # Both are removed, and brought back step by step: drawn, moved, drawn, removed, removed.
+    for key, left in {"Delete": (1, 0), "Control+z": (1, 2, 1, 1, 0)}.items():
+        for number in left:
+            page.keyboard.press(key)
+            assert page.evaluate(f"{EXPLORER}.regions.size") == number
+
+
 def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     """Curves of a drawn and a moved region are the view's; keys step; no request goes outside."""
     response, rng = simulation.Rig().response(), np.random.default_rng(4)
@@ -234,6 +262,7 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     level = float(np.nanmedian(frame))
     sides = np.reshape(page.evaluate(SIDES, level - 273.15), view.shape)
     np.testing.assert_array_equal(sides, np.where(np.isnan(frame), 0, 1 + (frame > level)))
+    check_tools(page, view, after, start + 11)
     if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
         page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
     assert (lab.outside, lab.errors) == ([], [])

@@ -16,6 +16,11 @@ from dbthermal.explorer import Region
 from dbthermal.schema import Status, status_attrs
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+COLORS = """() => {{
+    const canvas = document.querySelector('[data-part={part}]');
+    const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+    return new Set(new Uint32Array(data.buffer)).size;
+}}"""
 HOSTILE = "</script><script>document.title = 'taken'</script><img src=x onerror=alert(1)>"
 
 
@@ -69,6 +74,26 @@ def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
     assert all(one.startswith(("data:", "#")) for one in sources)
 
 
+def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
+    """How hot, how sure, how much, and emissivities of two materials each by its own pixels."""
+    data = scene(source="a.tif and b.tif")
+    data["emissivity"].values[:, :, 8:] = np.array([0.928, 0.871])[:, None, None]
+    dbthermal.report(data, tmp_path / "scene.html", title="Wall", author="A. Tester")
+    page = (tmp_path / "scene.html").read_text("utf-8")
+    head = page.partition("<h2")[0]
+    assert "A. Tester, a.tif and b.tif" in head
+    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically \N{PLUS-MINUS SIGN} 0.03 K" in head
+    assert "Measured: 95% of the pixels; completed from what else is known: 4%." in head
+    found = numbers(page)["answer"]
+    assert found["measured"] == pytest.approx(1 - 9 / 192)
+    materials = {entry["nearest"][0]["material"]: entry for entry in found["materials"]}
+    assert materials["construction concrete"]["pixels"] == 96
+    assert materials["plate window glass"]["pixels"] == 87
+    assert materials["plate window glass"]["emissivity"]["9.5"] == pytest.approx(0.718)
+    assert "96 pixels alike" in page
+    assert "construction concrete (0.0)" in page
+
+
 def test_only_measured_pixels_count(tmp_path: Path) -> None:
     """Completed emissivities, far off here, do not enter the mean; warnings and calibration do."""
     data = scene(blackbody="4 temperatures of 20.00, 40.00, 60.00, 85.00 degC")
@@ -80,6 +105,22 @@ def test_only_measured_pixels_count(tmp_path: Path) -> None:
     assert found["emissivity"]["9.5"] == pytest.approx(0.718)
     for text in ("<strong>Fixed pattern of 100.</strong>", "20.00, 40.00, 60.00", "data:image/png"):
         assert text in page
+
+
+def test_a_large_scene_fits_into_a_letter(tmp_path: Path) -> None:
+    """A report of many pixels and frames of noise, with both inputs, has at most 8 MB."""
+    rng = np.random.default_rng(1)
+    place = {"time": np.arange(120) // 6, "y": np.arange(120) // 10, "x": np.arange(160) // 10}
+    large = scene().isel(place).assign_coords(time=np.arange(120) / 4)
+    for name in ("object_temperature", "background_temperature"):
+        large[name] = large[name] + rng.normal(0, 0.1, large[name].shape).astype(np.float32)
+    counts = rng.normal(20000, 10, (2, 120, 120, 160)) + 5.0 * np.arange(160)
+    parts = {"counts": (("band", "time", "y", "x"), counts.astype("f4"), {"units": "count"})}
+    capture = xr.Dataset(parts, {"time": large["time"], "band": large["band"]})
+    dbthermal.report(large, tmp_path / "scene.html", capture)
+    size = (tmp_path / "scene.html").stat().st_size
+    print(f"{size / 1e6:.1f} MB")
+    assert size < 8e6  # [byte]
 
 
 def test_same_result_gives_same_bytes(tmp_path: Path) -> None:
@@ -137,5 +178,22 @@ def test_page_works_without_a_network(tmp_path: Path) -> None:
         assert "4.75 s" in readout.inner_text()
         page.locator("[data-part=picture]").click(position={"x": 3, "y": 3})
         assert "row 0, column 0: no value" in readout.inner_text()
+        assert readout.inner_text().endswith(", flagged")
+        page.locator("[data-part=picture]").click(position={"x": 50, "y": 50})  # of row 1
+        assert readout.inner_text().endswith(", completed and not measured")
+        # The object first, with colours by a bar, and round ticks without -0.0.
+        assert page.locator("[data-part=quantity]").input_value() == "object_temperature"
+        assert page.evaluate(COLORS.format(part="bar")) > 40
+        assert page.evaluate(COLORS.format(part="picture")) > 2
+        # A narrow page has no part outside; a printed one has the picture of the film.
+        page.set_viewport_size({"width": 390, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        for part in ("picture", "bar", "curve"):
+            box = page.locator(f"[data-part={part}]").bounding_box()
+            assert box is not None
+            assert box["x"] + box["width"] <= 390
+        page.emulate_media(media="print")
+        assert page.locator(".film img").is_visible()
+        assert not page.locator("video").is_visible()
         browser.close()
     assert errors == []

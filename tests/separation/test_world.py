@@ -1,4 +1,7 @@
-"""Intervals in situations that the paper does not assume hold, or their pixels have a flag."""
+"""In situations that the paper does not assume, intervals hold, or pixels have a flag."""
+
+import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -6,33 +9,52 @@ from worlds import RESPONSE, World, seen
 
 from dbthermal import separation
 
-WORLDS = {
-    "plain": World(),
-    "fine detail": World(detail=0.01),
-    "lenses blur unlike": World(blur=(0.5, 1.3)),
-    "lenses blur alike": World(blur=(0.9, 0.9)),
-    "second camera sharper": World(blur=(1.2, 0.4)),
-    "rough surface": World(roughness=(2.0, 2.8)),
-    "cameras shake": World(shake=(0.3, 0.3), detail=0.01),
-    "each camera shakes": World(shake=(0.25, 0.3), detail=0.01),
-    "fabrics": World(fabric=(0.92, 0.80)),
-    "1/f noise": World(flicker=0.5),
-    "lock-in": World(lamp=0.3),
-    "foil": World(behind=(0.10, 0.15), surface=((0.75, 0.60), (0.75, 0.60))),
-    "breathing skin": World(breath=0.5, detail=0.003, surface=((0.93, 0.85), (0.93, 0.85))),
+SKIN, PLASTIC = (0.93, 0.85), (0.75, 0.60)
+DETAIL = 0.01
+# Situation, the warning that it earns, and the situation without it, whose error is compared.
+WORLDS: dict[str, tuple[World, str, str]] = {
+    "plain": (World(), "", ""),
+    "fine detail": (World(detail=DETAIL), "", ""),
+    "lenses blur alike": (World(blur=(0.9, 0.9)), "", ""),
+    "lenses blur unlike": (World(blur=(0.5, 1.3)), "not equally sharp", "lenses blur alike"),
+    "cameras shake": (World(shake=(0.3, 0.3), detail=DETAIL), "image moved", "fine detail"),
+    "1/f noise": (World(flicker=0.5), "", ""),
+    "fabrics": (World(fabric=(0.92, 0.80)), "", ""),
+    "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
+    "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
+    "lock-in": (World(lamp=0.3), "", ""),
+    "foil": (World(behind=(0.10, 0.15), surface=(PLASTIC, PLASTIC)), "", ""),
+    "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
-PLAIN = ("plain", "lenses blur alike")
+QUICK = list(WORLDS)[:7]
+# A camera's motion that is left makes bars somewhat too small.
+LEAST, LEAST_SHAKEN, MOST_RMSE = 0.9, 0.85, 1.5
 
 
-def judged(name: str, seed: int) -> tuple[float, float, float, list[str]]:
-    """Share of the intervals that hold, of pixels without a flag, their RMSE, and warnings."""
-    capture, truth = seen(WORLDS[name], seed)
-    with pytest.warns() if name not in PLAIN else _nothing():
+@cache
+def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]:
+    """Share of the intervals that hold, share and RMSE [K] of pixels without a flag, warnings."""
+    capture, truth = seen(WORLDS[name][0], seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
         result = separation.separate(capture, RESPONSE)
     sound = result["status"].values == 0
     error = (result["object_temperature"].values - truth)[:, sound]
     holds = np.abs(error) < 1.96 * result["object_temperature_std"].values[:, sound]
-    rmse = float(np.sqrt(np.mean(error**2))) if sound.any() else 0.0
-    cover = float(holds.mean()) if sound.any() else 1.0
-    print(f"{name}: {cover:.3f} hold of {sound.mean():.3f} without a flag, RMSE {rmse:.3f} K")
-    return cover, float(sound.mean()), rmse, result.attrs.get("warnings", [])
+    figures = float(holds.mean()), float(sound.mean()), float(np.sqrt(np.mean(error**2)))
+    print(name, seed, *(f"{figure:.3f}" for figure in figures))
+    return *figures, tuple(result.attrs.get("warnings", []))
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in [*WORLDS][7:])]
+)
+def test_intervals_hold(name: str, seed: int) -> None:
+    """In 9 of 10 samples without a flag; what was mended is said, and nearly as good as without."""
+    holds, _, rmse, said = outcome(name, seed)
+    _, sentence, without = WORLDS[name]
+    assert holds >= (LEAST_SHAKEN if "shake" in name else LEAST)
+    assert any(sentence in line for line in said) or not sentence
+    if without:
+        assert rmse <= MOST_RMSE * outcome(without, seed)[2]

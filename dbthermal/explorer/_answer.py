@@ -1,0 +1,164 @@
+"""Answer of a result in a few sentences: how hot, how sure, how much of it, which materials."""
+
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from scipy.constants import zero_Celsius
+
+from dbthermal import emissivity, schema
+from dbthermal._arrays import Array, Mask
+from dbthermal.schema import Status
+from dbthermal.separation._doubts import hardly_measured
+
+SPREAD: Final = 0.02  # of emissivities of samples of one material
+_ALIKE: Final = 3.0  # standard deviations up to which a material of the table is named
+_VAGUE: Final = 0.15  # deviation from which most is alike: the demonstration's tape has 0.18
+_RANGE: Final = (1.0, 99.0)  # percentiles of the temperatures that are said
+_ROWS, _TIMES = 64, 60  # of the image and the film that are looked at, at most
+_NOISE: Final = ("noise", "ratio")  # causes that both bands show; all else is the calibration's
+_COMMON: Final = 0.02  # share of the pixels from which a material is listed
+_DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
+
+
+def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[list[str], Any]:
+    """Sentences on a result for whoever asks how hot it is and how sure, and their numbers.
+
+    Parameters
+    ----------
+    result : Dataset
+        Stage `separated`, also a lazy one: some rows and frames of its films are read.
+    materials : Dataset, optional
+        Stage `emissivity_table`; `emissivity.embedded_table` if not given.
+
+    Returns
+    -------
+    list of str, dict
+        Sentences, and `object_temperature_degC` (two), `object_temperature_std_K`, by cause,
+        `measured` and `completed` as shares of the pixels, and the list `materials`.
+    """
+    table = emissivity.embedded_table() if materials is None else materials
+    height, width = result.sizes["y"], result.sizes["x"]
+    status = result["status"].values if "status" in result else np.zeros((height, width), np.uint32)
+    measured, completed = status == 0, (status & np.uint32(schema.COMPLETED)) != 0
+    numbers: dict[str, Any] = {"measured": float(measured.mean())}
+    numbers["completed"] = float(completed.mean())
+    # Temperatures of measured pixels, or of all where none is.
+    limits = ((height, _ROWS), (result.sizes["time"], _TIMES))
+    rows, times = (slice(0, None, -(-size // most)) for size, most in limits)
+    part = result.isel(time=times, y=rows)
+    film = part["object_temperature"].values
+    valid = np.isfinite(film) & (measured[rows] if measured[rows].any() else True)
+    sentences = list[str]()
+    if valid.any():
+        low, high = np.percentile(film[valid], _RANGE) - zero_Celsius
+        deviations = _deviations(part, valid)
+        numbers |= {"object_temperature_degC": [float(low), float(high)]}
+        numbers |= {"object_temperature_std_K": deviations}
+        bars = " and ".join(f"+- {value:.2g} K ({cause})" for cause, value in deviations.items())
+        name = "Object" if measured.any() else "Object, completed and not measured,"
+        typical = f"typically {bars}" if bars else "without a standard deviation"
+        sentences.append(f"{name} from {low:.1f} to {high:.1f} degC, {typical}.")
+    else:
+        sentences.append("No object temperature at any pixel.")
+    # Shares of the pixels.
+    rest = f"completed from what else is known: {completed.mean():.0%}"
+    sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {rest}.")
+    # Materials, and what to watch out for.
+    numbers["materials"] = listed = by_material(result, measured, table)
+    for entry in listed:
+        pairs = zip(entry["emissivity"].items(), entry["emissivity_std"].values(), strict=True)
+        values = ", ".join(f"{value:.3f} +- {std:.3f} ({band})" for (band, value), std in pairs)
+        name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
+        sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
+    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
+    flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
+    doubts += [
+        f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
+        for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])
+        if share >= _DOUBTED and not bit & schema.COMPLETED
+    ]
+    return sentences + [f"Watch out: {doubt}" for doubt in dict.fromkeys(doubts)], numbers
+
+
+def _deviations(part: xr.Dataset, valid: Mask) -> dict[str, float]:
+    """Typical deviation of the object temperature [K]: noise, and calibration if it is known."""
+    if "object_temperature_std" not in part:
+        return {}
+    squares = {"noise": part["object_temperature_std"] ** 2}
+    if "uncertainty" in part:  # by cause, of each pixel
+        causes = part["uncertainty"] ** 2
+        by_noise = causes["cause"].isin(_NOISE)
+        squares = {"noise": causes.where(by_noise).sum("cause", min_count=1)}
+        squares["calibration"] = causes.where(~by_noise).sum("cause", min_count=1)
+    typical = dict[str, float]()
+    for name, square in squares.items():
+        values = np.broadcast_to(square.values, valid.shape)[valid]
+        if np.isfinite(values).any():
+            typical[name] = float(np.sqrt(np.nanmedian(values)))
+    return typical
+
+
+def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[dict[str, Any]]:
+    """Emissivities of the measured pixels, by the nearest material of a table.
+
+    Pixels that the separation took for one material (`material`) are judged by their median. The
+    commonest first; ``nearest`` is empty where many materials of the table are alike.
+    """
+    if not {"emissivity", "emissivity_std"} <= {*result.data_vars}:
+        return []
+    bands = [str(band) for band in result["band"].values]
+    values, stds = (
+        result[name].transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
+        for name in ("emissivity", "emissivity_std")
+    )
+    finite = np.isfinite(values + stds).all(axis=1)
+    values, stds = values[finite], stds[finite]
+    vague = stds.max(axis=1, initial=0.0) >= _VAGUE
+    # Medians of each label, which tell materials apart that single pixels do not.
+    judged, deviations = values.copy(), stds.copy()
+    labels = np.full(len(values), -1)
+    if "material" in result:
+        labels = result["material"].values[measured][finite]
+    for label in np.unique(labels[labels >= 0]):
+        judged[labels == label] = np.median(values[labels == label], axis=0)
+        deviations[labels == label] = 0.0
+    # Groups of pixels alike the commonest nearest material, then of the rest.
+    groups, free = [vague], ~vague
+    if {*bands} <= {*table["band"].values}:
+        distances = distance(bands, judged, deviations, table)
+        first, free = distances.argmin(axis=1), free & (distances.min(axis=1) < _ALIKE)
+        while free.sum() >= max(1, _COMMON * len(values)):
+            commonest = np.bincount(first[free]).argmax()
+            groups.append(free & (distances[:, commonest] < _ALIKE))
+            free = free & ~groups[-1]
+    # Medians of each, and the materials within a deviation.
+    listed = []
+    for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
+        middle, std = (np.median(array[pixels], axis=0) for array in (values, stds))
+        entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
+        entry |= {"emissivity": dict(zip(bands, middle.tolist(), strict=True))}
+        entry |= {"emissivity_std": dict(zip(bands, std.tolist(), strict=True))}
+        if pixels is not groups[0]:
+            near = nearest(bands, middle, std, table)
+            entry["nearest"] = [place for place in near if place["distance"] < 1]
+        listed.append(entry)
+    return sorted(listed, key=lambda entry: -entry["pixels"])
+
+
+def nearest(
+    bands: list[str], values: Array, stds: Array, table: xr.Dataset, number: int = 3
+) -> list[dict[str, Any]]:
+    """Materials of a table that are nearest to emissivities (band), and how far they are."""
+    if not {*bands} <= {*table["band"].values} or not np.isfinite(values + stds).all():
+        return []
+    far, names = distance(bands, values, stds, table), table["material"].values
+    order = np.argsort(far)[:number]
+    return [{"material": str(names[at]), "distance": float(far[at])} for at in order]
+
+
+def distance(bands: list[str], values: Array, stds: Array, table: xr.Dataset) -> Array:
+    """Distance (..., material) of emissivities (..., band), root mean square in deviations [1]."""
+    library = table["emissivity"].sel(band=bands).transpose("material", "band").values
+    ratio = (library - values[..., None, :]) / np.hypot(stds, SPREAD)[..., None, :]
+    return np.asarray(np.sqrt(np.mean(ratio**2, axis=-1)))
