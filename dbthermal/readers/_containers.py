@@ -4,8 +4,10 @@ import math
 import re
 import struct
 import warnings
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +15,7 @@ import numpy as np
 import xarray as xr
 import zarr
 
+from dbthermal import _text as texts
 from dbthermal.readers import _recording as recordings
 
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
@@ -132,6 +135,7 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
+    deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         root = zarr.open(str(path), mode="r")
         members: dict[str, Any] = {path.stem: root}
@@ -163,10 +167,21 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
                 sizes = struct.unpack("<4xI4xI", stream.read(16).ljust(16, b"\0"))
             if sizes != (values.dtype.itemsize * math.prod(pieces), key.stat().st_size):
                 raise ValueError(f"Damaged chunk '{key.name}' of '{path.name}'. Must be whole.")
+    # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
+    if values.shards:
+        fill = values.dtype.type(values.fill_value == 0)
+        metadata: Any = replace(values.metadata, fill_value=fill)  # type: ignore[type-var]
+        refilled = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
+        for start in range(0, values.shape[0], values.shards[0]):
+            frames = slice(start, start + values.shards[0])
+            if not np.array_equal(values[frames], refilled[frames]):
+                label = f"Missing chunks in the shards of '{values.path or path.stem}'"
+                raise ValueError(f"{label} of '{path.name}'. Must be whole.")
+    # What pads the last chunks, which is of one value.
     metadata = values.metadata.update_shape(whole)
     padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
     more = len(keys) > math.prod(grid)
-    for axis, size in enumerate(values.shape):  # what pads the last chunks is of one value
+    for axis, size in enumerate(values.shape):
         beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])
         more = more or bool(beyond.size and np.ptp(beyond))
     if more:

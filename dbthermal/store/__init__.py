@@ -4,24 +4,26 @@
 `join_parts` one whose rows several processes make;
 `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
 record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
-`HeldFolder` is found wherever it is moved. No other package writes zarr.
+`HeldFolder` is found wherever it is moved. What `whole` writes appears whole, and what is `held`
+belongs to one process. No other package writes zarr.
 """
 
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows
-from dbthermal.store._recording import HeldFolder, Recording, to_disk
+from dbthermal.store._recording import HeldFolder, Recording
 from dbthermal.store._results import (
     checksum,
     provenance,
     save_figure,
     save_text,
     save_video,
-    whole,
 )
+from dbthermal.store._whole import held, to_disk, whole
 
 __all__ = [
     "HeldFolder",
     "Recording",
     "checksum",
+    "held",
     "join_parts",
     "open_dataset",
     "provenance",
