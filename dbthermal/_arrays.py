@@ -7,6 +7,7 @@ as the process's memory until they are released (`release`).
 import importlib
 import mmap
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -84,11 +85,18 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     folder, size = _FOLDER.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
     if folder is None or size < _LEAST:
         return np.empty(shape, dtype)
-    with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
-        file.truncate(size)
-        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
-            os.posix_fallocate(file.fileno(), 0, size)
-        pages = mmap.mmap(file.fileno(), size)
+    try:
+        with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
+            file.truncate(size)
+            if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
+                os.posix_fallocate(file.fileno(), 0, size)
+            pages = mmap.mmap(file.fileno(), size)
+    except OSError as error:
+        room = f"with room: {shutil.disk_usage(folder).free / 1e6:.3g} MB are free"
+        raise OSError(
+            f"No film of {size / 1e6:.3g} MB in '{folder}', beside the output: {error.strerror}. "
+            f"Must be a folder that can be written to, on a disk {room}."
+        ) from error
     _MAPS.add(pages)
     return np.frombuffer(pages, dtype).reshape(shape)
 

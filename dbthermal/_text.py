@@ -74,11 +74,6 @@ def tree_files(root: Path) -> Iterator[str]:
                     raise ValueError(f"{label}. Must be a regular file in it.")
 
 
-def printable(text: str) -> str:
-    """Text without characters that control a terminal, or hide others: these as escapes."""
-    return "".join(it if it.isprintable() or it == "\n" else ascii(it)[1:-1] for it in text)
-
-
 def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
     """Text of a `regular_file` with newlines, without byte-order mark; ValueError by line."""
     content = regular_file(path, limit).read_bytes()

@@ -2,10 +2,11 @@
 
 import argparse
 import math
+import shutil
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -18,12 +19,20 @@ from dbthermal import (
     emissivity,
     limits,
     scene,
+    schema,
     separation,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._warnings import warned
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
+
+_OUTPUTS: Final = {
+    "import": "capture",
+    **dict.fromkeys(("correct", "align"), "corrected"),
+    **dict.fromkeys(("separate", "complete"), "separated"),
+}
+"""Command -> stage of what it writes, whose size follows from that of a capture."""
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, Any]:
@@ -190,7 +199,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
 def foreseen(
     options: argparse.Namespace, sources: list[Path], targets: list[Path]
 ) -> dict[str, Any]:
-    """Inputs and outputs of a command, and the memory that a separation takes at most."""
+    """Inputs and outputs of a command with their bytes, and the memory that a separation takes."""
     inputs = dict[str, Any]()
     for path in sources:
         contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
@@ -200,6 +209,19 @@ def foreseen(
     summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
         summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
+    # Bytes of an output before its compression, and those that the disk has for it.
+    outlines = [summary.get("would_be", {}), *inputs.values()]
+    sizes = next((it["sizes"] for it in outlines if "time" in it.get("sizes", {})), None)
+    if sizes and options.command in _OUTPUTS:
+        stage = _OUTPUTS[options.command]
+        variables = (schema.STAGES[stage] | schema.OPTIONAL[stage]).values()
+        sizes = {"axis": 2, "other_band": sizes["band"], **sizes}
+        values = [math.prod(sizes[dim] for dim in it.dims) for it in variables]
+        sizes_of_types = [np.dtype(it.dtype).itemsize for it in variables]
+        summary["would_write_bytes_at_most"] = int(np.dot(values, sizes_of_types))
+    if targets:
+        place = next(folder for folder in targets[0].absolute().parents if folder.is_dir())
+        summary["free_bytes"] = shutil.disk_usage(place).free
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))

@@ -15,6 +15,7 @@ from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
+from dbthermal.bands import FILTERS
 from dbthermal.schema import Status
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._completion.complete import Beside, filled
@@ -34,6 +35,11 @@ _UNEXPLAINED: Final = (
     "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
     "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
     "small."
+)
+_NOT_COMPLETED: Final = (
+    "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
+    f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
+    "their emissivities."
 )
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
 
@@ -69,7 +75,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         Labels (y, x) of the materials, -1 for none; found if not given and scikit-image is
         installed (extra "materials").
     surroundings, surroundings_std, prior
-        As in `complete`.
+        As in `complete`. Without a prior, and of bands that no library has, nothing is completed.
     settings : SubspaceSettings, optional
         Options of the method "subspace".
     alone : Dataset, optional
@@ -109,7 +115,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     # Check the inputs, before the work.
     context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
-    stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
+    names = [str(band) for band in corrected["band"].values]
+    completable = _completable(prior, names)
     require_workers(workers)
     inputs = check(corrected, response, get_method("subspace"), settings=settings)
     response = inputs.response  # with one noise for all steps
@@ -143,10 +150,19 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result = result.copy(deep=True)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=reflection_shift)
-    result = filled(result, corrected, response, context, workers)
+    doubts += [] if completable else [_NOT_COMPLETED.format(names)]
+    result = filled(result, corrected, response, context, workers) if completable else result
     if materials is not None:
         result["material"] = materials
     return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
+
+
+def _completable(prior: str | xr.DataArray | xr.Dataset | None, names: list[str]) -> bool:
+    """Tell whether a prior knows the bands; ValueError for one that is stated and does not."""
+    if prior is None and not FILTERS.keys() >= set(names):
+        return False
+    stated(prior, names)
+    return True
 
 
 def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr.Dataset:

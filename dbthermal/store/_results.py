@@ -100,7 +100,9 @@ def commit() -> str:
 def _git(folder: Path, *arguments: str) -> str:
     """Output of a git command in `folder`; empty if it fails or git is absent."""
     command = ["git", "-C", str(folder), *arguments]
-    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+    # Not those of another clone, as a hook of git has them.
+    environment = {name: it for name, it in os.environ.items() if not name.startswith("GIT_")}
+    environment["GIT_OPTIONAL_LOCKS"] = "0"
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     except FileNotFoundError:

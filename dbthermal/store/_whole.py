@@ -115,9 +115,9 @@ def _reasons(path: Path, folder: Path) -> Iterator[None]:
             raise
         room = next(parent for parent in path.absolute().parents if parent.is_dir())
         failed = type(error)(
-            f"Output '{path}' is not written: {error.strerror or error}. Must be in a folder that "
-            f"can be written to, on a disk with room: {shutil.disk_usage(room).free / 1e6:.0f} MB "
-            "are free."
+            f"Output '{path}' is not written: {error.strerror or os.strerror(errno.ENOSPC)}. Must "
+            "be in a folder that can be written to, on a disk with room: "
+            f"{shutil.disk_usage(room).free / 1e6:.3g} MB are free."
         )
         failed.errno = error.errno
         raise failed from error
