@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -304,7 +305,11 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         summary = _command("steps", "foreseen")(options, sources, targets)
     else:
         start = time.monotonic()
-        summary = _command(module, function)(options)
+        with ExitStack() as places:
+            for path in targets:  # which no other process writes to from here on
+                places.enter_context(import_module("dbthermal.store").reserved(path))
+            _sources_and_targets(options)  # and to which none has written meanwhile
+            summary = _command(module, function)(options)
         if not sys.stderr.isatty():  # where no bar was shown
             print(f"{options.command}: {time.monotonic() - start:.1f} s", file=sys.stderr)
     # The summary, for programs or for people.

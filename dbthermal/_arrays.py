@@ -7,7 +7,6 @@ as the process's memory until they are released (`release`).
 import importlib
 import mmap
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -92,11 +91,8 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
                 os.posix_fallocate(file.fileno(), 0, size)
             pages = mmap.mmap(file.fileno(), size)
     except OSError as error:
-        room = f"with room: {shutil.disk_usage(folder).free / 1e6:.3g} MB are free"
-        raise OSError(
-            f"No film of {size / 1e6:.3g} MB in '{folder}', beside the output: {error.strerror}. "
-            f"Must be a folder that can be written to, on a disk {room}."
-        ) from error
+        label = f"No film of {size / 1e6:.3g} MB in '{folder}', beside the output"
+        raise OSError(f"{label}: {error.strerror}. Must have room, and be writable.") from error
     _MAPS.add(pages)
     return np.frombuffer(pages, dtype).reshape(shape)
 

@@ -212,13 +212,12 @@ def foreseen(
     # Bytes of an output before its compression, and those that the disk has for it.
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sizes = next((it["sizes"] for it in outlines if "time" in it.get("sizes", {})), None)
-    if sizes and options.command in _OUTPUTS:
-        stage = _OUTPUTS[options.command]
-        variables = (schema.STAGES[stage] | schema.OPTIONAL[stage]).values()
+    if sizes and (stage := _OUTPUTS.get(options.command)):
         sizes = {"axis": 2, "other_band": sizes["band"], **sizes}
-        values = [math.prod(sizes[dim] for dim in it.dims) for it in variables]
-        sizes_of_types = [np.dtype(it.dtype).itemsize for it in variables]
-        summary["would_write_bytes_at_most"] = int(np.dot(values, sizes_of_types))
+        summary["would_write_bytes_at_most"] = sum(
+            math.prod(sizes[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
+            for variable in (schema.STAGES[stage] | schema.OPTIONAL[stage]).values()
+        )
     if targets:
         place = next(folder for folder in targets[0].absolute().parents if folder.is_dir())
         summary["free_bytes"] = shutil.disk_usage(place).free

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
@@ -94,7 +95,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     TypeError, ValueError
         As `solve` does; if the memory is too small for a row, or the parts are of another run.
     BlockingIOError
-        With the process, while another one separates into the same target.
+        With its name, while another process separates into the target.
     ExceptionGroup
         Errors of several captures, each with the capture's name; all others are finished.
 
@@ -132,7 +133,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     ):
 
         def separate(pair: tuple[Path | xr.Dataset, Path]) -> None:
-            _separate_capture(*pair, plan, dict(provenance), executor, memory, bar, blocks)
+            with store.reserved(pair[1]):
+                _separate_capture(*pair, plan, dict(provenance), executor, memory, bar, blocks)
 
         runs = [captures.submit(separate, pair) for pair in pairs]
         try:
@@ -202,33 +204,31 @@ def _separate_capture(
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed at its very end
         return
     plan = replace(plan, response=response, height=height, provenance=made)
-    _check_parts(folder)
-    with store.held(folder, target):
-        _begin(folder, {"height": height, **made})
-        end = capture.sizes["y"]
-        paths = {top: folder / f"{top:06d}.zarr" for top in range(0, end, height)}
-        # Separate the blocks that are missing, those of one reading together.
-        with ThreadPoolExecutor(threads) as pool:
-            missing = list[Future[None]]()
-            for top in range(0, end, read):
-                rows = slice(top, min(top + read, end))
-                blocks = range(top, rows.stop, height)
-                places = {row - top: paths[row] for row in blocks if not paths[row].exists()}
-                if places:
-                    block = source if isinstance(source, Path) else capture.isel(y=rows)
-                    task = block, rows, places, plan.of_rows(rows)
-                    missing.append((executor or pool).submit(_separate_rows, *task))
-            jobs.extend(missing)
-            bar.total = (bar.total or 0) + len(missing)
-            try:
-                for job in as_completed(missing):
-                    job.result()
-                    bar.update()
-            finally:
-                for job in missing:
-                    job.cancel()
-        store.join_parts(paths.values(), target)
-        shutil.rmtree(folder)
+    _begin(folder, {"height": height, **made})
+    end = capture.sizes["y"]
+    paths = {top: folder / f"{top:06d}.zarr" for top in range(0, end, height)}
+    # Separate the blocks that are missing, those of one reading together.
+    with ThreadPoolExecutor(threads) as pool:
+        missing = list[Future[None]]()
+        for top in range(0, end, read):
+            rows = slice(top, min(top + read, end))
+            blocks = range(top, rows.stop, height)
+            places = {row - top: paths[row] for row in blocks if not paths[row].exists()}
+            if places:
+                block = source if isinstance(source, Path) else capture.isel(y=rows)
+                task = block, rows, places, plan.of_rows(rows)
+                missing.append((executor or pool).submit(_separate_rows, *task))
+        jobs.extend(missing)
+        bar.total = (bar.total or 0) + len(missing)
+        try:
+            for job in as_completed(missing):
+                job.result()
+                bar.update()
+        finally:
+            for job in missing:
+                job.cancel()
+    store.join_parts(paths.values(), target)
+    shutil.rmtree(folder)
 
 
 def _separate_rows(
@@ -307,23 +307,19 @@ def _share(
     return threads, height, read(height)[0]
 
 
-def _check_parts(folder: Path) -> None:
-    """Refuse a folder that is of no run, for it is deleted at the end."""
-    names = [place.name for place in folder.iterdir()] if folder.is_dir() else []
-    foreign = [name for name in names if not name.startswith(".")]
-    if foreign and "plan.json" not in names:
-        raise ValueError(
-            f"Foreign folder '{folder}', with '{foreign[0]}'. Must be of a run, for it is "
-            "deleted at the end, or none."
-        )
-
-
 def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
-    """Write the plan of a run into the folder of its parts, or compare it with that in it."""
+    """Make the folder of the parts, or find it as the same run left it."""
     file, content = folder / "plan.json", json.dumps(plan, indent=2, sort_keys=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if not file.exists():
-        with store.whole(file, ".json") as draft:
-            draft.write_text(content)
+        if foreign := [it.name for it in folder.iterdir() if not it.name.startswith(".plan-")]:
+            raise ValueError(
+                f"Foreign folder '{folder}', with '{foreign[0]}'. Must be of a run, for it is "
+                "deleted at the end, or none."
+            )
+        draft = folder / f".plan-{os.getpid()}"
+        draft.write_text(content)
+        draft.replace(file)
     elif file.read_text() != content:
         raise ValueError(
             f"Invalid folder '{folder}': of a run of another capture, response, version, memory or "

@@ -4,8 +4,8 @@
 `join_parts` one whose rows several processes make;
 `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
 record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
-`HeldFolder` is found wherever it is moved. What `whole` writes appears whole, and what is `held`
-belongs to one process. No other package writes zarr.
+`HeldFolder` is found wherever it is moved. What is written appears `whole`, at a
+place that is `reserved` for one process. No other package writes zarr.
 """
 
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows
@@ -17,16 +17,16 @@ from dbthermal.store._results import (
     save_text,
     save_video,
 )
-from dbthermal.store._whole import held, to_disk, whole
+from dbthermal.store._whole import reserved, to_disk, whole
 
 __all__ = [
     "HeldFolder",
     "Recording",
     "checksum",
-    "held",
     "join_parts",
     "open_dataset",
     "provenance",
+    "reserved",
     "save",
     "save_figure",
     "save_rows",

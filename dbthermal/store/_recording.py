@@ -73,8 +73,6 @@ class Recording:
     ) -> None:
         # A new path, and the attributes of an empty recording.
         self.path, self.chunk, self._closed = Path(path), chunk, False
-        if self.path.exists():
-            raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
         attrs = {**integrity.GROWING, **attrs, "complete": False, "closed": False}
         self._attrs = json.loads(json.dumps(attrs, allow_nan=False))
@@ -82,6 +80,8 @@ class Recording:
         sizes = {**sizes, "band": len(bands), "time": chunk}
         # The store with empty arrays, on the disk before it has its name.
         with whole(self.path, ".zarr") as draft:
+            if self.path.exists():
+                raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
             draft.mkdir()
             self._store = DurableStore(draft)
             group = zarr.open_group(self._store, mode="w-", zarr_format=3, attributes=self._attrs)

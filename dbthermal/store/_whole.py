@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from dbthermal import _text as texts
@@ -27,14 +28,12 @@ except ImportError:  # Windows: there two processes may write to one place
     fcntl = None  # type: ignore[assignment]
 
 _THREADS: Final = 8
-_LOOKS: Final = 100  # for a folder, which its holder may remove between its making and its locking
-_HOLDER: Final = ".holder"  # file that is locked, and names its process
+_LOOKS: Final = 100  # for a lock, whose holder may remove it between its opening and its locking
 _CUT: Final = re.compile(r"\d+ requested and \d+ written")  # NumPy's words for a full disk
-_LOCKED: Final[set[int]] = set()  # descriptors of locked files, of this process
+_LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they die with us
 
 
 def _leave_to_parent() -> None:
-    """Close locked files in a process that was forked: a lock must die with its holder."""
     while _LOCKED:
         os.close(_LOCKED.pop())
 
@@ -61,46 +60,103 @@ def check_place(path: str | Path, suffix: str) -> Path:
 def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """Yield a place beside `path` to write to, which becomes `path` unless an error is raised.
 
-    SIGTERM and SIGHUP are raised meanwhile (`raised_signals`), so that nothing is left behind. What
-    a killed process left is removed by the next that writes to `path`.
-
     Parameters
     ----------
     path : str or Path
-        File or folder that is to be whole, or as it was. Its parents are made; ValueError if one
-        is a store, which would then be another than was written. BlockingIOError while another
-        process writes to it; OSError, with the path, if it cannot be written.
+        File or folder that is to be whole, or as it was; ValueError if a parent is a store, which
+        would then be another than was written. For other errors see `reserved`.
     suffix : str
         End of its name; ValueError for another one.
     """
     path = check_place(path, suffix)
+    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
+    with (
+        reserved(path) as folder,
+        TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as place,
+    ):
+        draft = Path(place) / path.name
+        yield draft
+        tree_to_disk([draft], draft.parent)
+        if path.is_dir():  # a folder cannot be renamed onto another
+            path.rename(folder / "replaced")
+        draft.replace(path)
+        to_disk([path.parent])
+
+
+@contextmanager
+def reserved(path: str | Path) -> Iterator[Path]:
+    """Reserve the place of an output for this process, and yield a hidden folder beside it.
+
+    The system's lock dies with its process, however that ends: what a dead one left is removed by
+    the next that writes to `path`. SIGTERM and SIGHUP are raised meanwhile (`raised_signals`), so
+    that nothing is left. On a disk without locks nothing is reserved.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder, whose parents are made. BlockingIOError while another process has it, with
+        that process; OSError, with what it needs, if it cannot be written.
+    """
+    path = texts.as_path(path).absolute()
     folder = path.with_name(f".{path.name}.draft")
-    draft, replaced = folder / path.name, folder / "replaced"
-    with raised_signals(), _reasons(path, folder), held(folder, path):
-        _remove_remains(folder, path)
+    with raised_signals(), _reasons(path, folder):
+        if (lock := _lock(folder, path)) is None:  # by this process already
+            yield folder
+            return
         try:
-            yield draft
-            tree_to_disk([draft], folder)
-            if path.is_dir():  # a folder cannot be renamed onto another
-                path.rename(replaced)
-            draft.replace(path)
-            to_disk([path.parent])
-        finally:
             _remove_remains(folder, path)
-            # Interrupted, zarr's threads may still write: what stays hides no interrupt.
-            shutil.rmtree(folder, ignore_errors=True)
+            yield folder
+        finally:
+            if lock in _LOCKED:  # not in a fork
+                _remove_remains(folder, path)
+                shutil.rmtree(folder, ignore_errors=True)
+                _LOCKED.remove(lock)
+                os.close(lock)
 
 
 def _remove_remains(folder: Path, path: Path) -> None:
-    """Put an earlier result back, if no new one has come to its place; remove all else."""
+    """Put an earlier result back if no new one has come to its place; remove drafts."""
     with suppress(OSError):
         if not path.exists():
             (folder / "replaced").rename(path)
-    for place in folder.iterdir() if folder.is_dir() else ():
-        if place.is_dir() and not place.is_symlink():
-            shutil.rmtree(place, ignore_errors=True)
-        elif place.name != _HOLDER:
-            place.unlink(missing_ok=True)
+    for place in folder.glob("*/"):
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _lock(folder: Path, path: Path) -> int | None:
+    """Lock a file in a folder, which names this process; None if this process has done so."""
+    name, file = f"process {os.getpid()} on {platform.node()}", folder / "holder"
+    for _ in range(_LOOKS):
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # removed by its holder
+            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                if (holder := _lock_file(lock)) == name:
+                    return None
+                if holder:
+                    rule = "Must end first, or another output be named"
+                    raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
+                if os.path.samestat(os.fstat(lock), file.stat()):
+                    os.write(lock, name.encode())
+                    _LOCKED.add(lock)
+                    return lock
+            finally:
+                if lock not in _LOCKED:
+                    os.close(lock)
+    raise BlockingIOError(f"Busy output '{path}'. Must be written by one process at a time.")
+
+
+def _lock_file(lock: int) -> str:
+    """Lock an open file and empty it, or return the name that is written in it."""
+    try:
+        if fcntl:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+    except BlockingIOError:
+        return os.read(lock, 200).decode(errors="replace") or "another process"
+    except OSError:  # a disk that knows no locks
+        pass
+    return ""
 
 
 @contextmanager
@@ -109,77 +165,16 @@ def _reasons(path: Path, folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        place = Path(str(error.filename or folder))
+        place = Path(str(error.filename or folder)).absolute()
         related = place.is_relative_to(folder) or folder.is_relative_to(place)
         if not related or not (error.errno or _CUT.search(str(error))):
             raise
-        room = next(parent for parent in path.absolute().parents if parent.is_dir())
-        failed = type(error)(
-            f"Output '{path}' is not written: {error.strerror or os.strerror(errno.ENOSPC)}. Must "
-            "be in a folder that can be written to, on a disk with room: "
-            f"{shutil.disk_usage(room).free / 1e6:.3g} MB are free."
-        )
-        failed.errno = error.errno
-        raise failed from error
-
-
-@contextmanager
-def held(folder: Path, path: Path) -> Iterator[None]:
-    """Hold a folder for this process alone, while a block lasts.
-
-    The system's lock dies with the process, however that ends, so that what a dead one left can be
-    held anew. On a disk without locks nothing is held.
-
-    Parameters
-    ----------
-    folder, path : Path
-        Folder, which is made if it is missing; what it is for, as an error names it:
-        BlockingIOError if another process holds it, with that process.
-    """
-    number = _lock(folder, path)
-    try:
-        yield
-    finally:
-        if number in _LOCKED:
-            _LOCKED.remove(number)
-            os.close(number)
-
-
-def _lock(folder: Path, path: Path) -> int:
-    """Descriptor of the locked file in a folder."""
-    file = folder / _HOLDER
-    for _ in range(_LOOKS):
-        folder.mkdir(parents=True, exist_ok=True)
-        if folder.is_symlink():
-            raise ValueError(f"Invalid folder '{folder}', a link. Must be a folder: delete it.")
-        with suppress(FileNotFoundError):  # removed by its holder
-            number = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
-            try:
-                _lock_file(number, path)
-                if os.path.samestat(os.fstat(number), file.stat()):
-                    _LOCKED.add(number)
-                    return number
-            finally:
-                if number not in _LOCKED:
-                    os.close(number)
-    raise BlockingIOError(f"Busy output '{path}'. Must be written by one process at a time.")
-
-
-def _lock_file(number: int, path: Path) -> None:
-    """Lock an open file, and write the name of this process into it."""
-    try:
-        if fcntl:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        holder = os.read(number, 200).decode(errors="replace") or "another process"
-        raise BlockingIOError(
-            f"Busy output '{path}': {holder} writes to it. Must end first, or another output be "
-            "named."
+        reason = error.strerror or os.strerror(errno.ENOSPC)
+        room = next(parent for parent in folder.parents if parent.is_dir())
+        raise type(error)(
+            f"Output '{path}' is not written: {reason}. Must be in a folder that can be written "
+            f"to, with room: {shutil.disk_usage(room).free / 1e6:.3g} MB are free."
         ) from error
-    except OSError:  # a disk that knows no locks
-        return
-    os.ftruncate(number, 0)
-    os.write(number, f"process {os.getpid()} on {platform.node()}".encode())
 
 
 def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
