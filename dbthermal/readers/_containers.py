@@ -19,6 +19,7 @@ from dbthermal import _text as texts
 from dbthermal.readers import _recording as recordings
 
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
+_LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -137,7 +138,8 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
-        root = zarr.open(str(path), mode="r")
+        # Each array by its metadata, of which consolidated ones are a copy that may be old.
+        root = zarr.open(str(path), mode="r", use_consolidated=False)
         members: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
             members = dict(root.members(max_depth=None))
@@ -146,7 +148,13 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     for name, array in arrays.items():
         chunk = (1, 1, *(array.shards or array.chunks))[-3:]
         recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
-        if array.ndim == 3 and (missing := array.nchunks - array.nchunks_initialized):
+        for code in array.filters:
+            kind = getattr(code, "codec_id", type(code).__name__)
+            if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
+                rule = "Must be one that changes no counts: save them without it"
+                raise ValueError(f"Invalid filter '{kind}' of '{name}' of '{path.name}'. {rule}.")
+        missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
+        if array.ndim == 3 and missing:
             raise ValueError(
                 f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
             )

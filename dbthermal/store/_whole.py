@@ -28,6 +28,7 @@ except ImportError:  # Windows: there two processes may write to one place
     fcntl = None  # type: ignore[assignment]
 
 _THREADS: Final = 8
+_REPLACED: Final = "replaced"  # an earlier result, until the new one has its name
 _LOOKS: Final = 100  # for a lock, whose holder may remove it between its opening and its locking
 _CUT: Final = re.compile(r"\d+ requested and \d+ written")  # NumPy's words for a full disk
 _LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they die with us
@@ -72,14 +73,17 @@ def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
     with (
         reserved(path) as folder,
-        TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as place,
+        TemporaryDirectory(prefix="draft-", dir=folder, ignore_cleanup_errors=True) as place,
     ):
         draft = Path(place) / path.name
         yield draft
         tree_to_disk([draft], draft.parent)
-        if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(folder / "replaced")
-        draft.replace(path)
+        try:
+            if path.is_dir():  # a folder cannot be renamed onto another
+                path.rename(draft.with_name(_REPLACED))
+            draft.replace(path)
+        finally:
+            _restore(draft.parent, path)
         to_disk([path.parent])
 
 
@@ -109,17 +113,24 @@ def reserved(path: str | Path) -> Iterator[Path]:
         finally:
             if lock in _LOCKED:  # not in a fork
                 _remove_remains(folder, path)
-                shutil.rmtree(folder, ignore_errors=True)
+                with suppress(OSError):
+                    (folder / "holder").unlink()
+                    folder.rmdir()
                 _LOCKED.remove(lock)
                 os.close(lock)
 
 
-def _remove_remains(folder: Path, path: Path) -> None:
-    """Put an earlier result back if no new one has come to its place; remove drafts."""
+def _restore(place: Path, path: Path) -> None:
+    """Put an earlier result back, if no new one has come to its place."""
     with suppress(OSError):
         if not path.exists():
-            (folder / "replaced").rename(path)
-    for place in folder.glob("*/"):
+            (place / _REPLACED).rename(path)
+
+
+def _remove_remains(folder: Path, path: Path) -> None:
+    """Remove drafts, and nothing else, from a folder."""
+    for place in folder.glob("draft-*"):
+        _restore(place, path)
         shutil.rmtree(place, ignore_errors=True)
 
 
@@ -128,6 +139,8 @@ def _lock(folder: Path, path: Path) -> int | None:
     name, file = f"process {os.getpid()} on {platform.node()}", folder / "holder"
     for _ in range(_LOOKS):
         folder.mkdir(parents=True, exist_ok=True)
+        if folder.is_symlink():  # to a folder in which nothing may be removed
+            raise ValueError(f"Invalid folder '{folder}', a link. Must be a folder: delete it.")
         with suppress(FileNotFoundError):  # removed by its holder
             lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
             try:
