@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from functools import cache
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -251,6 +252,8 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
+    # A program may be started without a terminal.
+    sys.stdout, sys.stderr = sys.stdout or StringIO(), sys.stderr or StringIO()
     say = cache(lambda text: print(_shown(f"Warning: {text}"), file=sys.stderr))  # once
     warnings.showwarning = lambda message, *_, **__: say(str(message))
     options = _parser().parse_args(arguments)
