@@ -111,13 +111,13 @@ def test_an_earlier_store_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def interrupted(*_: Any) -> Path:
         raise KeyboardInterrupt
 
-    with (
-        monkeypatch.context() as patch,
-        pytest.raises(KeyboardInterrupt),
-        store.whole(path, ".zarr") as draft,
-    ):
-        draft.mkdir()
-        patch.setattr(Path, "replace", interrupted)
+    def interrupt() -> None:
+        with monkeypatch.context() as patch, store.whole(path, ".zarr") as draft:
+            draft.mkdir()
+            patch.setattr(Path, "replace", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
     assert names(tmp_path) == ["a.zarr"]
     (tmp_path / ".a.zarr.draft" / "draft-x").mkdir(parents=True)
     path.rename(tmp_path / ".a.zarr.draft" / "draft-x" / "replaced")
