@@ -206,17 +206,17 @@ def foreseen(
         inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
             inputs[str(path)] |= files.outline(files.opened(path))
-    summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
+    summary: dict[str, Any] = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
         summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
     # Bytes of an output before its compression, and those that the disk has for it.
     outlines = [summary.get("would_be", {}), *inputs.values()]
-    sizes = next((it["sizes"] for it in outlines if "time" in it.get("sizes", {})), None)
-    if sizes and (stage := _OUTPUTS.get(options.command)):
-        sizes = {"axis": 2, "other_band": sizes["band"], **sizes}
+    sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
+    if sized and (stage := _OUTPUTS.get(options.command)):
+        lengths = {"axis": 2, "other_band": sized[0]["band"], **sized[0]}
         summary["would_write_bytes_at_most"] = sum(
-            math.prod(sizes[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
-            for variable in (schema.STAGES[stage] | schema.OPTIONAL[stage]).values()
+            math.prod(lengths[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
+            for variable in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values()
         )
     if targets:
         place = next(folder for folder in targets[0].absolute().parents if folder.is_dir())

@@ -178,7 +178,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
     if values.shards:
         fill = values.dtype.type(values.fill_value == 0)
-        metadata: Any = replace(values.metadata, fill_value=fill)  # type: ignore[type-var]
+        metadata: Any = replace(values.metadata, fill_value=fill)
         refilled = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
         for start in range(0, values.shape[0], values.shards[0]):
             frames = slice(start, start + values.shards[0])
@@ -187,7 +187,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
                 raise ValueError(f"{label} of '{path.name}'. Must be whole.")
     # What pads the last chunks, which is of one value.
     metadata = values.metadata.update_shape(whole)
-    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
+    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
     more = len(keys) > math.prod(grid)
     for axis, size in enumerate(values.shape):
         beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])

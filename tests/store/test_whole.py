@@ -21,6 +21,7 @@ from dbthermal import store
 from dbthermal._arrays import empty, on_disk
 from dbthermal.store import _whole
 
+RANDOM = np.random.default_rng(1).random((40, 2**17))
 WRITER = """
 import os, signal, sys, time
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
@@ -182,9 +183,6 @@ def test_a_full_disk(write: Any, tmp_path: Path, capfd: pytest.CaptureFixture[st
         write(tmp_path / "a.zarr")
     assert not names(tmp_path)
     assert capfd.readouterr() == ("", "")
-
-
-RANDOM = np.random.default_rng(1).random((40, 2**17))
 
 
 def tiff(path: Path) -> None:
