@@ -147,7 +147,7 @@ def _lock(folder: Path, path: Path) -> int | None:
                     rule = "Must end first, or another output be named"
                     raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
                 if os.path.samestat(os.fstat(lock), file.stat()):
-                    os.write(lock, name.encode())
+                    _sign(lock, name, folder)
                     _LOCKED.add(lock)
                     return lock
             finally:
@@ -167,6 +167,16 @@ def _lock_file(lock: int) -> str:
     return ""
 
 
+def _sign(lock: int, name: str, folder: Path) -> None:
+    """Write a name into a locked file of a folder; without room, remove them."""
+    try:
+        os.write(lock, name.encode())
+    except OSError:
+        (folder / "holder").unlink()
+        folder.rmdir()
+        raise
+
+
 @contextmanager
 def _reasons(path: Path, folder: Path) -> Iterator[None]:
     """Name the output, and what it needs, in an error of the system while it is written."""
@@ -175,7 +185,7 @@ def _reasons(path: Path, folder: Path) -> Iterator[None]:
     except OSError as error:
         place = Path(str(error.filename or folder)).absolute()
         related = place.is_relative_to(folder) or folder.is_relative_to(place)
-        if not related or not (error.errno or " written" in str(error)):  # NumPy's word
+        if not related or not (error.errno or " requested and " in str(error)):  # NumPy's words
             raise
         reason = error.strerror or os.strerror(errno.ENOSPC)
         room = next(parent for parent in folder.parents if parent.is_dir())

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
 from dbthermal import store
 with store.whole(sys.argv[1], ".md") as draft:
     draft.write_text("half")
-    if sys.argv[2] == "fork" and os.fork() == 0:
+    if sys.argv[2] == "fork" and os.fork():
         time.sleep(600)
     print("writing", flush=True)
     time.sleep(600)
@@ -179,9 +179,14 @@ def _films(path: Path) -> None:
 def test_a_full_disk(write: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """The output is named with what it needs; nothing is left, and no library says more."""
     rule = r"(Output '.*a\.\w+' is not written|No film of 4\.19 MB in '.*): .*\. Must .*room"
-    with file_limit(2**20), pytest.raises(OSError, match=rule):
-        write(tmp_path / "a.zarr")
-    assert not names(tmp_path)
+    for size, command in ((2**20, False), (2**20, True), (0, False)):
+        with (
+            file_limit(size),
+            pytest.raises(OSError, match=rule),
+            store.reserved(tmp_path / "a.zarr") if command else nullcontext(),
+        ):
+            write(tmp_path / "a.zarr")
+        assert not names(tmp_path)
     assert capfd.readouterr() == ("", "")
 
 
