@@ -31,9 +31,8 @@ _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
 # Names of variables, which are folders on any disk; coordinates are listed, parted by spaces.
-_NAME: Final = re.compile(r"(?!__)\w([\w.()+-]| (?=[\w(]))*(?<!\.)")
+_NAME: Final = re.compile(r"(?!__|.{61})\w([\w.()+-]| (?=[\w(]))*(?<!\.)")
 _RESERVED: Final = {integrity.GROUP, integrity.SUMS}
-_LONGEST: Final = 200  # byte
 
 # Attributes by which other values would be opened than are saved.
 _DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} | {
@@ -201,16 +200,12 @@ def _check(dataset: xr.Dataset) -> None:
                 raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
     # Names and types of the variables.
     for name, variable in dataset.variables.items():
-        size = len(str(name).encode(errors="replace"))
-        listed = isinstance(name, str) and _NAME.fullmatch(name) and size <= _LONGEST
-        if not listed or name in _RESERVED or (" " in str(name) and name in dataset.coords):
+        listed = isinstance(name, str) and _NAME.fullmatch(name) and name not in _RESERVED
+        if not listed or (" " in str(name) and name in dataset.coords):
             rule = (
-                "Must be letters, digits, '_', '-', '+', '.', '()', and single spaces unless of a"
+                "Must be at most 60 letters, digits, _ - + . ( ), or blanks unless of a coordinate"
             )
-            raise ValueError(
-                f"Invalid name {texts.shown(name)}. {rule} coordinate; at most {_LONGEST} bytes, "
-                "for a folder has it."
-            )
+            raise ValueError(f"Invalid name {texts.shown(name)}. {rule}: a folder has it.")
         if not all(length >= 0 for length in variable.shape):  # NaN in arrays of dask
             rule = "Must have known sizes, as from compute_chunk_sizes() of dask"
             raise ValueError(f"Invalid shape {variable.shape} of '{name}'. {rule}.")

@@ -186,7 +186,7 @@ def names(rng: Rng) -> Attack:
     def judge(opened: xr.Dataset) -> Verdict:
         return wrong("other names", where=not opened.drop_attrs().identical(given))
 
-    plain = re.fullmatch(r"[a-zA-Z][\w-]*", name, re.ASCII) and len(name) < 200
+    plain = re.fullmatch(r"[a-zA-Z][\w-]*", name, re.ASCII) and len(name) <= 60
     return Attack(f"name {name!r}", act, judge, ("name",), good=bool(plain))
 
 
