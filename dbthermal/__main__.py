@@ -13,8 +13,10 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from functools import cache
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -311,7 +313,9 @@ def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    say = cache(lambda text: print(f"Warning: {text}", file=sys.stderr))  # once
+    # A program may be started without a terminal.
+    sys.stdout, sys.stderr = sys.stdout or StringIO(), sys.stderr or StringIO()
+    say = cache(lambda text: print(_shown(f"Warning: {text}"), file=sys.stderr))  # once
     warnings.showwarning = lambda message, *_, **__: say(str(message))
     options = _parser().parse_args(arguments)
     # An error ends in a line and a status.
@@ -325,17 +329,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        status, reason = 1, _reason(error, options.command)
+        status, reason = 1, _reason(error, options)
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
         reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
         reason += _suggestion(reason)
-    print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
+    print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
     return status
 
 
-def _reason(error: Exception, command: str) -> str:
+def _reason(error: Exception, options: argparse.Namespace) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
+    command = options.command
     extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
     if isinstance(error, ImportError) and extra:
         extra = command if command == "report" else extra  # which has all that it needs
@@ -343,6 +348,10 @@ def _reason(error: Exception, command: str) -> str:
     if isinstance(error, FileNotFoundError) and error.filename:  # of the system, not of dbthermal
         return f"No file or folder '{error.filename}'. Must exist."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
+    if isinstance(error, MemoryError) or "start new thread" in message:
+        output = f", '{options.output}' is not written" if "output" in options else ""
+        rule = "Must have more, or fewer frames or pixels; --dry-run says what a separation takes"
+        return f"Out of memory{output}: {message or 'none is free'}. {rule}."
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
         return message
     return f"{type(error).__name__}: {message} (--traceback shows where)"
@@ -374,11 +383,22 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         if options.dry_run:
             summary = _command("steps", "foreseen")(options, sources, targets)
         else:
-            summary = _command(module, function)(options)
+            with ExitStack() as places:
+                for path in targets:  # which no other process writes to from here on
+                    places.enter_context(import_module("dbthermal.store").reserved(path))
+                _sources_and_targets(options)  # and to which none has written meanwhile
+                summary = _command(module, function)(options)
     # The summary, for programs or for people.
-    text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
-    print(text, flush=True)
+    lines = [json.dumps(summary, default=_plain)] if options.json else _lines(summary)
+    print("\n".join(map(_shown, lines)), flush=True)
     return 0
+
+
+def _shown(text: str) -> str:
+    """Text as a terminal takes it: names of files may hold what would control it."""
+    encoding = sys.stdout.encoding or "utf-8"
+    shown = "".join(it if it.isprintable() else ascii(it)[1:-1] for it in text)
+    return shown.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def _command(module: str, function: str) -> Any:

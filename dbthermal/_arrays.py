@@ -65,11 +65,15 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     folder, size = _FOLDER.get(), int(np.prod(shape)) * np.dtype(dtype).itemsize
     if folder is None or size < _LEAST:
         return np.empty(shape, dtype)
-    with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
-        file.truncate(size)
-        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
-            os.posix_fallocate(file.fileno(), 0, size)
-        pages = mmap.mmap(file.fileno(), size)
+    try:
+        with TemporaryFile(dir=folder) as file:  # without a name: the map alone keeps it
+            file.truncate(size)
+            if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and kills later
+                os.posix_fallocate(file.fileno(), 0, size)
+            pages = mmap.mmap(file.fileno(), size)
+    except OSError as error:
+        label = f"No film of {size / 1e6:.3g} MB in '{folder}', beside the output"
+        raise OSError(f"{label}: {error.strerror}. Must have room, and be writable.") from error
     _MAPS.add(pages)
     return np.frombuffer(pages, dtype).reshape(shape)
 

@@ -125,7 +125,8 @@ class _Cache(FunctionCache):
     def _place(self, sig: Any, codegen: Any) -> tuple[Path, bytes]:
         """File for a kind of arguments, and the digest of the code and all else it depends on."""
         kinds = list(_kinds(sig if isinstance(sig, tuple) else sig.args))
-        kind = hashlib.sha256(repr((kinds, codegen.magic_tuple())).encode()).hexdigest()
+        bare = ("OO",) if sys.flags.optimize > 1 else ()  # other instructions, in other files
+        kind = hashlib.sha256(repr((kinds, codegen.magic_tuple(), *bare)).encode()).hexdigest()
         function = self._function.py_func
         name = f"{function.__module__}.{function.__qualname__}-{kind[:16]}"
         versions = f"{sys.implementation.cache_tag} {numba.__version__}"

@@ -21,7 +21,7 @@ from dbthermal.alignment._resampling import on_one_clock
 from dbthermal.alignment._views import registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
-from dbthermal.store._results import check_place
+from dbthermal.store._whole import check_place
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy

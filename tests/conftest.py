@@ -1,8 +1,11 @@
 """Fixtures of all tests: a mirror of the outside files, and a simulated capture of glass."""
 
 import os
+import signal
+import threading
 from collections.abc import Generator
 from pathlib import Path
+from types import FrameType
 
 import hypothesis
 import numpy as np
@@ -16,6 +19,19 @@ from dbthermal.simulation import Background, Rig
 hypothesis.settings.register_profile("untimed", deadline=None)  # a test measures no time
 hypothesis.settings.load_profile("untimed")
 os.environ["MPLBACKEND"] = "agg"  # a test opens no window
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """End the session at SIGTERM or SIGHUP, also where a test takes it for its own interrupt."""
+
+    def end(number: int, _: FrameType | None) -> None:
+        session.shouldstop = f"ended by {signal.Signals(number).name}"
+        raise KeyboardInterrupt(session.shouldstop)
+
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, end)
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,11 @@
 
 import argparse
 import math
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -18,6 +19,7 @@ from dbthermal import (
     emissivity,
     limits,
     scene,
+    schema,
     separation,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
@@ -27,6 +29,12 @@ from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
 
 _SWEEP = 64  # frames of each temperature of a blackbody that are taken
+_OUTPUTS: Final = {
+    "import": "capture",
+    **dict.fromkeys(("correct", "align"), "corrected"),
+    **dict.fromkeys(("separate", "complete"), "separated"),
+}
+"""Command -> stage of what it writes, whose size follows from that of a capture."""
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, Any]:
@@ -171,16 +179,28 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
 def foreseen(
     options: argparse.Namespace, sources: list[Path], targets: list[Path]
 ) -> dict[str, Any]:
-    """Inputs and outputs of a command, and the memory that a separation takes at most."""
+    """Inputs and outputs of a command with their bytes, and the memory that a separation takes."""
     inputs = dict[str, Any]()
     for path in sources:
         contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
         inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
             inputs[str(path)] |= files.outline(files.opened(path))
-    summary = {"would_read": inputs, "would_write": [*map(str, targets)]}
+    summary: dict[str, Any] = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
         summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
+    # Bytes of an output before its compression, and those that the disk has for it.
+    outlines = [summary.get("would_be", {}), *inputs.values()]
+    sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
+    if sized and (stage := _OUTPUTS.get(options.command)):
+        lengths = {"axis": 2, "other_band": sized[0]["band"], **sized[0]}
+        summary["would_write_bytes_at_most"] = sum(
+            math.prod(lengths[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
+            for variable in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values()
+        )
+    if targets:
+        place = next(folder for folder in targets[0].absolute().parents if folder.is_dir())
+        summary["free_bytes"] = shutil.disk_usage(place).free
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))

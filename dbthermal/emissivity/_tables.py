@@ -173,7 +173,7 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     if unknown or len(set(names)) < len(names):
         raise ValueError(
             f"Invalid bands {names} of the library's emissivities. Must be of {list(FILTERS)}, "
-            "each once; of other bands give a prior on the emissivities."
+            "each once, when the capture is made; or give a prior on the emissivities."
         )
     titles, rows = _packaged(_MIXTURE)
     count, values = len(FILTERS), texts.numbers(rows, len(titles), _MIXTURE)

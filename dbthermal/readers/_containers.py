@@ -4,8 +4,10 @@ import math
 import re
 import struct
 import warnings
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +15,11 @@ import numpy as np
 import xarray as xr
 import zarr
 
+from dbthermal import _text as texts
 from dbthermal.readers import _recording as recordings
 
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
+_LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -132,8 +136,10 @@ def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
+    deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
-        root = zarr.open(str(path), mode="r")
+        # Each array by its metadata, of which consolidated ones are a copy that may be old.
+        root = zarr.open(str(path), mode="r", use_consolidated=False)
         members: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
             members = dict(root.members(max_depth=None))
@@ -142,7 +148,13 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     for name, array in arrays.items():
         chunk = (1, 1, *(array.shards or array.chunks))[-3:]
         recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
-        if array.ndim == 3 and (missing := array.nchunks - array.nchunks_initialized):
+        for code in array.filters:
+            kind = getattr(code, "codec_id", type(code).__name__)
+            if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
+                rule = "Must be one that changes no counts: save them without it"
+                raise ValueError(f"Invalid filter '{kind}' of '{name}' of '{path.name}'. {rule}.")
+        missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
+        if array.ndim == 3 and missing:
             raise ValueError(
                 f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
             )
@@ -163,10 +175,21 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
                 sizes = struct.unpack("<4xI4xI", stream.read(16).ljust(16, b"\0"))
             if sizes != (values.dtype.itemsize * math.prod(pieces), key.stat().st_size):
                 raise ValueError(f"Damaged chunk '{key.name}' of '{path.name}'. Must be whole.")
+    # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
+    if values.shards:
+        fill = values.dtype.type(values.fill_value == 0)
+        metadata: Any = replace(values.metadata, fill_value=fill)
+        refilled = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
+        for start in range(0, values.shape[0], values.shards[0]):
+            frames = slice(start, start + values.shards[0])
+            if not np.array_equal(values[frames], refilled[frames]):
+                label = f"Missing chunks in the shards of '{values.path or path.stem}'"
+                raise ValueError(f"{label} of '{path.name}'. Must be whole.")
+    # What pads the last chunks, which is of one value.
     metadata = values.metadata.update_shape(whole)
-    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
+    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
     more = len(keys) > math.prod(grid)
-    for axis, size in enumerate(values.shape):  # what pads the last chunks is of one value
+    for axis, size in enumerate(values.shape):
         beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])
         more = more or bool(beyond.size and np.ptp(beyond))
     if more:

@@ -105,7 +105,7 @@ def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bo
 def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
     """Raise ValueError if counts (time, y, x) take more memory than is allowed."""
     check_number(memory, "memory")
-    if len(shape) != 3 or min(shape) < 1:
+    if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
     frames, height, width = map(int, shape)
     needed = 2 * (frames + 3) * height * width  # 3 while one is decoded

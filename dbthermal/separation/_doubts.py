@@ -47,7 +47,7 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
         low, high = curve.counts([curve.lowest, curve.highest])
         margin = RANGE_SIGMAS * std
         outside = (every < low - margin) | (every > high + margin)
-        share = float(outside.sum() / max(1, np.isfinite(every).sum()))
+        share = float(outside.sum() / max(1, np.count_nonzero(~np.isnan(every))))
         if share > _OUTSIDE:
             sentences.append(
                 f"{share:.0%} of the samples of band '{name}' lie outside the {low:.0f} to "

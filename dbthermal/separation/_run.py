@@ -94,6 +94,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     ------
     TypeError, ValueError
         As `solve` does; if the memory is too small for a row, or the parts are of another run.
+    BlockingIOError
+        With its name, while another process separates into the target.
     ExceptionGroup
         Errors of several captures, each with the capture's name; all others are finished.
 
@@ -131,7 +133,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     ):
 
         def separate(pair: tuple[Path | xr.Dataset, Path]) -> None:
-            _separate_capture(*pair, plan, dict(provenance), executor, memory, bar, blocks)
+            with store.reserved(pair[1]):
+                _separate_capture(*pair, plan, dict(provenance), executor, memory, bar, blocks)
 
         runs = [captures.submit(separate, pair) for pair in pairs]
         try:

@@ -15,7 +15,9 @@ from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
+from dbthermal.bands import FILTERS
 from dbthermal.schema import Status
+from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._budget import without_calibration
@@ -42,6 +44,11 @@ _UNEXPLAINED: Final = (
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
 _ROUNDS, _BETTER = 3, 0.8
+_NOT_COMPLETED: Final = (
+    "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
+    f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
+    "their emissivities."
+)
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
 
 
@@ -76,7 +83,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         Labels (y, x) of the materials, -1 for none; found if not given and scikit-image is
         installed (extra "materials").
     surroundings, surroundings_std, prior
-        As in `complete`.
+        As in `complete`. Without a prior, and of bands that no library has, nothing is completed.
     settings : SubspaceSettings, optional
         Options of the method "subspace".
     alone : Dataset, optional
@@ -116,56 +123,72 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     # Check the inputs, before the work.
     context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.band_positions(corrected, [], "the corrected")
-    stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
+    names = [str(band) for band in corrected["band"].values]
+    completable = _completable(prior, names)
     require_workers(workers)
     inputs = check(corrected, response, get_method("subspace"), settings=settings)
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
     alone = None if alone is None else _checked(alone, corrected, inputs)
 
-    # Separate; and again while what is left shows the cameras' motion, or that their blurs differ.
-    def separated_again(capture: xr.Dataset, per_pixel: xr.Dataset | None) -> tuple[_Parts, Misfit]:
+    def once(capture: xr.Dataset, per_pixel: xr.Dataset | None = None) -> tuple[_Parts, Misfit]:
         scope = check(capture, response, inputs.method, settings=settings)
         parts = _separated(
             capture, scope, reflection_shift, materials, per_pixel, workers, progress
         )
         return parts, misfits.measure(parts.inputs, parts.result)
 
-    original, motion, sentences = corrected, None, []
-    parts, misfit = separated_again(corrected, alone)
-    for _ in range(_ROUNDS):
-        steady = stabilise(original, parts.inputs, parts.result, misfit, motion)
-        if steady is None and reflection_shift is None:  # a shift that motion feigns hides it
-            scope = replace(parts.inputs, displacement=None)
-            steady = stabilise(original, scope, parts.result, misfit, motion)
-        if steady is None:
-            break
-        retry = separated_again(steady.capture, None)
-        if retry[1].size > _BETTER * misfit.size:
-            break
-        corrected, motion, (parts, misfit) = steady.capture, steady.motion, retry
-        sentences = [steady.sentence]
-    alike = equalise(corrected, parts.inputs, parts.result, misfit)
-    if alike is not None:
-        retry = separated_again(alike.capture, None)
-        if retry[1].size < _BETTER * misfit.size:
-            single = misfit.single  # noise that is not white: a blur takes only rapid noise
-            corrected, (parts, misfit) = alike.capture, retry
-            change = np.hypot(misfit.change, alike.detail)
-            misfit = replace(misfit, change=change, single=single)
-            sentences.append(alike.sentence)
+    # Separate, and widen the bars by what is left.
+    corrected, (parts, misfit), mended = _mended(corrected, once, alone)
     result, materials = parts.result, parts.materials
     if result is alone:  # which is the caller's
         result = result.copy(deep=True)
     misfits.widen(parts.inputs, result, misfit)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=parts.reflection_shift)
-    result = filled(result, corrected, response, context, workers)
+    doubts = parts.doubts + mended
+    if completable:
+        result = filled(result, corrected, response, context, workers)
+    else:
+        doubts.append(_NOT_COMPLETED.format(names))
+        result = budget.added(result, parts.inputs)
     if materials is not None:
         result["material"] = materials
     source = "none" if parts.reflection_shift is None else "found"
     source = source if reflection_shift is None else "given"
-    return warned(result.assign_attrs(reflection_shift=source), *unlike, *parts.doubts, *sentences)
+    return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
+
+
+def _mended(
+    original: xr.Dataset,
+    once: Callable[..., tuple["_Parts", Misfit]],
+    per_pixel: xr.Dataset | None,
+) -> tuple[xr.Dataset, tuple["_Parts", Misfit], list[str]]:
+    """Separate; again, while what is left shows that cameras move, or that their blurs differ.
+
+    Returns the capture as mended, what was measured and what is left, and what was done.
+    """
+    capture, motion, sentences = original, None, []
+    outcome = parts, misfit = once(capture, per_pixel)
+    for _ in range(_ROUNDS):
+        steady = stabilise(original, parts.inputs, parts.result, misfit, motion)
+        if steady is None and parts.reflection_shift is not None:  # that motion may feign
+            scope = replace(parts.inputs, displacement=None)
+            steady = stabilise(original, scope, parts.result, misfit, motion)
+        retry = None if steady is None else once(steady.capture)
+        if steady is None or retry is None or retry[1].size > _BETTER * misfit.size:
+            break
+        capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
+        outcome = parts, misfit = retry
+    alike = equalise(capture, parts.inputs, parts.result, misfit)
+    if alike is not None:
+        parts, less = once(alike.capture)
+        if less.size < _BETTER * misfit.size:
+            # Noise that is not white is told before: a blur takes rapid noise alone.
+            less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
+            capture, outcome = alike.capture, (parts, less)
+            sentences.append(alike.sentence)
+    return capture, outcome, sentences
 
 
 @dataclass(frozen=True)
@@ -213,6 +236,14 @@ def _separated(
     if materials is not None:
         hold(alone, result, materials, apart=reflection_shift is not None)
     return _Parts(result, inputs, materials, reflection_shift, doubts)
+
+
+def _completable(prior: str | xr.DataArray | xr.Dataset | None, names: list[str]) -> bool:
+    """Tell whether a prior knows the bands; ValueError for one that is stated and does not."""
+    if prior is None and not FILTERS.keys() >= set(names):
+        return False
+    stated(prior, names)
+    return True
 
 
 def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr.Dataset:

@@ -6,6 +6,7 @@ No other package writes zarr; `readers` opens stores of others.
 import json
 import math
 import os
+import re
 import shutil
 import zlib
 from collections.abc import Iterable, Mapping
@@ -21,12 +22,17 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
 from dbthermal.store import _integrity as integrity
-from dbthermal.store._results import as_json, whole
+from dbthermal.store._results import as_json
+from dbthermal.store._whole import whole
 
 # Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
 _COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCodec())
 _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+# Names of variables, which are folders on any disk; coordinates are listed, parted by spaces.
+_NAME: Final = re.compile(r"(?!__|.{61})\w([\w.()+-]| (?=[\w(]))*(?<!\.)")
+_RESERVED: Final = {integrity.GROUP, integrity.SUMS}
 
 # Attributes by which other values would be opened than are saved.
 _DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} | {
@@ -181,6 +187,8 @@ def _check(dataset: xr.Dataset) -> None:
     attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
     for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
         for key, value in attrs.items():
+            if not isinstance(key, str):
+                raise TypeError(f"Invalid attribute {key!r} of {owner}. Must have text as name.")
             decoded = key in _DECODED or (key == "units" and " since " in str(value))
             if (decoded and attrs is not dataset.attrs) or key == "coordinates":
                 label = f"Invalid attribute '{key}' of {owner}"
@@ -192,8 +200,15 @@ def _check(dataset: xr.Dataset) -> None:
                 raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
     # Names and types of the variables.
     for name, variable in dataset.variables.items():
-        if "/" in str(name):
-            raise ValueError(f"Invalid name '{name}'. Must have no '/', which parts folders.")
+        listed = isinstance(name, str) and _NAME.fullmatch(name) and name not in _RESERVED
+        if not listed or (" " in str(name) and name in dataset.coords):
+            rule = (
+                "Must be at most 60 letters, digits, _ - + . ( ), or blanks unless of a coordinate"
+            )
+            raise ValueError(f"Invalid name {texts.shown(name)}. {rule}: a folder has it.")
+        if not all(length >= 0 for length in variable.shape):  # NaN in arrays of dask
+            rule = "Must have known sizes, as from compute_chunk_sizes() of dask"
+            raise ValueError(f"Invalid shape {variable.shape} of '{name}'. {rule}.")
         text = variable.dtype.kind == "O" and all(
             isinstance(element, str) for element in variable.values.flat
         )

@@ -17,7 +17,8 @@ import json
 import os
 import warnings
 import zlib
-from collections.abc import AsyncIterator, Collection, Iterator, Mapping
+from collections import deque
+from collections.abc import AsyncIterator, Collection, Mapping
 from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
@@ -26,6 +27,8 @@ from typing import Any, Final
 from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
+
+from dbthermal import _text as texts
 
 Content = bytes | memoryview
 
@@ -68,6 +71,7 @@ class CheckedStore(SummedStore):
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
         super().__init__(root, read_only=True)
+        deque(texts.tree_files(self.root), maxlen=0)  # nothing is opened that is no file in it
         # Before the checksums, for a recording that grows may replace it with the next line; and
         # again if they have changed: it was closed just then.
         self.closed, content = False, self._content(GROUP)
@@ -131,7 +135,7 @@ class CheckedStore(SummedStore):
 
         Of a store that grows, all files were on the disk whose lines precede that of its `group`.
         """
-        files, listed = set(_files(self.root)), {key for key, _ in self._sums}
+        files, listed = _files(self.root), {key for key, _ in self._sums}
         wanted = listed
         if not self.closed:
             wanted = {key for key, _ in takewhile(lambda line: line != group, self._sums)}
@@ -184,7 +188,7 @@ def sums_file(sums: Mapping[str, str]) -> bytes:
 
 def missing_files(root: Path) -> list[str]:
     """Files that were written to a store, and do not exist any more."""
-    return sorted(last_sums(root).keys() - set(_files(root)))
+    return sorted(last_sums(root).keys() - _files(root))
 
 
 def _sum(key: str, content: Content) -> tuple[str, str]:
@@ -206,8 +210,6 @@ def _is_listed(sums: Collection[tuple[str, str]], key: str, content: Content | N
     return _sum(key, content) in sums
 
 
-def _files(root: Path) -> Iterator[str]:
+def _files(root: Path) -> set[str]:
     """Relative names of all files but that of the checksums."""
-    for folder, _, names in os.walk(root):
-        place = Path(folder).relative_to(root)
-        yield from (key for name in names if (key := (place / name).as_posix()) != SUMS)
+    return {*texts.tree_files(root)} - {SUMS}

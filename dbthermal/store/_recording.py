@@ -5,10 +5,6 @@ disk first; then ``zarr.json``, which says how many frames are valid, is replace
 chunks are never written over in place. A kill or a power loss thus leaves a store without the chunk
 that was being written: ``complete`` is False and ``frames_written`` is where each band ends. The
 folder is held by its descriptor: renamed or moved, the recording goes on in it.
-
-A file system may write names and contents in any order: after a power loss a renamed file may have
-its new name and no content. So the new content is synced first, then it is renamed, then the folder
-that holds the name is synced.
 """
 
 import errno
@@ -16,8 +12,7 @@ import json
 import math
 import os
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -30,12 +25,11 @@ from zarr.core.buffer import Buffer
 
 from dbthermal.schema import COORDINATES, Variable
 from dbthermal.store import _integrity as integrity
-from dbthermal.store._results import whole
+from dbthermal.store._whole import replace, tree_to_disk, whole
 
 Values = npt.NDArray[Any]
 
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
-_THREADS: Final = 8
 _LOOKS: Final = 10  # for a folder, which may be moved while its path is read and compared
 # A chunk of zeros is written too: a missing one was never recorded.
 _FORM: Final[Any] = {
@@ -79,8 +73,6 @@ class Recording:
     ) -> None:
         # A new path, and the attributes of an empty recording.
         self.path, self.chunk, self._closed = Path(path), chunk, False
-        if self.path.exists():
-            raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
         attrs = {**integrity.GROWING, **attrs, "complete": False, "closed": False}
         self._attrs = json.loads(json.dumps(attrs, allow_nan=False))
@@ -88,6 +80,8 @@ class Recording:
         sizes = {**sizes, "band": len(bands), "time": chunk}
         # The store with empty arrays, on the disk before it has its name.
         with whole(self.path, ".zarr") as draft:
+            if self.path.exists():
+                raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
             draft.mkdir()
             self._store = DurableStore(draft)
             group = zarr.open_group(self._store, mode="w-", zarr_format=3, attributes=self._attrs)
@@ -99,9 +93,7 @@ class Recording:
             self._arrays["band"] = group.create_array(
                 "band", data=names, dimension_names=("band",), **_FORM
             )
-            tree_to_disk([draft], draft)
             self._folder = HeldFolder(draft, self.path)
-        to_disk([self.path.parent])
         # From here on it is written to wherever it is moved.
         self.root = self._store.root = self._folder.root
         self._inside = {name: (self.root / name).stat() for name in self._arrays}
@@ -302,49 +294,3 @@ class DurableStore(integrity.SummedStore):
     def replace(self, key: str, content: bytes) -> None:
         """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""
         replace(self.root / key, content, before=[integrity.add_sum(self.root, key, content)])
-
-
-def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
-    """Replace a file in one step: a power loss leaves the old content or the new one.
-
-    The new content is written beside it first. If that fails, the old file stays, and nothing
-    beside it. The files `before` are brought to the disk with it.
-    """
-    draft = path.with_name(f".{path.name}.part")
-    try:
-        draft.write_bytes(content)
-        to_disk([draft, *before])
-        draft.replace(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
-        raise
-    to_disk([path.parent])
-
-
-def to_disk(paths: Iterable[Path]) -> None:
-    """Wait until files and folders are on the disk, and not only in its cache.
-
-    All are synced at the same time, for a file system then writes its journal once.
-
-    Parameters
-    ----------
-    paths : iterable of Path
-        Files and folders (OSError if one cannot be synced); not what is in these.
-    """
-    with ThreadPoolExecutor(_THREADS) as pool:
-        list(pool.map(_to_disk, paths))
-
-
-def tree_to_disk(places: Iterable[Path], root: Path) -> None:
-    """Bring files, the contents of folders, and all their parents up to `root` to the disk."""
-    wanted = {path for place in places for path in (place, *place.rglob("*"))}
-    folders = {folder for path in wanted for folder in path.parents if folder.is_relative_to(root)}
-    to_disk(wanted | folders)
-
-
-def _to_disk(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)

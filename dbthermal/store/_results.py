@@ -1,7 +1,6 @@
 """Results and their provenance: text, figures as PNG, films as MP4.
 
-Each function that saves writes to a temporary place beside its path and renames at the end, so that
-a file under a result's name is always whole. Each result carries its provenance and nothing that
+Each result appears whole under its name (`whole`). It carries its provenance and nothing that
 differs between two runs of the same code on the same input: no date, no host and no folder.
 """
 
@@ -10,12 +9,10 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -23,7 +20,7 @@ import numpy.typing as npt
 
 from dbthermal import __version__, _numbers
 from dbthermal import _text as texts
-from dbthermal.store._integrity import SUMS
+from dbthermal.store._whole import whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +100,9 @@ def commit() -> str:
 def _git(folder: Path, *arguments: str) -> str:
     """Output of a git command in `folder`; empty if it fails or git is absent."""
     command = ["git", "-C", str(folder), *arguments]
-    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+    # Not those of another clone, as a hook of git has them.
+    environment = {name: it for name, it in os.environ.items() if not name.startswith("GIT_")}
+    environment["GIT_OPTIONAL_LOCKS"] = "0"
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     except FileNotFoundError:
@@ -154,8 +153,7 @@ def save_figure(
 
     Examples
     --------
-    >>> from tempfile import TemporaryDirectory
-    >>> from matplotlib.figure import Figure
+    >>>     >>> from matplotlib.figure import Figure
     >>> from PIL import Image
     >>> from dbthermal import store
     >>> with TemporaryDirectory() as folder:
@@ -227,45 +225,6 @@ def save_video(
             raise ValueError("Invalid film without frames. Must have at least one.")
         # Frames that the encoder still holds.
         film.mux(stream.encode())
-
-
-def check_place(path: str | Path, suffix: str) -> Path:
-    """Refuse the path of a file or folder of another end than this, or inside a store."""
-    path = texts.as_path(path)
-    if path.suffix != suffix:
-        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
-    if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
-        rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
-        raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
-    for folder in path.resolve().parents:
-        if (folder / SUMS).is_file():
-            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
-    return path
-
-
-@contextmanager
-def whole(path: str | Path, suffix: str) -> Iterator[Path]:
-    """Yield a place beside `path` to write to, which becomes `path` unless an error is raised.
-
-    Parameters
-    ----------
-    path : str or Path
-        File or folder that is to be whole, or as it was. Its parents are made; ValueError if one
-        is a store, which would then be another than was written.
-    suffix : str
-        End of its name; ValueError for another one.
-    """
-    path = check_place(path, suffix)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
-    with TemporaryDirectory(
-        prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        draft = Path(folder) / path.name
-        yield draft
-        if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(Path(folder) / "replaced")
-        draft.replace(path)
 
 
 def as_json(content: Mapping[str, Any], indent: int | None = None) -> str:

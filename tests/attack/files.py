@@ -3,6 +3,7 @@
 import itertools
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import sys
@@ -13,11 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+import zarr
 
-from attack.damage import Rng
+from attack.damage import Rng, Table, hurt
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick, scene
-from dbthermal import schema, store
+from dbthermal import readers, schema, store
 from dbthermal.instruments.recording import open_capture
 from reproduction import numbers
 
@@ -53,6 +55,9 @@ def originals() -> Path:
         recording.commit()
     recording.close(time=made["time"].values[:40])
     numbers.save({"rmse_K": 0.21, "name": "a"}, folder / "numbers.json", {"seed": 1})
+    foreign = made["counts"].values[0, :8].astype(np.uint16)
+    for name, layers in (("foreign", None), ("shards", (4, 16, 20))):
+        zarr.create_array(folder / f"{name}.zarr", data=foreign, chunks=(1, 16, 20), shards=layers)
     return folder
 
 
@@ -101,6 +106,88 @@ def bits(rng: Rng) -> Attack:
     names = (path.name, inside.parts[0] if len(inside.parts) > 1 else "")
     what = f"bit of byte {place} of {path.name}/{inside} flipped"
     return Attack(what, lambda: _open(path), judge, names)
+
+
+def _linked(file: Path, target: Path | str) -> None:
+    file.unlink()
+    file.symlink_to(target)
+
+
+def _elsewhere(_: Rng, file: Path) -> None:
+    place = Path(_workplace().name) / "elsewhere"
+    shutil.copy(file, place)
+    _linked(file, place)
+
+
+def _piped(_: Rng, file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+FOREIGN: Final[Table] = {
+    "pipe": _piped,
+    "device": lambda _, file: _linked(file, "/dev/zero"),
+    "link elsewhere": _elsewhere,
+    "link to nothing": lambda _, file: _linked(file, "nowhere"),
+    "loop": lambda _, file: (file.parent / "up").symlink_to(".."),
+}
+"""Damage to a file of a store, which is then no regular file in it."""
+
+
+def trees(rng: Rng) -> Attack:
+    """A pipe, a device, or a link in a store, of ours or of another program: nothing is opened."""
+    kind = pick(rng, ["result.zarr", "recording.zarr", "foreign.zarr", "shards.zarr"])
+    path = _copy(kind)
+    file = pick(rng, [one for one in sorted(path.rglob("*")) if one.is_file()])
+    what, _ = hurt(rng, FOREIGN, file)
+    read = _foreign if kind in ("foreign.zarr", "shards.zarr") else _open
+    judge = lambda _: wrong("opened")  # noqa: E731
+    return Attack(f"{what} at {kind}/{file.name}", lambda: read(path), judge, (path.name,))
+
+
+def _foreign(path: Path) -> xr.Dataset:
+    return readers.array(path, unit="count", clock=10.0)
+
+
+def shards(rng: Rng) -> Attack:
+    """A chunk, in a shard or not, that was never written: it is no black frame."""
+    shape, gap = (8, 12, 16), int(rng.integers(8))
+    path = Path(_workplace().name) / "damaged" / "gap.zarr"
+    shutil.rmtree(path.parent, ignore_errors=True)
+    fill, layers = pick(rng, [0, 18000]), pick(rng, [None, (2, 12, 16), (4, 12, 16), (8, 12, 16)])
+    options: dict[str, Any] = {"shape": shape, "dtype": "u2", "chunks": (1, 12, 16)}
+    array = zarr.create_array(path, shards=layers, fill_value=fill, **options)
+    for place in range(8):
+        if place != gap or layers is None:
+            array[place] = 20000 + place + np.arange(192, dtype="u2").reshape(12, 16)
+    if layers is None:
+        (path / "c" / str(gap) / "0" / "0").unlink()
+    judge = lambda _: wrong("a frame of the fill value")  # noqa: E731
+    return Attack(f"chunk {gap} of {layers}", lambda: _foreign(path), judge, ("missing",))
+
+
+_CHARACTERS: Final = "aZ_9.-+() /\\\n\r\x00\x1b\u202e\u00e9\u0301\ud800:*\"'%#~"
+_WORDS: Final = ("counts", "zarr.json", "checksums.sfv", "c", "c/0", "..", "", "__x", "a" * 300)
+
+
+def names(rng: Rng) -> Attack:
+    """A variable or coordinate of any name: it is saved and comes back, or it is refused."""
+    random = "".join(rng.choice([*_CHARACTERS], rng.integers(1, 12)))
+    name, path = pick(rng, [*_WORDS, *[random] * 20]), Path(_workplace().name) / "names.zarr"
+    time, values = pick(rng, ["time", name]), np.arange(3.0)
+    given = xr.Dataset({"a": ("time", values)}).assign_coords({name: (time, values)})
+    given = given if rng.random() < 0.5 else given.reset_coords(drop=False)
+
+    def act() -> xr.Dataset:
+        shutil.rmtree(path, ignore_errors=True)
+        store.save(given, path, {})
+        return store.open_dataset(path).load()
+
+    def judge(opened: xr.Dataset) -> Verdict:
+        return wrong("other names", where=not opened.drop_attrs().identical(given))
+
+    plain = re.fullmatch(r"[a-zA-Z][\w-]*", name, re.ASCII) and len(name) <= 60
+    return Attack(f"name {name!r}", act, judge, ("name",), good=bool(plain))
 
 
 _OPERATIONS: Final = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")

@@ -17,7 +17,7 @@ _SHARES: Final = {
     mirrored: "shifts 6 completions 6",
     stages: "offset 6 align 6 register 3 correct_capture 5 fit_response 8",
     steps: "steps 17",
-    files: "bits 8 kills 4",
+    files: "bits 8 kills 4 trees 3 shards 2 names 3",
 }
 CLASSES: Final[Mapping[str, tuple[Callable[[np.random.Generator], Attack], int]]] = {
     name: (getattr(module, name), int(share))

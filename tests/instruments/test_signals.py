@@ -28,11 +28,12 @@ LIMIT = 600.0  # how long a process may take on a busy machine [s]
 
 
 @pytest.fixture(autouse=True)
-def hung_up() -> Iterator[None]:
-    """Undo what nohup does to the tests themselves: SIGHUP is not ignored, by children neither."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def as_in_a_script() -> Iterator[None]:
+    """Undo what nohup and the session of the tests do: the signals end the program."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @contextmanager

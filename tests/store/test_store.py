@@ -154,6 +154,14 @@ def test_record_holds_what_made_a_result(tmp_path: Path) -> None:
         store.provenance({"folder": tmp_path})
 
 
+def test_commit_is_that_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a hook of git, which names the clone that it runs in."""
+    commit = store.provenance({})["commit"]
+    monkeypatch.setenv("GIT_DIR", "/nowhere")
+    monkeypatch.setenv("GIT_WORK_TREE", "/")
+    assert store.provenance({})["commit"] == commit
+
+
 def test_checksum_of_a_folder(tmp_path: Path) -> None:
     """A folder's checksum depends on its names and contents alone."""
     for name in ("a", "b"):

@@ -19,8 +19,8 @@ from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
 from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
-from dbthermal.instruments.recording._signals import SignalExit, raised_signals
 from dbthermal.instruments.session import BLACKBODY
+from dbthermal.store._signals import SignalExit, raised_signals
 
 __all__ = [
     "Limits",

@@ -1,4 +1,4 @@
-"""Signals that end a program, raised as an error, so that a recording is closed first."""
+"""Signals that end a program, raised as an error, so that a file or recording is ended first."""
 
 import signal
 import threading

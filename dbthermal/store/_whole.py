@@ -1,0 +1,246 @@
+"""Files and folders that appear whole under their names, and belong to one process meanwhile.
+
+What is written lies in a hidden folder beside its place until it is whole and on the disk; then it
+is renamed. A file system may write names and contents in any order: after a power loss a renamed
+file may have its new name and no content. So the new content is synced first, then it is renamed,
+then the folder that holds the name is synced.
+"""
+
+import errno
+import os
+import platform
+import shutil
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from dbthermal import _text as texts
+from dbthermal.store._integrity import SUMS
+from dbthermal.store._signals import raised_signals
+
+try:
+    import fcntl
+except ImportError:  # Windows: there two processes may write to one place
+    fcntl = None  # type: ignore[assignment]
+
+_THREADS: Final = 8
+_REPLACED: Final = "replaced"  # an earlier result, until the new one has its name
+_LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they die with us
+
+
+def _leave_to_parent() -> None:
+    while _LOCKED:
+        os.close(_LOCKED.pop())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
+
+
+def check_place(path: str | Path, suffix: str) -> Path:
+    """Refuse the path of a file or folder of another end than this, or inside a store."""
+    path = texts.as_path(path)
+    if path.suffix != suffix:
+        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
+        rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
+        raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
+    for folder in path.resolve().parents:
+        if (folder / SUMS).is_file():
+            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
+    return path
+
+
+@contextmanager
+def whole(path: str | Path, suffix: str) -> Iterator[Path]:
+    """Yield a place beside `path` to write to, which becomes `path` unless an error is raised.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder that is to be whole, or as it was; ValueError if a parent is a store, which
+        would then be another than was written. For other errors see `reserved`.
+    suffix : str
+        End of its name; ValueError for another one.
+    """
+    path = check_place(path, suffix)
+    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
+    with (
+        reserved(path) as folder,
+        TemporaryDirectory(prefix="draft-", dir=folder, ignore_cleanup_errors=True) as place,
+    ):
+        draft = Path(place) / path.name
+        yield draft
+        tree_to_disk([draft], draft.parent)
+        try:
+            if path.is_dir():  # a folder cannot be renamed onto another
+                path.rename(draft.with_name(_REPLACED))
+            draft.replace(path)
+        finally:
+            _restore(draft.parent, path)
+        to_disk([path.parent])
+
+
+@contextmanager
+def reserved(path: str | Path) -> Iterator[Path]:
+    """Reserve the place of an output for this process, and yield a hidden folder beside it.
+
+    The system's lock dies with its process, however that ends: what a dead one left is removed by
+    the next that writes to `path`. SIGTERM and SIGHUP are raised meanwhile (`raised_signals`), so
+    that nothing is left. On a disk without locks nothing is reserved.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder, whose parents are made. BlockingIOError while another process has it, with
+        that process; OSError, with what it needs, if it cannot be written.
+    """
+    path = texts.as_path(path).absolute()
+    folder = path.with_name(f".{path.name}.draft")
+    with raised_signals(), _reasons(path, folder):
+        if (lock := _lock(folder, path)) is None:  # by this process already
+            yield folder
+            return
+        try:
+            _remove_remains(folder, path)
+            yield folder
+        finally:
+            if lock in _LOCKED:  # not in a fork
+                _remove_remains(folder, path)
+                with suppress(OSError):
+                    (folder / "holder").unlink()
+                    folder.rmdir()
+                _LOCKED.remove(lock)
+                os.close(lock)
+
+
+def _restore(place: Path, path: Path) -> None:
+    """Put an earlier result back, if no new one has come to its place."""
+    with suppress(OSError):
+        if not path.exists():
+            (place / _REPLACED).rename(path)
+
+
+def _remove_remains(folder: Path, path: Path) -> None:
+    """Remove drafts, and nothing else, from a folder."""
+    for place in folder.glob("draft-*"):
+        _restore(place, path)
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _lock(folder: Path, path: Path) -> int | None:
+    """Lock a file in a folder, which names this process; None if this process has done so."""
+    name, file = f"process {os.getpid()} on {platform.node()}", folder / "holder"
+    while True:  # for its holder may remove it before it is locked
+        folder.mkdir(parents=True, exist_ok=True)
+        if folder.is_symlink():  # to a folder in which nothing may be removed
+            raise ValueError(f"Invalid folder '{folder}', a link. Must be a folder: delete it.")
+        with suppress(FileNotFoundError):
+            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                if (holder := _lock_file(lock)) == name:
+                    return None
+                if holder:
+                    rule = "Must end first, or another output be named"
+                    raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
+                if os.path.samestat(os.fstat(lock), file.stat()):
+                    _sign(lock, name, folder)
+                    _LOCKED.add(lock)
+                    return lock
+            finally:
+                if lock not in _LOCKED:
+                    os.close(lock)
+
+
+def _lock_file(lock: int) -> str:
+    """Lock an open file and empty it, or return the name that is written in it."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+    except BlockingIOError:
+        return os.read(lock, 200).decode(errors="replace") or "another process"
+    except (AttributeError, OSError):  # a system, or a disk, that knows no locks
+        pass
+    return ""
+
+
+def _sign(lock: int, name: str, folder: Path) -> None:
+    """Write a name into a locked file of a folder; without room, remove them."""
+    try:
+        os.write(lock, name.encode())
+    except OSError:
+        (folder / "holder").unlink()
+        folder.rmdir()
+        raise
+
+
+@contextmanager
+def _reasons(path: Path, folder: Path) -> Iterator[None]:
+    """Name the output, and what it needs, in an error of the system while it is written."""
+    try:
+        yield
+    except OSError as error:
+        place = Path(str(error.filename or folder)).absolute()
+        related = place.is_relative_to(folder) or folder.is_relative_to(place)
+        if not related or not (error.errno or " requested and " in str(error)):  # NumPy's words
+            raise
+        reason = error.strerror or os.strerror(errno.ENOSPC)
+        room = next(parent for parent in folder.parents if parent.is_dir())
+        raise type(error)(
+            f"Output '{path}' is not written: {reason}. Must be in a folder that can be written "
+            f"to, with room: {shutil.disk_usage(room).free / 1e6:.3g} MB are free."
+        ) from error
+
+
+def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
+    """Replace a file in one step: a power loss leaves the old content or the new one.
+
+    The new content is written beside it first. If that fails, the old file stays, and nothing
+    beside it. The files `before` are brought to the disk with it.
+    """
+    draft = path.with_name(f".{path.name}.part")
+    try:
+        draft.write_bytes(content)
+        to_disk([draft, *before])
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+    to_disk([path.parent])
+
+
+def to_disk(paths: Iterable[Path]) -> None:
+    """Wait until files and folders are on the disk, and not only in its cache.
+
+    All are synced at the same time, for a file system then writes its journal once.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Files and folders (OSError if one cannot be synced); not what is in these.
+    """
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(_to_disk, paths))
+
+
+def tree_to_disk(places: Iterable[Path], root: Path) -> None:
+    """Bring files, the contents of folders, and all their parents up to `root` to the disk."""
+    wanted = {path for place in places for path in (place, *place.rglob("*"))}
+    folders = {folder for path in wanted for folder in path.parents if folder.is_relative_to(root)}
+    to_disk(wanted | folders)
+
+
+def _to_disk(path: Path) -> None:
+    if os.name == "nt":  # which syncs no file that is only read, and no folder
+        return
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # of disks that sync no folder
+            raise
+    finally:
+        os.close(file)

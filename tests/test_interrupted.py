@@ -1,0 +1,205 @@
+"""Commands that are killed, signalled, or started twice: one whole output, nothing beside it."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from dbthermal import simulation, store
+
+COMMANDS = {
+    "import": "import a.tif b.tif --bands wide narrow --unit count --clock 10 --offset 0 -o x.zarr",
+    "correct": "correct scene.zarr --corrected-by-camera -o x.zarr",
+    "align": "align scene.zarr --register none --offset 0 -o x.zarr",
+    "separate": "separate scene.zarr response.zarr -o x.zarr",
+    "run": "separate scene.zarr response.zarr --method subspace -o x.zarr",
+    "export": "export result.zarr -o x.csv",
+    "report": "report result.zarr -o x.html",
+}
+# Before the n-th file operation at the output something is done: a kill, a signal, or a wait.
+HOOK = """
+import itertools, os, re, signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
+place, act, number = sys.argv[1], sys.argv[2], itertools.count(1)
+operations = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir"}
+def hook(event, arguments):
+    if event in operations and re.search(r"(^|/)\\.?x\\.(zarr|csv|html)", str(arguments[0])):
+        if place.isdigit() and next(number) == int(place):
+            if act == "wait":
+                print("waiting", flush=True)
+                sys.stdin.readline()
+            else:
+                os.kill(os.getpid(), int(act))
+sys.addaudithook(hook)
+from dbthermal.__main__ import main
+sys.exit(main(sys.argv[3:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files and stores of bands that no library knows."""
+    folder, rig, rng = tmp_path_factory.mktemp("user"), simulation.Rig(), np.random.default_rng(1)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    scene = simulation.walkers(np.arange(64) / 10, (8, 12), glass, rng)
+    capture = simulation.observe(scene, rig.response(), rng).assign_coords(band=["wide", "narrow"])
+    store.save(capture, folder / "scene.zarr", {})
+    store.save(rig.response().assign_coords(band=["wide", "narrow"]), folder / "response.zarr", {})
+    for name, counts in zip("ab", capture["counts"].values, strict=True):
+        tifffile.imwrite(folder / f"{name}.tif", counts.astype("uint16"), photometric="minisblack")
+    status, error = end(start(folder, "separate", output="result.zarr"))
+    assert status == 0, error
+    assert "no library has emissivities of the bands ['wide', 'narrow']" in error
+    return folder
+
+
+def start(
+    folder: Path, command: str, place: int | str = "-", act: str = "-", output: str = ""
+) -> subprocess.Popen[str]:
+    """Command in a process of its own, which acts at a file operation of its output."""
+    words = COMMANDS[command].split()
+    words[-1] = output or words[-1]
+    return subprocess.Popen(
+        [sys.executable, "-c", HOOK, str(place), act, *words, "--overwrite"],
+        cwd=folder,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit status of a process, and its errors."""
+    _, error = process.communicate("\n", timeout=600)
+    return process.returncode, error
+
+
+def beside(folder: Path) -> list[str]:
+    """Names of outputs, whole or not."""
+    return sorted(path.name for path in folder.iterdir() if "x." in path.name)
+
+
+def clean(folder: Path) -> None:
+    """Remove outputs."""
+    for path in folder.glob("x.*"):
+        path.rename(folder / f"old-{len([*folder.iterdir()])}")
+
+
+QUICK = ["import", "export"]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in COMMANDS if name not in QUICK]
+
+
+@pytest.mark.parametrize("command", [*QUICK, *SLOW])
+def test_killed_and_started_again(folder: Path, command: str) -> None:
+    """Killed at file operations of its output, a command needs no hand: it is started again."""
+    output = COMMANDS[command].split()[-1]
+    for place in (1, 3, 7, 12, 30):
+        status, _ = end(start(folder, command, place, "9"))
+        assert status in {-9, 0}
+        status, error = end(start(folder, command))
+        assert status == 0, error
+        assert beside(folder) == [output]
+        if output.endswith(".zarr"):
+            store.open_dataset(folder / output).load()
+        clean(folder)
+
+
+@pytest.mark.parametrize("command", [*QUICK, *SLOW])
+def test_signals_leave_nothing(folder: Path, command: str) -> None:
+    """By SIGTERM and SIGHUP a command ends with their status, and with no part of an output."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        status, error = end(start(folder, command, 6, str(int(number))))
+        assert status == 128 + number, error
+        assert [name for name in beside(folder) if not name.endswith(".parts")] == []
+        clean(folder)
+
+
+@pytest.mark.parametrize(
+    ("command", "second"),
+    [
+        ("import", "import"),
+        ("run", "run"),
+        *[pytest.param("run", "correct", marks=pytest.mark.slow)],
+    ],
+)
+def test_two_commands_at_one_output(folder: Path, command: str, second: str) -> None:
+    """The second is told the process of the first, which ends well."""
+    process = start(folder, command, 5, "wait")
+    assert process.stdout is not None
+    assert process.stdout.readline() == "waiting\n"
+    status, error = end(start(folder, second))
+    assert status == 1
+    assert f"Busy output '{folder / 'x.zarr'}': process {process.pid} on " in error
+    assert end(process)[0] == 0
+    assert beside(folder) == ["x.zarr"]
+    store.open_dataset(folder / "x.zarr").load()
+    clean(folder)
+
+
+def test_control_characters_are_shown(folder: Path) -> None:
+    """Names with an escape, a line end or a reversed order of letters do not reach the terminal."""
+    name = "c\x1b[31m\n\u202e.tif"
+    (folder / name).write_bytes((folder / "a.tif").read_bytes())
+    command = [sys.executable, "-m", "dbthermal", "info", name, "--unit", "count", "--clock", "10"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert r"c\x1b[31m\n\u202e.tif:" in done.stdout
+    assert not {"\x1b", "\u202e"} & {*done.stdout, *done.stderr}
+
+
+def test_too_little_memory_and_dry_runs(folder: Path) -> None:
+    """Out of memory the output is named, with what it needs; before it is, bytes are told."""
+    code = """
+import sys
+from dbthermal import readers
+from dbthermal.__main__ import main
+def two_bands(*_, **__):
+    raise MemoryError("Unable to allocate 1 TB")
+readers.two_bands = two_bands if sys.argv[1] == "short" else readers.two_bands
+sys.exit(main(sys.argv[2:]))
+"""
+    words = COMMANDS["import"].split()
+    short = subprocess.run(
+        [sys.executable, "-c", code, "short", *words],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert short.returncode == 1
+    assert "Out of memory, 'x.zarr' is not written: Unable to allocate 1 TB. Must" in short.stderr
+    dry = subprocess.run(
+        [sys.executable, "-c", code, "dry", *words, "--dry-run", "--json"],
+        cwd=folder, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    planned = json.loads(dry.stdout)
+    assert 2 * 64 * 8 * 12 * 2 <= planned["would_write_bytes_at_most"] < 30_000
+    assert planned["free_bytes"] > 0
+    assert beside(folder) == []
+
+
+def test_signals_end_the_session(tmp_path: Path) -> None:
+    """A test that takes the interrupt for its own is the last one."""
+    conftest = (Path(__file__).parent / "conftest.py").read_text(encoding="utf-8")
+    start = conftest.index("def pytest_sessionstart")
+    hook = conftest[start : conftest.index("\n\n\n", start)]
+    head = "import signal, threading, pytest\nfrom types import FrameType\n"
+    (tmp_path / "conftest.py").write_text(head + hook)
+    (tmp_path / "test_a.py").write_text("""
+import os, signal
+def test_first():
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except KeyboardInterrupt:
+        pass
+def test_second():
+    pass
+""")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "ended by SIGTERM" in done.stdout
+    assert "1 passed" in done.stdout
