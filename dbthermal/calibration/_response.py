@@ -104,8 +104,8 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         (band, temperature) [count] and the measured `counts`; `reference_temperature`,
         `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
         `netd` (band) [K]. `offset_std`, `gain_std`, `pattern_std` (band), `blackbody_accuracy`,
-        `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute ``blackbody``, the
-        temperatures and their deviations in words, which results and reports repeat.
+        `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute
+        ``blackbody``, the temperatures and their deviations in words, which results repeat.
 
     Warns
     -----

@@ -34,8 +34,8 @@ from dbthermal.separation._inputs import Inputs
 
 _FILMS: Final = tuple(BUDGETS)[:2]
 _FRAMES: Final = 16  # of a film, at least, that give its root mean square
-# Mean of a reflection [K] below which it is the sky's, whose changes in bands from 8.5 to 12.1 um are
-# 0.62 to 1.48 times those in 8-14 um (spectra of the ARM program, see data_manifest.yaml).
+# Mean of a reflection [K] below which it is the sky's, whose changes in bands from 8.5 to 12.1 um
+# are 0.62 to 1.48 times those in 8-14 um, by measured spectra (Atmospheric Radiation Measurement).
 _COLD, _SKY = 278.15, 0.4
 _SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
 _WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
