@@ -4,28 +4,30 @@ import math
 import re
 import struct
 import warnings
+import zlib
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
+import numpy.typing as npt
 import zarr
 
+from dbthermal.readers import _netcdf
 from dbthermal.readers import _recording as recordings
 
+# Names of times: of a dim, and of an array beside another.
+_BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
+_TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
+_MOMENT: Final = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9:.]{5,18}(Z|[+-][0-9:]{2,5})?")
+_OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
+_MOST_DEFLATED: Final = 1032  # bytes that deflate makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
-
-
-def kind_of(path: Path) -> str:
-    """Format of a container, by its first bytes; empty for any other file."""
-    if path.is_dir():
-        return "zarr"
-    with recordings.files([path])[0].open("rb") as stream:
-        start = stream.read(8)
-    return "HDF5" if start == b"\x89HDF\r\n\x1a\n" else "NetCDF" if start[:3] == b"CDF" else ""
 
 
 def dims_of(values: Any) -> list[Any]:
@@ -41,34 +43,74 @@ def dims_of(values: Any) -> list[Any]:
 
 def are_times(name: object, values: Any) -> bool:
     """Tell whether an array is a coordinate of times, by its name."""
-    return values.ndim == 1 and str(name).rpartition("/")[2].lower() in {"time", "t"}
+    is_line = 0 < values.ndim < 3 and values.size == max(values.shape)  # MATLAB has no vectors
+    return is_line and bool(_TIMES.fullmatch(str(name).rpartition("/")[2]))
+
+
+def attribute(values: Any, name: str) -> Any:
+    """Attribute of an array, None if missing; ValueError for a list, which may take any memory."""
+    attrs = getattr(values, "attrs", {})
+    if name not in attrs:
+        return None
+    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:
+        raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")
+    value = attrs[name]
+    value = value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def moments(times: Any) -> npt.NDArray[Any] | None:
+    """Times as numbers or dates, those in text as seconds; None of other text."""
+    if times.dtype.kind in "iufmM":
+        return np.asarray(times[...]).reshape(-1)
+    seconds = list[float]()
+    for number in range(times.size) if times.dtype.kind in "OSU" and times.ndim == 1 else ():
+        text = times[number]  # of any length, which one after another is no danger
+        text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
+        if not _MOMENT.fullmatch(text):
+            return None
+        moment = datetime.fromisoformat(text)
+        seconds.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+    return np.array(seconds) if seconds else None
+
+
+def _times_of(arrays: dict[str, Any], name: str) -> list[Any]:
+    """Times of an array of a file: those of its first dim, or such beside it by their names."""
+    group, dims = name.rpartition("/")[0], dims_of(arrays[name])[:1]
+    beside = {key.rpartition("/")[2]: a for key, a in arrays.items() if a.ndim < 3}
+    beside = {n: a for n, a in beside.items() if f"{group}/{n}".strip("/") in arrays}
+    if dims and dims[0] in beside:
+        return [beside[dims[0]]]
+    frames = arrays[name].shape[0]
+    return [a for n, a in beside.items() if _BESIDE.fullmatch(n) and a.size == frames]
 
 
 def read(
-    path: Path, name: str | None, check: Callable[..., None], memory: float, stack: ExitStack
+    path: Path,
+    kind: str,
+    name: str | None,
+    check: Callable[[Any, list[Any]], None],
+    compare: Callable[[Any, int], None],
+    stack: ExitStack,
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
-    # Size, for NetCDF is read at once.
-    kind = kind_of(path)
-    limit = max(2 * memory, 2**20)
-    if kind == "NetCDF" and path.stat().st_size > limit:
-        rule = f"Must be at most {limit:.3g} bytes, twice memory=, for it is read at once"
-        raise ValueError(f"Invalid size of '{path.name}'. {rule}.")
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
-        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
-        # The array, by its name, and its times.
+        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _variables}[kind](path, stack)
         films = [key for key, array in arrays.items() if array.ndim == 3]
         name = recordings.array_name(films, name, path)
-        values, dims = arrays[name], dims_of(arrays[name])
-        times = arrays.get("/".join([*name.split("/")[:-1], *map(str, dims[:1])]))
-        if isinstance(times, zarr.Array):
-            _check_chunks(times, path)
-        check(values, dims, times if times is not None and times.ndim == 1 else None)
-        if isinstance(values, zarr.Array):
-            _check_chunks(values, path)
-        return values[...]
+        # Shapes first, then what is stored, then times and numbers.
+        values = arrays[name]
+        check(values, dims_of(values))
+        whole = {"zarr": _check_chunks, "HDF5": _check_pieces}.get(kind, lambda *_: None)
+        for times in _times_of(arrays, name):
+            whole(times, path)
+            compare(times, values.shape[0])
+        whole(values, path)
+        with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
+            by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
+        return np.swapaxes(values[...], 1, 2) if by_columns else values[...]
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
@@ -77,11 +119,14 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
     arrays, headers = dict[str, Any](), [8]
 
     def visit(name: str, array: Any) -> None:
-        headers.append(h5py.h5o.get_info(array.id).addr)
-        if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(array.attrs.get("NAME")):
+        headers.append(h5py.h5o.get_info(array.id).addr + file.userblock_size)
+        if len(headers) > _OBJECTS or name.count("/") > _DEPTH:
+            label = f"{len(headers)} objects, {name.count('/')} deep, in '{path.name}'"
+            raise ValueError(f"Invalid tree of {label}. Must be {_OBJECTS}, {_DEPTH} at most.")
+        if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(attribute(array, "NAME")):
             arrays.update({name: array} if array.ndim == 3 or are_times(name, array) else {})
 
-    # All arrays of the file itself: no other file, no overlap, every chunk.
+    # All arrays of the file itself: no other file, no overlap.
     file.visititems(visit)  # follows no link to another file
     for name, array in arrays.items():
         if array.is_virtual or array.external:
@@ -89,46 +134,52 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
         start = array.id.get_offset() if array.chunks is None else None
         if start is not None and any(start <= place < start + array.nbytes for place in headers):
             raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-        if array.chunks is None and (stored := array.id.get_storage_size()) != array.nbytes:
-            rule = f"Must be all of the {stored} bytes stored"
-            raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
-        pieces = zip(array.shape, array.chunks or array.shape, strict=True)
-        wanted = math.prod(-(-size // piece) for size, piece in pieces) if array.chunks else 0
-        chunks = [
-            array.id.get_chunk_info(n) for n in range(array.id.get_num_chunks() if wanted else 0)
-        ]
-        if len(chunks) != wanted or any(chunk.filter_mask for chunk in chunks):
-            raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
     return arrays
 
 
-def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
-    opened = xr.open_dataset(
-        path,
-        engine="scipy",
-        mmap=False,  # what is mapped cannot be closed while an error refers to it
-        decode_times=False,
-        decode_coords=False,
-        concat_characters=False,
-        create_default_indexes=False,
-    )
-    variables = stack.enter_context(opened).variables
-    if not opened.encoding.get("unlimited_dims"):  # else they lie frame by frame
-        # One variable after another up to the end: a place in the header that is damaged shows.
-        content = np.memmap(path, "u1", "r")
-        kinds = [variable.encoding.get("dtype", variable.dtype) for variable in variables.values()]
-        sizes = [
-            -(-variable.size * kind.itemsize // 4) * 4
-            for variable, kind in zip(variables.values(), kinds, strict=True)
-        ]
-        start = len(content) - sum(sizes)
-        for name, kind, size in zip(variables, kinds, sizes, strict=True):
-            variable, start = variables[name], start + size
-            if variable.ndim == 3 and variable.dtype.kind == "u":
-                stored = content[start - size :][: variable[0].size * kind.itemsize].view(">u2")
-                if not np.array_equal(variable[0].values.ravel(), stored):
-                    raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-    return {str(n): v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
+def _check_pieces(array: Any, path: Path) -> None:
+    """Refuse an array of HDF5 that is not all there, or whose chunks unpack to more than itself."""
+    h5py, name = recordings.optional("h5py", "recordings"), array.name.strip("/")
+    stored = array.id.get_storage_size()
+    if array.chunks is None:
+        if array.dtype.kind != "O" and stored != array.nbytes:
+            rule = f"Must be all of the {stored} bytes stored"
+            raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
+        return
+    # Filters, of which the last one may be deflate, with a checksum behind it.
+    form = array.id.get_create_plist()
+    filters = [form.get_filter(n) for n in range(form.get_nfilters())]
+    codes, size = [code for code, *_ in filters], math.prod(array.chunks) * array.dtype.itemsize
+    if not all(map(h5py.h5z.filter_avail, codes)):
+        with suppress(ImportError):
+            import_module("hdf5plugin")
+    for code, _, _, label in filters:
+        if not h5py.h5z.filter_avail(code):
+            text = f"filter {code}, {label.decode(errors='replace')}, that compresses '{name}'"
+            rule = "Must be installed, many with: python -m pip install hdf5plugin"
+            raise ValueError(f"Missing {text} of '{path.name}'. {rule}.")
+    deflated = h5py.h5z.FILTER_DEFLATE in codes
+    sums = [h5py.h5z.FILTER_FLETCHER32] * (codes[-1:] == [h5py.h5z.FILTER_FLETCHER32])
+    if deflated and codes.index(h5py.h5z.FILTER_DEFLATE) != len(codes) - 1 - len(sums):
+        raise ValueError(f"Invalid filters {codes} of '{name}'. Must be deflate last.")
+    # Chunks, all there, and none larger than it says.
+    wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
+    chunks = list[tuple[tuple[int, ...], int, int]]()
+    array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
+    if len(chunks) != wanted or any(mask for _, mask, _ in chunks):
+        raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
+    if size > max(recordings.SMALL, array.nbytes):
+        raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
+    for place, _, length in chunks if deflated else ():
+        if length * _MOST_DEFLATED > recordings.SMALL:
+            _, packed = array.id.read_direct_chunk(place)
+            if len(zlib.decompressobj().decompress(packed, size + 64)) > size + 4:
+                raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
+
+
+def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
+    variables = _netcdf.arrays(path)
+    return {n: v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:

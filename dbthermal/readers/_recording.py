@@ -75,7 +75,7 @@ _ALONG: Final = 64  # samples along each axis that tell which of them is time
 _APART: Final = 1.3  # axes whose roughness differs by this factor are of another kind
 # Counts of a byte of a file: noise of a camera leaves one or two, and repeated values this many.
 _PACKED: Final = 64
-_SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
+SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
 # Names of a digital number, and of units of time.
 _COUNTS: Final = re.compile(
     r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
@@ -136,7 +136,7 @@ def files(path: Paths, reader: str) -> list[Path]:
             if form:
                 rule = f"Must be read by readers.{_READER[form]}"
                 raise ValueError(f"Invalid '{file.name}', {form}. {rule}.")
-        if texts.regular_file(file, _LARGEST).stat().st_size == 0:
+        if form != "zarr" and texts.regular_file(file, _LARGEST).stat().st_size == 0:
             raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
     return paths
 
@@ -179,7 +179,7 @@ def check_memory(shape: Sequence[int], memory: float, name: str, stored: float =
     label = f"{frames} frames of {height} x {width} pixels take {needed:.3g} bytes"
     if needed > memory:
         raise ValueError(f"Invalid size of '{name}': {label}. Must be at most memory={memory:.3g}.")
-    if needed > max(_SMALL, _PACKED * stored):
+    if needed > max(SMALL, _PACKED * stored):
         rule = f"Must be at most {_PACKED} times the {stored:.3g} bytes of the file"
         raise ValueError(f"Invalid size of '{name}': {label}. {rule}.")
 
