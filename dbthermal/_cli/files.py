@@ -14,6 +14,7 @@ from tqdm import tqdm
 from dbthermal import _rows, readers, schema, store
 from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal._warnings import warned
+from dbthermal.readers import _recording as recordings
 
 _MADE_BY = {
     "capture": "import",
@@ -23,9 +24,9 @@ _MADE_BY = {
     "separated": "separate",
 }
 READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
-    "TIFF": (readers.tiff, (".tif", ".tiff", ".btf")),
+    "TIFF": (readers.tiff, (".tif", ".tiff", ".btf", ".png")),
     "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr")),
-    "FLIR": (readers.flir, ()),
+    "FLIR": (readers.flir, (".fff", ".seq", ".csq", ".jpg", ".jpeg")),
     "raw files": (readers.raw, ()),
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
@@ -58,9 +59,16 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file: by its suffix, else raw if a shape is stated, else FLIR."""
-    kinds = [kind for kind, (_, suffixes) in READERS.items() if path.suffix.lower() in suffixes]
-    return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
+    """Kind of a recording's file: by its first bytes, else raw if a shape is stated, or by suffix."""
+    path.stat()  # a file that is missing has no kind
+    reader, suffix = recordings.reader_of(path), path.suffix.lower()
+    for kind, (function, suffixes) in READERS.items():
+        if reader == function.__name__ or (not reader and options.shape and kind == "raw files"):
+            return kind
+        if not reader and options.shape is None and suffix in suffixes:
+            return kind
+    label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
+    raise ValueError(f"{label}. Must be a recording; bare numbers need --shape and --byte-order.")
 
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:

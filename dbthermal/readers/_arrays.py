@@ -104,10 +104,7 @@ def array(
         text = str(attributes.get("units", attributes.get("unit", unit))).strip()
         recordings.check_unit(unit if text in {"", "1"} else text, label)
 
-    def compare(times: Any, frames: int) -> None:
-        if times.size != frames:
-            rule = f"Must be {frames}, one for each frame"
-            raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
+    def compare(times: Any) -> None:
         if (moments := containers.moments(times)) is not None:
             text = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
             recordings.check_times(moments, str(text or ""), clock, label)
@@ -119,7 +116,7 @@ def array(
             check(source, containers.dims_of(source))
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             for times in [axis for axis in coords if containers.are_times(axis.name, axis)][:1]:
-                compare(times, source.shape[0])
+                compare(times)
         elif (kind := recordings.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
             values = containers.read(path, kind, name, check, compare, stack)
         else:

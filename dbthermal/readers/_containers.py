@@ -1,5 +1,7 @@
 """Arrays in files of HDF5, NetCDF and zarr, which are left on disk."""
 
+import bz2
+import lzma
 import math
 import re
 import struct
@@ -74,14 +76,13 @@ def moments(times: Any) -> npt.NDArray[Any] | None:
     return np.array(seconds) if seconds else None
 
 
-def _times_of(arrays: dict[str, Any], name: str) -> list[Any]:
+def _times_of(arrays: dict[str, Any], name: str, frames: int) -> list[Any]:
     """Times of an array of a file: those of its first dim, or such beside it by their names."""
     group, dims = name.rpartition("/")[0], dims_of(arrays[name])[:1]
     beside = {key.rpartition("/")[2]: a for key, a in arrays.items() if a.ndim < 3}
     beside = {n: a for n, a in beside.items() if f"{group}/{n}".strip("/") in arrays}
     if dims and dims[0] in beside:
         return [beside[dims[0]]]
-    frames = arrays[name].shape[0]
     return [a for n, a in beside.items() if _BESIDE.fullmatch(n) and a.size == frames]
 
 
@@ -90,7 +91,7 @@ def read(
     kind: str,
     name: str | None,
     check: Callable[[Any, list[Any]], None],
-    compare: Callable[[Any, int], None],
+    compare: Callable[[Any], None],
     stack: ExitStack,
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
@@ -104,9 +105,12 @@ def read(
         values = arrays[name]
         check(values, dims_of(values))
         whole = {"zarr": _check_chunks, "HDF5": _check_pieces}.get(kind, lambda *_: None)
-        for times in _times_of(arrays, name):
+        for times in _times_of(arrays, name, frames := values.shape[0]):
+            if times.size != frames:
+                rule = f"Must be {frames}, one for each frame"
+                raise ValueError(f"Invalid number {times.size} of times of '{name}'. {rule}.")
             whole(times, path)
-            compare(times, values.shape[0])
+            compare(times)
         whole(values, path)
         with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
             by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
@@ -208,12 +212,21 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     # Files of chunks, which must be of their stated size.
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
-    if values.shards is None and "Blosc" in str(values.compressors[-1:]):
-        for key in keys:  # Blosc reads as far as its header says, and past the end of the memory
-            with key.open("rb") as stream:
-                sizes = struct.unpack("<4xI4xI", stream.read(16).ljust(16, b"\0"))
-            if sizes != (values.dtype.itemsize * math.prod(pieces), key.stat().st_size):
-                raise ValueError(f"Damaged chunk '{key.name}' of '{path.name}'. Must be whole.")
+    size = values.dtype.itemsize * math.prod(values.chunks)
+    if math.prod(pieces) * values.dtype.itemsize > max(recordings.SMALL, values.nbytes):
+        raise ValueError(f"Invalid chunk {pieces} of '{path.name}'. Must be its size at most.")
+    codecs = [getattr(codec, "codec_id", type(codec).__name__) for codec in values.compressors]
+    kinds = [kind.lower().removesuffix("codec") for kind in codecs]
+    if len(kinds) > 1 or not {*kinds} <= _UNPACKED.keys():
+        raise ValueError(
+            f"Invalid compressors {kinds} of '{path.name}'. Must be one of {[*_UNPACKED]}."
+        )
+    for key in keys if kinds else ():
+        parts = math.prod(pieces) // math.prod(values.chunks)
+        for packed in _pieces(key.read_bytes(), parts if values.shards else 0):
+            if not _UNPACKED[kinds[0]](packed, size):
+                label = f"chunk '{key.name}' of '{path.name}'"
+                raise ValueError(f"Damaged {label}. Must be whole, and unpack to {size} bytes.")
     metadata = values.metadata.update_shape(whole)
     padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
     more = len(keys) > math.prod(grid)
@@ -223,3 +236,38 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     if more:
         rule = "Must be all that its chunks hold: there is more"
         raise ValueError(f"Invalid shape {values.shape} of '{path.name}'. {rule}.")
+
+
+def _pieces(content: bytes, number: int) -> list[bytes]:
+    """Chunks of the file of a chunk, or of a shard by the index at its end."""
+    index = np.frombuffer(content[-16 * number - 4 : -4], "<u8").reshape(-1, 2).tolist()
+    listed = [content[start : start + length] for start, length in index if start < len(content)]
+    return listed if number else [content]
+
+
+def _zstd(packed: bytes, size: int) -> bool:
+    """Tell whether the header of Zstandard states a size."""
+    about = packed[4] if len(packed) > 4 else 0
+    width = (about >> 5 & 1, 2, 4, 8)[about >> 6]
+    start = 5 + (not about & 32) + (0, 1, 2, 4)[about & 3]
+    stated = int.from_bytes(packed[start : start + width], "little")
+    return width > 0 and stated + 256 * (width == 2) == size
+
+
+def _unpacks(make: Callable[[], Any]) -> Callable[[bytes, int], bool]:
+    """Test whether a piece unpacks to a size, which never unpacks farther."""
+    return lambda packed, size: len(make().decompress(packed, size + 1)) == size
+
+
+# Test by compressor whether a piece unpacks to a size, beyond which it would take any memory.
+_UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
+    "blosc": lambda packed, size: (
+        struct.unpack("<4xI4xI", packed[:16].ljust(16, b"\0")) == (size, len(packed))
+    ),
+    "lz4": lambda packed, size: int.from_bytes(packed[:4], "little") == size,
+    "zstd": _zstd,
+    "gzip": _unpacks(lambda: zlib.decompressobj(31)),
+    "zlib": _unpacks(zlib.decompressobj),
+    "bz2": _unpacks(bz2.BZ2Decompressor),
+    "lzma": _unpacks(lzma.LZMADecompressor),
+}

@@ -115,6 +115,16 @@ def format_of(path: Path) -> str:
     return next((name for at, mark, name in _MAGIC if start[at:].startswith(mark)), "")
 
 
+def reader_of(path: Path) -> str:
+    """Reader of a file by its first bytes, empty if unknown; ValueError for a foreign format."""
+    form, suffix = format_of(path) if path.exists() else "", path.suffix.lower()
+    if suffix in _FOREIGN and form in {"", "film", "picture", "zip"}:
+        raise ValueError(f"Refused '{path.name}': {_FOREIGN[suffix]}.")
+    if form in _FOREIGN:
+        raise ValueError(f"Refused '{path.name}', a {form}: {_FOREIGN[form]}.")
+    return _READER.get(form, "")
+
+
 def files(path: Paths, reader: str) -> list[Path]:
     """Regular files of a recording, in the order of time; ValueError by what to do instead."""
     listed = path if isinstance(path, list | tuple) else [path]
@@ -127,16 +137,12 @@ def files(path: Paths, reader: str) -> list[Path]:
             rule = "Must rise: 'frame10' comes after 'frame9', which the order of text does not"
             raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
     for file in paths:
-        form = format_of(file) if reader != "raw" and file.exists() else ""
-        suffix = file.suffix.lower()
-        if reader != "raw" and _READER.get(form) != reader:
-            if way := _FOREIGN.get(suffix, _FOREIGN.get(form, "")):
-                label = f"'{file.name}', a {form}" if form else f"'{file.name}'"
-                raise ValueError(f"Refused {label}: {way}.")
-            if form:
-                rule = f"Must be read by readers.{_READER[form]}"
-                raise ValueError(f"Invalid '{file.name}', {form}. {rule}.")
-        if form != "zarr" and texts.regular_file(file, _LARGEST).stat().st_size == 0:
+        actual = "" if reader == "raw" else reader_of(file)
+        if actual not in {"", reader}:
+            label = f"Invalid '{file.name}' for readers.{reader}, by its first bytes"
+            raise ValueError(f"{label}. Must be read by readers.{actual}.")
+        is_store = actual == "array" and file.is_dir()
+        if not is_store and texts.regular_file(file, _LARGEST).stat().st_size == 0:
             raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
     return paths
 
@@ -225,14 +231,12 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock, name: str) ->
     """Raise ValueError for a file's own times that do not rise, or that the clock contradicts."""
     # Seconds since the first frame; of numbers without a unit in any that is in use.
     word = unit.partition(" since ")[0].strip()
-    scales = [
-        scale for names, scale in _SECONDS.items() if re.fullmatch(names, word, re.IGNORECASE)
-    ]
-    if values.dtype.kind == "M":
+    scales = [scale for text, scale in _SECONDS.items() if re.fullmatch(text, word, re.IGNORECASE)]
+    if values.dtype.kind in "mM":
         values, scales = (values - values[0]) / np.timedelta64(1, "s"), [1.0]
-    elif values.dtype.kind == "m":
-        values, scales = values / np.timedelta64(1, "s"), [1.0]
-    if not (scales := scales if word else [*_SECONDS.values()][:4]):
+    elif not word:
+        scales = [1.0, 1e-3, 1e-6, 1e-9]
+    if not scales:
         raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
     stated = stamps(clock, len(values), name)
     apart = values.astype(np.float64) - float(values[0])
