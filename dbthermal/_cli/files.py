@@ -59,7 +59,7 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file: by its first bytes, else raw if a shape is stated, or by suffix."""
+    """Kind of a recording's file: by its first bytes, a shape that is stated, or its suffix."""
     path.stat()  # a file that is missing has no kind
     reader, suffix = recordings.reader_of(path), path.suffix.lower()
     for kind, (function, suffixes) in READERS.items():

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final
+from types import SimpleNamespace
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -81,91 +82,98 @@ def array(
     recordings.check_unit(unit, label)
     recordings.check_number(memory, "memory")
 
-    attributes, stored = dict[str, Any](), np.inf
+    stored, path = np.inf, Path()
     if isinstance(source, str | Path):
         (path,) = recordings.files([source], "array")
         parts = path.rglob("*") if path.is_dir() else [path]
         stored = sum(part.lstat().st_size for part in parts)
-
-    def check(values: Any, dims: Sequence[Any]) -> None:
-        for dim, names in zip(dims, _DIMS, strict=False):
-            if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
-                rule = "Must be (time, y, x): rename or transpose"
-                raise ValueError(f"Invalid dims {[*dims]} of '{label}'. {rule}.")
-        texts = {name: containers.attribute(values, name) for name in _ATTRIBUTES}
-        attributes.update({name: text for name, text in texts.items() if text is not None})
-        for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
-            if attributes.get(scale, neutral) != neutral:
-                raise ValueError(f"Invalid '{scale}' of '{label}'. Must be counts as measured.")
-        dtype = np.dtype(getattr(values, "dtype", object))
-        if dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}:
-            dtype = np.dtype(f"u{dtype.itemsize}")
-        _check(getattr(values, "shape", ()), dtype, memory, label, stored)
-        text = str(attributes.get("units", attributes.get("unit", unit))).strip()
-        recordings.check_unit(unit if text in {"", "1"} else text, label)
-
-    def compare(times: Any) -> None:
-        if (moments := containers.moments(times)) is not None:
-            text = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
-            recordings.check_times(moments, str(text or ""), clock, label)
-
-    # The array, checked before it is read, and what came of it.
+    rules = _Rules(label, unit, clock, memory, stored, {})
+    # The array, checked before it is read, and what came of it: a lazy one may not be as it says.
     with ExitStack() as stack:
+        values: Any = source
         if not isinstance(source, str | Path):
-            values: Any = source
-            check(source, containers.dims_of(source))
+            rules.check(source, containers.dims_of(source))
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             for times in [axis for axis in coords if containers.are_times(axis.name, axis)][:1]:
-                compare(times)
+                rules.compare(times)
         elif (kind := recordings.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
-            values = containers.read(path, kind, name, check, compare, stack)
+            values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
-            values = _numpy_file(path, name, memory, stack)
-        counts = np.asarray(values)
-    check(counts, ())  # a lazy array may give other numbers than it says
-    if counts.shape != (shape := getattr(source, "shape", counts.shape)):
-        raise ValueError(f"Invalid shape {counts.shape} of '{label}'. Must be {shape}, as it says.")
-    fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
-    if counts.dtype.kind == "i":  # whole numbers from 0, as NetCDF 3 writes them
-        fills = [fill % 2**16 for fill in fills]
-    counts = counts.astype(np.uint16, copy=False)
+            values = _numpy_file(path, name, rules, stack)
+        read = np.asarray(values)
+    rules.check(read)
+    if read.shape != (shape := getattr(source, "shape", read.shape)):
+        raise ValueError(f"Invalid shape {read.shape} of '{label}'. Must be {shape}, as it says.")
+    counts = read.astype(np.uint16, copy=False)
     # The numbers: byte order, and values that stand for missing counts.
-    judged = isinstance(source, str | Path) and any(np.any(frame & 0xFF) for frame in counts)
+    judged = stored < np.inf and any(np.any(frame & 0xFF) for frame in counts)
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
+    attributes = rules.attributes
+    fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
+    fills = [fill % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
     return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
-def _check(
-    shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str, stored: float
-) -> None:
-    """Raise ValueError for what is no stack of counts, before it is read."""
-    if dtype.kind != "u" or dtype.itemsize != 2:
-        rule = "Must be uint16: counts, neither temperatures nor objects"
-        raise ValueError(f"Invalid dtype {dtype} of '{name}'. {rule}.")
-    recordings.check_memory(shape, memory, name, stored)
+class _Rules(NamedTuple):
+    """What an array must be: of counts, of a size, of times that the clock does not contradict."""
+
+    label: str
+    unit: str
+    clock: Clock
+    memory: float
+    stored: float  # size of its file [byte]
+    attributes: dict[str, Any]  # of the array, as it is checked
+
+    def check(self, values: Any, dims: Sequence[Any] = ()) -> None:
+        """Raise ValueError for what is no stack of counts, before it is read."""
+        for dim, names in zip(dims, _DIMS, strict=False):
+            if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
+                rule = "Must be (time, y, x): rename or transpose"
+                raise ValueError(f"Invalid dims {[*dims]} of '{self.label}'. {rule}.")
+        texts = {name: containers.attribute(values, name) for name in _ATTRIBUTES}
+        attributes = self.attributes
+        attributes.update({name: text for name, text in texts.items() if text is not None})
+        for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
+            if attributes.get(scale, neutral) != neutral:
+                rule = f"Must be {neutral:g}: counts as measured"
+                raise ValueError(f"Invalid '{scale}' of '{self.label}'. {rule}.")
+        dtype = np.dtype(getattr(values, "dtype", object))
+        unsigned = str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}
+        if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):
+            rule = "Must be uint16: counts, neither temperatures nor objects"
+            raise ValueError(f"Invalid dtype {dtype} of '{self.label}'. {rule}.")
+        shape = getattr(values, "shape", ())
+        recordings.check_memory(shape, self.memory, self.label, self.stored)
+        text = str(attributes.get("units", attributes.get("unit", self.unit))).strip()
+        recordings.check_unit(self.unit if text in {"", "1"} else text, self.label)
+
+    def compare(self, times: Any) -> None:
+        """Raise ValueError for times that the clock contradicts."""
+        if (moments := containers.moments(times)) is not None:
+            text = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
+            recordings.check_times(moments, str(text or ""), self.clock, self.label)
 
 
-def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:
+def _numpy_file(path: Path, name: str | None, rules: _Rules, stack: ExitStack) -> Any:
     """Array of a .npy or of a .npz, whose checksums must be right."""
     stream: IO[bytes] = stack.enter_context(path.open("rb"))
-    size = path.stat().st_size
     with recordings.damage_named(f"Damaged '{path.name}'", "a whole .npz"):
         if stream.read(2) != b"PK":
             stream.seek(0)
-            return _numpy_array(stream, path.name, memory, size)
+            return _numpy_array(stream, path.name, rules)
         archive = stack.enter_context(zipfile.ZipFile(path))
         names = [member.removesuffix(".npy") for member in archive.namelist()]
         member = archive.infolist()[names.index(recordings.array_name(names, name, path))]
         if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             label = f"compression {member.compress_type} of '{member.filename}' of '{path.name}'"
             raise ValueError(f"Invalid {label}. Must be none or deflate, as of NumPy.")
-        return _numpy_array(stack.enter_context(archive.open(member)), path.name, memory, size)
+        return _numpy_array(stack.enter_context(archive.open(member)), path.name, rules)
 
 
-def _numpy_array(stream: IO[bytes], name: str, memory: float, stored: float) -> npt.NDArray[Any]:
+def _numpy_array(stream: IO[bytes], name: str, rules: _Rules) -> npt.NDArray[Any]:
     """Array in NumPy's format, which must end where its header says."""
     with recordings.damage_named(f"Invalid '{name}'", ".npy, .npz, HDF5, NetCDF or zarr"):
         version = np.lib.format.read_magic(stream)
@@ -178,7 +186,7 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float, stored: float) -> 
             raise ValueError(f"Header of {length} bytes. Must be at most {_LONGEST}.")
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
             shape, by_columns, dtype = read(BytesIO(start + stream.read(length)))
-    _check(shape, dtype, memory, name, stored)
+    rules.check(SimpleNamespace(shape=shape, dtype=dtype))
     size = 2 * int(np.prod(shape, dtype=object))
     if len(content := stream.read(size + 1)) != size:
         size_read = f"{len(content)} bytes or more of counts in '{name}'"

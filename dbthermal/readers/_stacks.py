@@ -49,13 +49,12 @@ _AXES: Final = re.compile(
     r"""(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""", re.MULTILINE
 )
 # Intervals of frames, their unit, frame rates, and times, as ImageJ, OME and JSON write them.
-_STATED: Final = r"""\b(?:{})["']?\s*[:=]\s*["']?([^\s"',<>]+)"""
-_INTERVAL: Final = re.compile(
-    _STATED.format("finterval|frame[ _]?interval|TimeIncrement"), re.IGNORECASE
-)
-_TIME_UNIT: Final = re.compile(_STATED.format("tunit|TimeIncrementUnit|DeltaTUnit"), re.IGNORECASE)
-_RATE: Final = re.compile(_STATED.format("fps|frame[ _]?rate"), re.IGNORECASE)
-_TIMES: Final = re.compile(_STATED.format("DeltaT"))
+_STATED: Final = r"""(?i)\b(?:{})["']?\s*[:=]\s*["']?({})"""
+_NUMBER: Final = r"[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?"
+_INTERVAL: Final = re.compile(_STATED.format("finterval|frame[ _]?interval|TimeIncrement", _NUMBER))
+_TIMES: Final = re.compile(_STATED.format("DeltaT", _NUMBER))
+_RATE: Final = re.compile(_STATED.format("fps|frame[ _]?rate", _NUMBER))
+_TIME_UNIT: Final = re.compile(_STATED.format("tunit|TimeIncrementUnit|DeltaTUnit", r"\w+"))
 _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slices are ImageJ's own
 
 

@@ -212,7 +212,7 @@ def test_other_units_dims_and_files_are_refused(tmp_path: Path) -> None:
     for changed, message in (
         (frames.assign_attrs(units="K"), "Invalid unit 'K'"),
         (frames.rename(t="y", y="time"), r"Invalid dims \['y', 'time', 'x'\] .* Must be \(time, y"),
-        (frames.assign_attrs(scale_factor=0.1), "Invalid dtype float"),
+        (frames.assign_attrs(scale_factor=0.1), "Invalid 'scale_factor' of"),
     ):
         changed.to_netcdf(tmp_path / "a.nc", engine="scipy")
         with pytest.raises(ValueError, match=message):
