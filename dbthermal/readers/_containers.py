@@ -25,9 +25,9 @@ from dbthermal.readers import _recording as recordings
 # Names of times: of a dim, and of an array beside another.
 _BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
 _TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
-_MOMENT: Final = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}[T ][0-9:.]{5,18}(Z|[+-][0-9:]{2,5})?")
+_MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
-_MOST_DEFLATED: Final = 1032  # bytes that deflate makes of one
+_DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
@@ -69,9 +69,10 @@ def moments(times: Any) -> npt.NDArray[Any] | None:
     for number in range(times.size) if times.dtype.kind in "OSU" and times.ndim == 1 else ():
         text = times[number]  # of any length, which one after another is no danger
         text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
-        if not _MOMENT.fullmatch(text):
+        try:
+            moment = datetime.fromisoformat(text if len(text) <= _MOMENT else "")
+        except ValueError:
             return None
-        moment = datetime.fromisoformat(text)
         seconds.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
     return np.array(seconds) if seconds else None
 
@@ -141,32 +142,37 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
     return arrays
 
 
+def _filters(array: Any, path: Path) -> list[int]:
+    """Codes of the filters of an array of HDF5; deflate may be the last, before a checksum."""
+    h5py, form = recordings.optional("h5py", "recordings"), array.id.get_create_plist()
+    filters = [form.get_filter(n) for n in range(form.get_nfilters())]
+    codes = [code for code, *_ in filters]
+    if not all(map(h5py.h5z.filter_avail, codes)):
+        with suppress(ImportError):
+            import_module("hdf5plugin")
+    for code, _, _, label in filters:
+        if not h5py.h5z.filter_avail(code):
+            text = f"filter {code}, {label.decode(errors='replace')}, that compresses"
+            rule = "Must be installed, many with: python -m pip install hdf5plugin"
+            raise ValueError(f"Missing {text} '{array.name}' of '{path.name}'. {rule}.")
+    before = codes[:-1] if codes[-1:] == [h5py.h5z.FILTER_FLETCHER32] else codes
+    if _DEFLATE in before[:-1]:
+        raise ValueError(f"Invalid filters {codes} of '{array.name}'. Must be deflate last.")
+    return codes
+
+
 def _check_pieces(array: Any, path: Path) -> None:
     """Refuse an array of HDF5 that is not all there, or whose chunks unpack to more than itself."""
-    h5py, name = recordings.optional("h5py", "recordings"), array.name.strip("/")
+    name = array.name.strip("/")
     stored = array.id.get_storage_size()
     if array.chunks is None:
         if array.dtype.kind != "O" and stored != array.nbytes:
             rule = f"Must be all of the {stored} bytes stored"
             raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
         return
-    # Filters, of which the last one may be deflate, with a checksum behind it.
-    form = array.id.get_create_plist()
-    filters = [form.get_filter(n) for n in range(form.get_nfilters())]
-    codes, size = [code for code, *_ in filters], math.prod(array.chunks) * array.dtype.itemsize
-    if not all(map(h5py.h5z.filter_avail, codes)):
-        with suppress(ImportError):
-            import_module("hdf5plugin")
-    for code, _, _, label in filters:
-        if not h5py.h5z.filter_avail(code):
-            text = f"filter {code}, {label.decode(errors='replace')}, that compresses '{name}'"
-            rule = "Must be installed, many with: python -m pip install hdf5plugin"
-            raise ValueError(f"Missing {text} of '{path.name}'. {rule}.")
-    deflated = h5py.h5z.FILTER_DEFLATE in codes
-    sums = [h5py.h5z.FILTER_FLETCHER32] * (codes[-1:] == [h5py.h5z.FILTER_FLETCHER32])
-    if deflated and codes.index(h5py.h5z.FILTER_DEFLATE) != len(codes) - 1 - len(sums):
-        raise ValueError(f"Invalid filters {codes} of '{name}'. Must be deflate last.")
+    codes = _filters(array, path)
     # Chunks, all there, and none larger than it says.
+    size = math.prod(array.chunks) * array.dtype.itemsize
     wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
     chunks = list[tuple[tuple[int, ...], int, int]]()
     array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
@@ -174,7 +180,7 @@ def _check_pieces(array: Any, path: Path) -> None:
         raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
     if size > max(recordings.SMALL, array.nbytes):
         raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
-    for place, _, length in chunks if deflated else ():
+    for place, _, length in chunks if _DEFLATE in codes else ():
         if length * _MOST_DEFLATED > recordings.SMALL:
             _, packed = array.id.read_direct_chunk(place)
             if len(zlib.decompressobj().decompress(packed, size + 64)) > size + 4:

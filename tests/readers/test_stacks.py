@@ -156,7 +156,7 @@ def test_intervals_of_a_description(tmp_path: Path, options: Any, agrees: bool) 
 
 def test_frame_rate_of_a_description(tmp_path: Path) -> None:
     """A frame rate may be that of playing: another one than the clock's is a warning."""
-    for text, warned in (("fps=10.0", False), ("fps=30", True), ('{"frame_rate": 9}', True)):
+    for text, warned in (("fps=10.0", False), ("fps=30", True), ('{"frame_rate": 5}', True)):
         write(path := tmp_path / "a.tif", scene(), description=text)
         if not warned:
             read(path)
