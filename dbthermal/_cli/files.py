@@ -59,16 +59,18 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file: by its first bytes, a shape that is stated, or its suffix."""
-    path.stat()  # a file that is missing has no kind
-    reader, suffix = recordings.reader_of(path), path.suffix.lower()
-    for kind, (function, suffixes) in READERS.items():
-        if reader == function.__name__ or (not reader and options.shape and kind == "raw files"):
-            return kind
-        if not reader and options.shape is None and suffix in suffixes:
-            return kind
-    label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
-    raise ValueError(f"{label}. Must be a recording; bare numbers need --shape and --byte-order.")
+    """Kind of a recording's file: by its first bytes, its suffix, or a shape that is stated."""
+    reader, suffix, raw = recordings.reader_of(path), path.suffix.lower(), options.shape is not None
+    kinds = [kind for kind, (function, _) in READERS.items() if function.__name__ == reader]
+    kinds += [kind for kind, (_, suffixes) in READERS.items() if suffix in suffixes]
+    if not reader and raw:  # of any suffix but those of TIFF and arrays
+        kinds = [*(kind for kind in kinds if kind != "FLIR"), "raw files"]
+    if not kinds:
+        path.stat()  # a file that is missing has no format
+        label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
+        rule = "Must be a recording; bare numbers need --shape and --byte-order"
+        raise ValueError(f"{label}. {rule}.")
+    return kinds[0]
 
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:

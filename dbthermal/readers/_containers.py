@@ -105,7 +105,12 @@ def read(
         # Shapes first, then what is stored, then times and numbers.
         values = arrays[name]
         check(values, dims_of(values))
-        whole = {"zarr": _check_chunks, "HDF5": _check_pieces}.get(kind, lambda *_: None)
+        checks: dict[str, Callable[[Any, Path], None]] = {
+            "zarr": _check_chunks,
+            "HDF5": _check_pieces,
+            "NetCDF": lambda _, path: None,  # whole by its header
+        }
+        whole = checks[kind]
         for times in _times_of(arrays, name, frames := values.shape[0]):
             if times.size != frames:
                 rule = f"Must be {frames}, one for each frame"

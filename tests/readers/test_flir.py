@@ -235,7 +235,12 @@ def test_a_codec_gets_the_pixels_alone(path: Path, monkeypatch: pytest.MonkeyPat
     path.write_bytes(content)
     seen = list[bytes]()
     decode = imagecodecs.png_decode
-    monkeypatch.setattr(imagecodecs, "png_decode", lambda c: seen.append(c) or decode(c))
+
+    def seen_decode(content: bytes) -> object:
+        seen.append(content)
+        return decode(content)
+
+    monkeypatch.setattr(imagecodecs, "png_decode", seen_decode)
     assert_array_equal(readers.flir(path).counts, scene(1))
     assert b"zTXt" in content
     assert b"zTXt" not in seen[0]

@@ -76,8 +76,9 @@ def test_compressed_without_loss(tmp_path: Path, codec: str, predictor: bool, or
     write(path := tmp_path / "a.tif", scene(), byteorder=order, **options)
     assert_array_equal(read(path).counts, scene())
     with tifffile.TiffFile(path) as file:
-        place, number = file.pages[1].tags[279].valueoffset, len(file.pages[1].databytecounts)
-        kind = f"{order}{'I' if file.pages[1].tags[279].dtype == 4 else 'H'}"
+        page: Any = file.pages[1]
+        place, number = page.tags[279].valueoffset, len(page.databytecounts)
+        kind = f"{order}{'I' if page.tags[279].dtype == 4 else 'H'}"
     assert number == 3
     content = bytearray(path.read_bytes())
     (length,) = struct.unpack_from(kind, content, place)
@@ -95,8 +96,9 @@ def test_a_strip_unpacks_no_farther_than_its_page(tmp_path: Path) -> None:
         read(path)
     content = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
         for tag in (256, 257, 278):  # width, length, and rows of a strip
-            struct.pack_into("<H", content, file.pages[0].tags[tag].valueoffset, 90)
+            struct.pack_into("<H", content, page.tags[tag].valueoffset, 90)
     path.write_bytes(content)
     with pytest.raises(ValueError, match="TIFF"):
         read(path)
