@@ -105,19 +105,13 @@ def read(
         # Shapes first, then what is stored, then times and numbers.
         values = arrays[name]
         check(values, dims_of(values))
-        checks: dict[str, Callable[[Any, Path], None]] = {
-            "zarr": _check_chunks,
-            "HDF5": _check_pieces,
-            "NetCDF": lambda _, path: None,  # whole by its header
-        }
-        whole = checks[kind]
         for times in _times_of(arrays, name, frames := values.shape[0]):
             if times.size != frames:
                 rule = f"Must be {frames}, one for each frame"
                 raise ValueError(f"Invalid number {times.size} of times of '{name}'. {rule}.")
-            whole(times, path)
+            _check_whole(times, path)
             compare(times)
-        whole(values, path)
+        _check_whole(values, path)
         with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
             by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
         return np.swapaxes(values[...], 1, 2) if by_columns else values[...]
@@ -164,6 +158,14 @@ def _filters(array: Any, path: Path) -> list[int]:
     if _DEFLATE in before[:-1]:
         raise ValueError(f"Invalid filters {codes} of '{array.name}'. Must be deflate last.")
     return codes
+
+
+def _check_whole(array: Any, path: Path) -> None:
+    """Refuse an array that is not all there, or whose chunks unpack to more than itself."""
+    if isinstance(array, zarr.Array):
+        _check_chunks(array, path)
+    elif hasattr(array, "is_virtual"):  # of HDF5; one of NetCDF 3 is whole by its header
+        _check_pieces(array, path)
 
 
 def _check_pieces(array: Any, path: Path) -> None:
@@ -229,9 +231,8 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     codecs = [getattr(codec, "codec_id", type(codec).__name__) for codec in values.compressors]
     kinds = [kind.lower().removesuffix("codec") for kind in codecs]
     if len(kinds) > 1 or not {*kinds} <= _UNPACKED.keys():
-        raise ValueError(
-            f"Invalid compressors {kinds} of '{path.name}'. Must be one of {[*_UNPACKED]}."
-        )
+        rule = f"Must be one of {[*_UNPACKED]}"
+        raise ValueError(f"Invalid compressors {kinds} of '{path.name}'. {rule}.")
     for key in keys if kinds else ():
         parts = math.prod(pieces) // math.prod(values.chunks)
         for packed in _pieces(key.read_bytes(), parts if values.shards else 0):

@@ -6,7 +6,7 @@ which hold a slab of each. From the specification of Unidata, "NetCDF Classic Fo
 
 import math
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -14,60 +14,47 @@ import xarray as xr
 _TYPES: Final = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")  # from 1
 _DIMS, _VARIABLES, _ATTRIBUTES = 10, 11, 12  # tags of lists
 _LONGEST: Final = 2**20  # of a header [byte]
-_STEP: Final = 4  # to a multiple of which all is filled up [byte]
-
-
-class _Variable(NamedTuple):
-    """Dims, attributes and place of a variable; `shape` is that in the file or in a record."""
-
-    dims: list[str]
-    attrs: dict[str, Any]
-    dtype: np.dtype[Any]
-    start: int
-    shape: list[int]
-    in_records: bool
-
-    @property
-    def size(self) -> int:
-        """Bytes of the variable in the file or in a record."""
-        return math.prod(self.shape) * self.dtype.itemsize
 
 
 def arrays(path: Path) -> dict[str, xr.Variable]:
     """Variables of a file, not yet read; ValueError unless it ends where its header says."""
     with path.open("rb") as stream:
         header = _Header(stream.read(_LONGEST))
-    variables, size = header.variables(), path.stat().st_size
-    # Size and number of the records; a single variable of small numbers is not filled up.
-    recorded = [variable for variable in variables.values() if variable.in_records]
-    record = sum(_filled(variable.size) for variable in recorded)
-    record = recorded[0].size if len(recorded) == 1 else record
+    forms, file_size = header.variables(), path.stat().st_size
+    # Size of a variable or its slab, and of a record; a single slab is not filled up.
+    sizes = {name: math.prod(shape) * dtype.itemsize for name, (*_, shape, dtype) in forms.items()}
+    recorded = [name for name, (dims, _, _, shape, _) in forms.items() if len(dims) > len(shape)]
+    record = sum(_filled(sizes[name]) for name in recorded)
+    record = sizes[recorded[0]] if len(recorded) == 1 else record
     records = header.records
     if records == 256**header.width - 1:  # written as a stream
-        records = (size - min(v.start for v in recorded)) // record if record else 0
+        records = (file_size - min(forms[name][2] for name in recorded)) // max(record, 1)
     # All lie one behind another, and the last one ends with the file.
     stop = header.at
-    for name, variable in sorted(variables.items(), key=lambda item: item[1].start):
-        if variable.start < stop:
-            raise ValueError(
-                f"Overlapping '{name}' at {variable.start}. Must begin from {stop} on."
-            )
-        stop = variable.start + variable.size
-    if recorded:
-        stop += (records - 1) * record
+    for start, name in sorted((form[2], name) for name, form in forms.items()):
+        if start < stop:
+            raise ValueError(f"Overlapping '{name}' at {start}. Must begin from {stop} on.")
+        stop = start + sizes[name]
+    stop += (records - 1) * record if recorded else 0
+    if not stop <= file_size < stop + max(record, 4):  # some writers fill a block up
+        raise ValueError(f"{file_size} bytes, {records} records. Must end at {stop}, as it states.")
     content, listed = np.memmap(path, "u1", "r"), dict[str, xr.Variable]()
-    if not stop <= size < stop + max(record, _STEP):  # some writers fill a block up
-        raise ValueError(f"{size} bytes with {records} records. Must end at {stop}, as it states.")
-    for name, (dims, attrs, dtype, start, shape, in_records) in variables.items():
-        steps = [*np.cumprod([dtype.itemsize, *shape[:0:-1]])[::-1].tolist()][: len(shape)]
-        over, strides = ([records, *shape], [record, *steps]) if in_records else (shape, steps)
+    for name, (dims, attrs, start, shape, dtype) in forms.items():
+        steps = [math.prod(shape[axis + 1 :]) * dtype.itemsize for axis in range(len(shape))]
+        over, strides = (
+            ([records, *shape], [record, *steps]) if name in recorded else (shape, steps)
+        )
         values = np.ndarray(over, dtype, content.data, start, strides)
         listed[name] = xr.Variable(dims, values, attrs)
     return listed
 
 
 def _filled(size: int) -> int:
-    return -(-size // _STEP) * _STEP
+    """Size with what fills it up to a multiple of 4 bytes."""
+    return -(-size // 4) * 4
+
+
+_Form = tuple[list[str], dict[str, Any], int, list[int], np.dtype[Any]]
 
 
 class _Header:
@@ -80,34 +67,31 @@ class _Header:
         self.dims = [(self.text(), self.number()) for _ in range(self.length(_DIMS))]
         self.attributes()
 
-    def variables(self) -> dict[str, _Variable]:
-        """Variables by their names."""
-        listed = dict[str, _Variable]()
+    def variables(self) -> dict[str, _Form]:
+        """Dims, attributes, place, shape (in the file or a record) and type by the name."""
+        listed = dict[str, _Form]()
         for _ in range(self.length(_VARIABLES)):
-            name = self.text()
-            dims = [self.dims[self.number()] for _ in range(self.number())]
+            name, dims = self.text(), [self.dims[self.number()] for _ in range(self.number())]
             attrs, dtype, _ = self.attributes(), self.dtype(), self.number()
+            shape = [size for place, (_, size) in enumerate(dims) if size or place]
             start = self.number(4 if self.content[3] == 1 else 8)
-            in_records = bool(dims) and dims[0][1] == 0
-            shape = [size for _, size in dims[in_records:]]
-            names = [dim for dim, _ in dims]
-            listed[name] = _Variable(names, attrs, dtype, start, shape, in_records)
+            listed[name] = [dim for dim, _ in dims], attrs, start, shape, dtype
         return listed
 
     def attributes(self) -> dict[str, Any]:
-        """Attributes, of the file or of a variable."""
-        return {self.text(): self.values() for _ in range(self.length(_ATTRIBUTES))}
-
-    def values(self) -> Any:
-        """Value of an attribute: text, or numbers."""
-        dtype, size = self.dtype(), self.number()
-        values = np.frombuffer(self.taken(size * dtype.itemsize), dtype)
-        return values.tobytes().decode() if dtype.kind == "S" else np.squeeze(values)[()]
+        """Attributes, texts and numbers, of the file or of a variable."""
+        listed = dict[str, Any]()
+        for _ in range(self.length(_ATTRIBUTES)):
+            name, dtype, number = self.text(), self.dtype(), self.number()
+            content = self.taken(number * dtype.itemsize)
+            is_text, values = dtype.kind == "S", np.squeeze(np.frombuffer(content, dtype))
+            listed[name] = content.decode() if is_text else values[()]
+        return listed
 
     def length(self, tag: int) -> int:
         """Length of a list."""
         actual, length = self.number(4), self.number()
-        if (actual, length) != (0, 0) and actual != tag:
+        if length and actual != tag:
             raise ValueError(f"Tag {actual} before byte {self.at}. Must be {tag}.")
         return length
 

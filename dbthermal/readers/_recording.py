@@ -171,7 +171,7 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bool = False) -> None:
     """Raise ValueError where counts are masked, or values that stand for missing ones."""
-    if masked or (fills and np.isin(counts, fills).any()):
+    if masked or (fills and any(np.isin(frame, fills).any() for frame in counts)):
         raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
 
 
@@ -349,9 +349,8 @@ def _time_elsewhere(counts: Counts, name: str) -> list[str]:
     neighbours share their pattern. Roughness is the mean second difference without its largest
     quarter, and that of rounding.
     """
-    middle = counts[
-        tuple(slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape)
-    ]
+    sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
+    middle = counts[tuple(sides)]
     if min(middle.shape) < 8:
         return []
     rough = list[float]()
@@ -361,18 +360,17 @@ def _time_elsewhere(counts: Counts, name: str) -> list[str]:
     for axis, like in ((1, 2), (2, 1)):
         alike, unlike = abs(rough[0] - rough[like]), np.abs(np.subtract(rough, rough[axis]))
         if max(_SMOOTHER * alike, np.log(_APART)) < np.delete(unlike, axis).min():
-            label = (
-                f"Axis {axis} of '{name}' may be time: along it neighbours differ in another way"
-            )
-            return [f"{label}. Must be (time, y, x): transpose it if it is not."]
+            rule = "Must be (time, y, x): transpose it if it is not"
+            return [f"Axis {axis} of '{name}' may be time, by how its neighbours differ. {rule}."]
     return []
 
 
 def png_size(content: bytes, place: str) -> tuple[int, int, int]:
-    """Height, width and bits that a PNG states, which must be gray."""
+    """Height, width and bits that a PNG states, which must be gray, of 16 bits."""
     columns, rows, bits, colours = struct.unpack_from(">IIBB", content.ljust(26), 16)
-    if colours:
-        raise ValueError(f"Invalid PNG in {place}, in colours {colours}. Must be gray: counts.")
+    if bits != 16 or colours or not rows * columns:
+        label = f"{rows} x {columns} pixels of {bits} bits, colours {colours}, of PNG in {place}"
+        raise ValueError(f"Invalid {label}. Must be of 16 bits and gray: counts, not a picture.")
     return rows, columns, bits
 
 

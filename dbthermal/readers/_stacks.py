@@ -210,9 +210,10 @@ def raw(
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
     if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
-        label = f"'{name}': no images of 16-bit numbers, as of 8 bits, 32 bits, or packed"
-        rule = "Must be smoother than with bytes swapped, and every number of the same kind"
-        raise ValueError(f"Invalid counts of {label}. {rule}.")
+        rule = (
+            "Must be 16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
+        )
+        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
     if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
@@ -237,17 +238,16 @@ def _are_longer(counts: Counts) -> bool:
 def _check_clock(text: str, frames: int, clock: Clock, name: str) -> list[str]:
     """Refuse a clock that times in a description contradict; sentence on a frame rate that does."""
     unit = (_TIME_UNIT.findall(text) or ["s"])[0]
-    times = [float(time) for time in _TIMES.findall(text)]
-    interval = float((_INTERVAL.findall(text) or [0])[0])
-    if frames > 1 and len(times) == frames:
-        recordings.check_times(np.array(times), unit, clock, name)
-    elif frames > 1 and interval:
-        recordings.check_times(interval * np.arange(frames), unit, clock, name)
-    elif (rate := float((_RATE.findall(text) or [0])[0])) and frames > 1:
-        actual = (frames - 1) / recordings.stamps(clock, frames, name)[-1]
-        if abs(rate / actual - 1) > 0.5 / (frames - 1):
-            label = f"'{name}' states {rate:g} frames a second, and clock= {actual:g}"
-            return [f"{label}. Must be the rate of recording, not of playing it."]
+    interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
+    times = np.array(_TIMES.findall(text), dtype=np.float64)
+    times = times if times.size == frames else interval * np.arange(frames)
+    if times.any():
+        recordings.check_times(times, unit, clock, name)
+    elif (
+        rate and abs((frames - 1) / rate - recordings.stamps(clock, frames, name)[-1]) > 0.5 / rate
+    ):
+        rule = "Must be the rate of recording; that in the file may be of playing it"
+        return [f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."]
     return []
 
 
@@ -290,21 +290,12 @@ def _values(page: _Page) -> Iterator[Counts]:
         yield values.ravel()
 
 
-def _picture(path: Path) -> _Page:
-    """PNG of 16 bits, which is the only page of its file."""
-    with path.open("rb") as stream:
-        *shape, bits = recordings.png_size(stream.read(32), f"'{path.name}'")
-    if bits != 16 or not math.prod(shape):
-        label = f"Invalid PNG '{path.name}', {shape} pixels of {bits} bits"
-        raise ValueError(f"{label}. Must be of 16 bits: counts, not a picture.")
-    spans = [(0, path.stat().st_size)]
-    return _Page(path, (shape[0], shape[1]), 1, ">", spans, [], "png")
-
-
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
     if recordings.format_of(path) == "PNG":
-        return [_picture(path)]
+        with path.open("rb") as stream:
+            rows, columns, _ = recordings.png_size(stream.read(32), f"'{path.name}'")
+        return [_Page(path, (rows, columns), 1, ">", [(0, path.stat().st_size)], [], "png")]
     tifffile = recordings.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
     # Complaints that tifffile logs, without an error.

@@ -119,8 +119,11 @@ def test_png_of_16_bits(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Invalid 'a0.tif' .* read by readers\.tiff"):
         readers.flir(paths[0])
     for counts, message in (
-        (scene()[0].astype("u1"), "24, 32. pixels of 8 bits. Must be of 16 bits: counts"),
-        (np.stack([scene()[0]] * 3, axis=-1), "in colours 2. Must be gray"),
+        (
+            scene()[0].astype("u1"),
+            "24 x 32 pixels of 8 bits, .* Must be of 16 bits and gray: counts",
+        ),
+        (np.stack([scene()[0]] * 3, axis=-1), "colours 2, .*Must be of 16 bits and gray"),
     ):
         with pytest.raises(ValueError, match=message):
             read(picture(tmp_path / "b.png", counts))
@@ -163,7 +166,7 @@ def test_frame_rate_of_a_description(tmp_path: Path) -> None:
         if not warned:
             read(path)
             continue
-        with pytest.warns(UserWarning, match=r"frames a second, and clock= 10\. Must be the rate"):
+        with pytest.warns(UserWarning, match=r"frames a second, and clock= .*of playing"):
             assert_array_equal(read(path).counts, scene())
 
 
