@@ -355,7 +355,10 @@ def _time_elsewhere(counts: Counts, name: str) -> list[str]:
         return []
     rough = list[float]()
     for axis in range(3):
-        bends = np.sort(np.abs(np.diff(middle.astype(np.int32), 2, axis=axis)), axis=None)
+        means = middle.mean(axis=tuple({0, 1, 2} - {axis}), keepdims=True)
+        steps, turns = (np.abs(np.diff(means, order, axis=axis)).mean() for order in (1, 2))
+        values = middle - (means if turns > steps else 0.0)  # without a pattern of columns
+        bends = np.sort(np.abs(np.diff(values, 2, axis=axis)), axis=None)
         rough.append(float(np.log(bends[: 3 * bends.size // 4].mean() + 0.3)))
     for axis, like in ((1, 2), (2, 1)):
         alike, unlike = abs(rough[0] - rough[like]), np.abs(np.subtract(rough, rough[axis]))
