@@ -308,8 +308,9 @@ def _pages(path: Path) -> list[_Page]:
             for number, page in enumerate(file.pages):
                 pages.append(_page(page, path, file.byteorder, number))
                 total += sum(length for _, length in pages[-1].spans)
+                total += sum(tag.valuebytecount for tag in page.tags)
                 if total > size:  # as of a chain of pages that returns to itself
-                    raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
+                    raise ValueError(f"{total} bytes of pixels, tags. Must fit into its {size}.")
             description = str(file.pages[0].description)
             if stated_unit := _TEMPERATURES.search(description):
                 recordings.check_unit(stated_unit.group(1), path.name)

@@ -331,3 +331,19 @@ def test_raw(tmp_path: Path) -> None:
             bare(path, **{"byte_order": "big", argument: wrong})
     with pytest.raises(ValueError, match=r"Must be at most memory=100"):
         bare(path, byte_order="big", memory=100)
+
+
+def test_pages_share_no_description(tmp_path: Path) -> None:
+    """Pages whose tags lie at one place, which takes hours to read, are refused at the second."""
+    image, text = scene()[0].tobytes(), b"x" * 20000
+    tags = {256: 32, 257: 24, 258: 16, 259: 1, 262: 1, 273: 8, 277: 1, 278: 24, 279: len(image)}
+    content = b"II*\0" + struct.pack("<I", 8 + len(image) + len(text)) + image + text
+    for _ in range(3):
+        content += struct.pack("<H", len(tags) + 1)
+        for tag in sorted([*tags, 270]):
+            kind, number = (2, len(text)) if tag == 270 else (4, 1)
+            content += struct.pack("<HHII", tag, kind, number, tags.get(tag, 8 + len(image)))
+        content += struct.pack("<I", len(content) + 4)
+    (path := tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ValueError, match=r"bytes of pixels, tags\. Must fit into its"):
+        read(path)
