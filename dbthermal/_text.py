@@ -58,6 +58,22 @@ def regular_file(path: str | Path, limit: int) -> Path:
     return path
 
 
+def tree_files(root: Path) -> Iterator[str]:
+    """Yield relative names of a folder's files; ValueError for links, pipes and devices in it."""
+    folders = [os.fspath(root)]
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+                elif entry.is_file(follow_symlinks=False):
+                    yield Path(entry.path).relative_to(root).as_posix()
+                elif os.path.lexists(entry.path):  # a draft may have got its name meanwhile
+                    kind = "link" if entry.is_symlink() else "pipe, socket or device"
+                    label = f"Invalid '{Path(entry.path).relative_to(root)}' in '{root}', a {kind}"
+                    raise ValueError(f"{label}. Must be a regular file in it.")
+
+
 def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
     """Text of a `regular_file` with newlines, without byte-order mark; ValueError by line."""
     content = regular_file(path, limit).read_bytes()

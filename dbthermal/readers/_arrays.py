@@ -15,6 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._arrays import empty, parts
 from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock
@@ -85,10 +86,10 @@ def array(
     stored, path = np.inf, Path()
     if isinstance(source, str | Path):
         (path,) = recordings.files([source], "array")
-        parts = path.rglob("*") if path.is_dir() else [path]
-        stored = sum(part.lstat().st_size for part in parts)
+        inside = path.rglob("*") if path.is_dir() else [path]
+        stored = sum(file.lstat().st_size for file in inside)
     rules = _Rules(label, unit, clock, memory, stored, {})
-    # The array, checked before it is read, and what came of it: a lazy one may not be as it says.
+    # The array, checked before it is read.
     with ExitStack() as stack:
         values: Any = source
         if not isinstance(source, str | Path):
@@ -100,11 +101,8 @@ def array(
             values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
             values = _numpy_file(path, name, rules, stack)
-        read = np.asarray(values)
-    rules.check(read)
-    if read.shape != (shape := getattr(source, "shape", read.shape)):
-        raise ValueError(f"Invalid shape {read.shape} of '{label}'. Must be {shape}, as it says.")
-    counts = read.astype(np.uint16, copy=False)
+        read = values if isinstance(source, str | Path) else recordings.film(values)
+    counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
     judged = stored < np.inf and any(np.any(frame & 0xFF) for frame in counts)
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
@@ -187,8 +185,13 @@ def _numpy_array(stream: IO[bytes], name: str, rules: _Rules) -> npt.NDArray[Any
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
             shape, by_columns, dtype = read(BytesIO(start + stream.read(length)))
     rules.check(SimpleNamespace(shape=shape, dtype=dtype))
-    size = 2 * int(np.prod(shape, dtype=object))
-    if len(content := stream.read(size + 1)) != size:
-        size_read = f"{len(content)} bytes or more of counts in '{name}'"
-        raise ValueError(f"Truncated or damaged {size_read}. Must be {size}, as its header says.")
-    return np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")
+    counts, size = empty(shape[::-1] if by_columns else shape, np.uint16), 0
+    for frames in parts(counts):
+        size += stream.readinto(counts[frames].view("u1").data)  # type: ignore[attr-defined]
+        if not dtype.isnative:
+            counts[frames].byteswap(inplace=True)
+    size += len(stream.read(1))
+    if size != counts.nbytes:
+        actual = f"{size} bytes or more of counts in '{name}'"
+        raise ValueError(f"Truncated or damaged {actual}. Must be {counts.nbytes}, by its header.")
+    return counts.T if by_columns else counts

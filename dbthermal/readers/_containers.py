@@ -7,8 +7,10 @@ import re
 import struct
 import warnings
 import zlib
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib import import_module
 from io import BytesIO
@@ -19,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import zarr
 
+from dbthermal import _text as texts
 from dbthermal.readers import _netcdf
 from dbthermal.readers import _recording as recordings
 
@@ -29,6 +32,7 @@ _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
+_LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -114,7 +118,8 @@ def read(
         _check_whole(values, path)
         with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
             by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
-        return np.swapaxes(values[...], 1, 2) if by_columns else values[...]
+        counts = recordings.film(values)
+        return np.swapaxes(counts, 1, 2) if by_columns else counts
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
@@ -200,8 +205,10 @@ def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
+    deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
-        root = zarr.open(str(path), mode="r")
+        # Each array by its metadata, of which consolidated ones are a copy that may be old.
+        root = zarr.open(str(path), mode="r", use_consolidated=False)
         members: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
             members = dict(root.members(max_depth=None))
@@ -210,7 +217,13 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     for name, array in arrays.items():
         chunk = (1, 1, *(array.shards or array.chunks))[-3:]
         recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
-        if array.ndim == 3 and (missing := array.nchunks - array.nchunks_initialized):
+        for code in array.filters:
+            kind = getattr(code, "codec_id", type(code).__name__)
+            if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
+                rule = "Must be one that changes no counts: save them without it"
+                raise ValueError(f"Invalid filter '{kind}' of '{name}' of '{path.name}'. {rule}.")
+        missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
+        if array.ndim == 3 and missing:
             raise ValueError(
                 f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
             )
@@ -225,6 +238,32 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     # Files of chunks, which must be of their stated size.
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
+    _check_unpacked(values, keys, path)
+    # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
+    if values.shards:
+        fill = values.dtype.type(values.fill_value == 0)
+        metadata: Any = replace(values.metadata, fill_value=fill)
+        refilled = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
+        for start in range(0, values.shape[0], values.shards[0]):
+            frames = slice(start, start + values.shards[0])
+            if not np.array_equal(values[frames], refilled[frames]):
+                label = f"Missing chunks in the shards of '{values.path or path.stem}'"
+                raise ValueError(f"{label} of '{path.name}'. Must be whole.")
+    # What pads the last chunks, which is of one value.
+    metadata = values.metadata.update_shape(whole)
+    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
+    more = len(keys) > math.prod(grid)
+    for axis, size in enumerate(values.shape):
+        beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])
+        more = more or bool(beyond.size and np.ptp(beyond))
+    if more:
+        rule = "Must be all that its chunks hold: there is more"
+        raise ValueError(f"Invalid shape {values.shape} of '{path.name}'. {rule}.")
+
+
+def _check_unpacked(values: zarr.Array[Any], keys: list[Path], path: Path) -> None:
+    """Refuse files of chunks that unpack to another size than that of a chunk."""
+    pieces = values.shards or values.chunks
     size = values.dtype.itemsize * math.prod(values.chunks)
     if math.prod(pieces) * values.dtype.itemsize > max(recordings.SMALL, values.nbytes):
         raise ValueError(f"Invalid chunk {pieces} of '{path.name}'. Must be its size at most.")
@@ -239,15 +278,6 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
             if not _UNPACKED[kinds[0]](packed, size):
                 label = f"chunk '{key.name}' of '{path.name}'"
                 raise ValueError(f"Damaged {label}. Must be whole, and unpack to {size} bytes.")
-    metadata = values.metadata.update_shape(whole)
-    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
-    more = len(keys) > math.prod(grid)
-    for axis, size in enumerate(values.shape):  # what pads the last chunks is of one value
-        beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])
-        more = more or bool(beyond.size and np.ptp(beyond))
-    if more:
-        rule = "Must be all that its chunks hold: there is more"
-        raise ValueError(f"Invalid shape {values.shape} of '{path.name}'. {rule}.")
 
 
 def _pieces(content: bytes, number: int) -> list[bytes]:

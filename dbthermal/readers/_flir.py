@@ -14,7 +14,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal._warnings import warned
 from dbthermal.readers import _flir_records as container
 from dbthermal.readers import _recording as recordings
@@ -143,7 +143,7 @@ def flir(
         # Images, all of the form of the first.
         form = _image(*listed[0])._replace(body=b"")
         recordings.check_memory((len(listed), *form.shape), memory, name)
-        counts = np.empty((len(listed), *form.shape), dtype=np.uint16)
+        counts = empty((len(listed), *form.shape), np.uint16)
         for number, listing in enumerate(listed):
             image = _image(*listing)
             if image._replace(body=b"") != form:
@@ -152,6 +152,7 @@ def flir(
             if byte_order is not None and image.order:
                 image = image._replace(order=recordings.byte_order(name, byte_order))
             counts[number] = _decoded(image, listing[-1])
+            release()
         seconds, same_number, attrs = _cameras(listed, timed=clock is None)
     # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)

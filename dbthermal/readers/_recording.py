@@ -18,7 +18,7 @@ import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import schema
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, empty, made_on_disk, parts
 from dbthermal._warnings import warned
 
 Counts = npt.NDArray[np.uint16]
@@ -171,23 +171,38 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bool = False) -> None:
     """Raise ValueError where counts are masked, or values that stand for missing ones."""
-    if masked or (fills and any(np.isin(frame, fills).any() for frame in counts)):
+    if masked or (fills and any(np.isin(counts[at], fills).any() for at in parts(counts))):
         raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
 
 
 def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
     """Raise ValueError if counts (time, y, x) take more memory than allowed, or the file holds."""
     check_number(memory, "memory")
-    if len(shape) != 3 or not all(size >= 1 for size in shape):
+    if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
     frames, height, width = map(int, shape)
     needed = 2 * (frames + 3) * height * width  # 3 while one is decoded
     label = f"{frames} frames of {height} x {width} pixels take {needed:.3g} bytes"
-    if needed > memory:
+    if needed > memory and not made_on_disk():
         raise ValueError(f"Invalid size of '{name}': {label}. Must be at most memory={memory:.3g}.")
     if needed > max(SMALL, _PACKED * stored):
         rule = f"Must be at most {_PACKED} times the {stored:.3g} bytes of the file"
         raise ValueError(f"Invalid size of '{name}': {label}. {rule}.")
+
+
+def film(values: Any) -> Counts:
+    """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time.
+
+    Those that come must be of the type and shape that the array declares.
+    """
+    counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
+    for frames in parts(counts):
+        actual, place = np.asarray(values[frames]), counts[frames]
+        if (actual.dtype, actual.shape) != (values.dtype, place.shape):
+            label = f"{actual.dtype} {actual.shape} of frames from {frames.start} on"
+            raise ValueError(f"Invalid {label}. Must be {values.dtype} {place.shape}, as declared.")
+        place[...] = actual
+    return counts
 
 
 def smoother(counts: Counts, rearranged: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
+from dbthermal._arrays import empty, release
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock, Counts, Paths
 
@@ -35,6 +36,7 @@ _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
+_AT_ONCE: Final = 2**25  # of a span [byte]
 _FIRST: Final = 8  # frames that tell rows from columns
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
@@ -128,12 +130,13 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     recordings.check_memory(shape, memory, name, stored)
     sentences = _check_clock(pages[0].description, shape[0], clock, name)
     # Their pixels, from the places that the pages state.
-    counts, at = np.empty(shape, dtype=np.uint16), 0
+    counts, at = empty(shape, np.uint16), 0
     flat = counts.reshape(-1)
     for page in pages:
         for values in _values(page):
             flat[at : at + values.size] = values
             at += values.size
+            release()
     recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
@@ -205,7 +208,7 @@ def raw(
     recordings.check_memory((frames, *shape), memory, name)
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = np.memmap(file, form, "r", offset=header)["counts"].astype(np.uint16)
+    counts = recordings.film(np.memmap(file, form, "r", offset=header)["counts"])
     if (sign := recordings.smoother(counts)) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
@@ -240,7 +243,7 @@ def _check_clock(text: str, frames: int, clock: Clock, name: str) -> list[str]:
     unit = (_TIME_UNIT.findall(text) or ["s"])[0]
     interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
     times = np.array(_TIMES.findall(text), dtype=np.float64)
-    times = times if times.size == frames else interval * np.arange(frames)
+    times = times if times.size == frames else np.multiply(interval, np.arange(frames))
     if times.any():
         recordings.check_times(times, unit, clock, name)
     elif (
@@ -273,7 +276,9 @@ def _values(page: _Page) -> Iterator[Counts]:
         return
     for number, (start, length) in enumerate(page.spans):
         if not page.codec:
-            yield np.fromfile(page.path, f"{page.order}u2", length // 2, offset=start)
+            for place in range(start, start + length, _AT_ONCE):
+                size = min(_AT_ONCE, start + length - place) // 2
+                yield np.fromfile(page.path, f"{page.order}u2", size, offset=place)
             continue
         stored = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
         rows = min(page.rows, page.shape[0] - number * page.rows)
