@@ -30,6 +30,7 @@ _BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
 _TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
+_CHUNKS: Final = 2**16  # of less than 1 kB in an array of HDF5
 _DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
@@ -186,6 +187,8 @@ def _check_pieces(array: Any, path: Path) -> None:
     # Chunks, all there, and none larger than it says.
     size = math.prod(array.chunks) * array.dtype.itemsize
     wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
+    if wanted > (most := max(_CHUNKS, array.nbytes // 2**10)):  # HDF5 takes 6 kB for each
+        raise ValueError(f"Invalid number {wanted} of chunks of '{name}'. Must be at most {most}.")
     chunks = list[tuple[tuple[int, ...], int, int]]()
     array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
     if len(chunks) != wanted or any(mask for _, mask, _ in chunks):

@@ -413,6 +413,14 @@ def test_trees_of_hdf5(tmp_path: Path) -> None:
         read(path)
 
 
+def test_chunks_are_not_too_many(tmp_path: Path) -> None:
+    """Chunks of a few bytes, of which HDF5 takes kilobytes for each, are limited."""
+    with h5py.File(path := tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (40, 40, 60), "u2", chunks=(1, 1, 1))
+    with pytest.raises(ValueError, match=r"Invalid number 96000 of chunks .* at most 65536"):
+        read(path)
+
+
 def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
     """A scale of another length is refused before it is read; an attribute is one value."""
     with h5py.File(hdf5(tmp_path / "a.h5"), "r+") as file:
