@@ -142,7 +142,8 @@ def flir(
             raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
         # Images, all of the form of the first.
         form = _image(*listed[0])._replace(body=b"")
-        recordings.check_memory((len(listed), *form.shape), memory, name)
+        stored = sum(file.stat().st_size for file in paths)
+        recordings.check_memory((len(listed), *form.shape), memory, name, stored)
         counts = empty((len(listed), *form.shape), np.uint16)
         for number, listing in enumerate(listed):
             image = _image(*listing)

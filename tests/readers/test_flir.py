@@ -350,6 +350,14 @@ def test_size_before_memory(path: Path) -> None:
         readers.flir(path)
 
 
+def test_a_sequence_unpacks_to_no_bomb(path: Path) -> None:
+    """Constant images, which pack a thousandfold, take no more memory than a camera's could."""
+    image = np.full((1, 1024, 1024), 17000, dtype=np.uint16)
+    path.write_bytes(sequence(image, "jpegls") * 40)
+    with pytest.raises(ValueError, match=r"40 frames .* Must be at most 64 times the .* bytes"):
+        readers.flir(path, clock=10.0)
+
+
 def test_missing_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without imagecodecs the extra is named."""
     path.write_bytes(sequence(scene(1), "jpegls"))
