@@ -83,13 +83,17 @@ def moments(times: Any) -> npt.NDArray[Any] | None:
 
 
 def _times_of(arrays: dict[str, Any], name: str, frames: int) -> list[Any]:
-    """Times of an array of a file: those of its first dim, or such beside it by their names."""
+    """Times of an array of a file: of its first dim, or by their names, of many films beside it."""
     group, dims = name.rpartition("/")[0], dims_of(arrays[name])[:1]
-    beside = {key.rpartition("/")[2]: a for key, a in arrays.items() if a.ndim < 3}
-    beside = {n: a for n, a in beside.items() if f"{group}/{n}".strip("/") in arrays}
-    if dims and dims[0] in beside:
-        return [beside[dims[0]]]
-    return [a for n, a in beside.items() if _BESIDE.fullmatch(n) and a.size == frames]
+    lines = {key.rpartition("/")[::2]: array for key, array in arrays.items() if array.ndim < 3}
+    if dims and (group, dims[0]) in lines:
+        return [lines[group, dims[0]]]
+    films = sum(array.ndim == 3 for array in arrays.values())
+    return [
+        array
+        for (place, key), array in lines.items()
+        if _BESIDE.fullmatch(key) and array.size == frames and (place == group or films == 1)
+    ]
 
 
 def read(
@@ -218,8 +222,6 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     arrays = {n: array for n, array in members.items() if isinstance(array, zarr.Array)}
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
     for name, array in arrays.items():
-        chunk = (1, 1, *(array.shards or array.chunks))[-3:]
-        recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
         for code in array.filters:
             kind = getattr(code, "codec_id", type(code).__name__)
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):

@@ -357,7 +357,10 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
         with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
             read(hdf5(path, **{name: times}))
     assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
-    assert_array_equal(read(hdf5(path, **{"other/time": np.arange(3.0)})).counts, scene())
+    with pytest.raises(ValueError, match="Invalid times"):
+        read(hdf5(path, **{f"other/{name}": np.arange(3.0)}))
+    two = {f"other/{name}": np.arange(3.0), "other/frames": scene()}
+    assert_array_equal(read(hdf5(path, **two), "frames").counts, scene())
 
 
 def test_user_block_and_matlab(tmp_path: Path) -> None:
