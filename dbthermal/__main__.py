@@ -30,7 +30,7 @@ _EXTRAS: Final = {
     **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
     "jinja2": "report",
     **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
-    **dict.fromkeys(("h5py", "tifffile"), "recordings"),
+    **dict.fromkeys(("h5py", "imagecodecs", "tifffile"), "recordings"),
     "av": "video",
     "cv2": "alignment",
     "matplotlib": "figures",

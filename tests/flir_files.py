@@ -80,12 +80,13 @@ def sequence(
     seconds: Sequence[float] | None = None,
     sums: bool = False,
     values: Values = None,
+    packed: bytes = b"",
 ) -> bytes:
     """All frames, one after the other, zeros between; `inner` is the order in the records."""
     times = [1.5e9 + 0.125 + k / 10 for k in range(len(counts))] if seconds is None else seconds
     parts = []
     for number, (image, moment) in enumerate(zip(counts, times, strict=True)):
-        body = compressed(image, codec) if codec else image.astype(f"{inner}u2").tobytes()
+        body = packed or compressed(image, codec) if codec else image.astype(f"{inner}u2").tobytes()
         kind = {"": 2, "png": 3, "jpegls": 4}[codec]
         records = [
             (32, 0, camera(image, number, moment, inner, values)),

@@ -16,6 +16,7 @@ from dbthermal._arrays import on_disk, release
 from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal._warnings import warned
 from dbthermal.explorer._answer import answer
+from dbthermal.readers import _recording as recordings
 
 _MADE_BY = {
     "capture": "import",
@@ -25,9 +26,9 @@ _MADE_BY = {
     "separated": "separate",
 }
 READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
-    "TIFF": (readers.tiff, (".tif", ".tiff", ".btf")),
+    "TIFF": (readers.tiff, (".tif", ".tiff", ".btf", ".png")),
     "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr")),
-    "FLIR": (readers.flir, ()),
+    "FLIR": (readers.flir, (".fff", ".seq", ".csq", ".jpg", ".jpeg")),
     "raw files": (readers.raw, ()),
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
@@ -63,9 +64,18 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
-    """Kind of a recording's file: by its suffix, else raw if a shape is stated, else FLIR."""
-    kinds = [kind for kind, (_, suffixes) in READERS.items() if path.suffix.lower() in suffixes]
-    return [*kinds, "FLIR" if options.shape is None else "raw files"][0]
+    """Kind of a recording's file: by its first bytes, its suffix, or a shape that is stated."""
+    reader, suffix, raw = recordings.reader_of(path), path.suffix.lower(), options.shape is not None
+    kinds = [kind for kind, (function, _) in READERS.items() if function.__name__ == reader]
+    kinds += [kind for kind, (_, suffixes) in READERS.items() if suffix in suffixes]
+    if not reader and raw:  # of any suffix but those of TIFF and arrays
+        kinds = [*(kind for kind in kinds if kind != "FLIR"), "raw files"]
+    if not kinds:
+        path.stat()  # a file that is missing has no format
+        label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
+        rule = "Must be a recording; bare numbers need --shape and --byte-order"
+        raise ValueError(f"{label}. {rule}.")
+    return kinds[0]
 
 
 def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -> xr.Dataset:

@@ -5,8 +5,10 @@ import warnings
 import zipfile
 from collections.abc import Sequence
 from contextlib import ExitStack
+from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final
+from types import SimpleNamespace
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +23,10 @@ from dbthermal.readers._recording import MEMORY, Clock
 # Names of dims by their place, and those of an array without names, of any case.
 _DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
-_UNITS: Final = {"seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
-_SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LONGEST: Final = 2**16  # header of NumPy's format [byte]
 _ATTRIBUTES: Final = (
     *("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value", "origin"),
+    "_Unsigned",
 )
 
 
@@ -81,101 +83,108 @@ def array(
     recordings.check_unit(unit, label)
     recordings.check_number(memory, "memory")
 
-    attributes = dict[str, Any]()
-
-    def check(values: Any, dims: Sequence[Any], times: Any = None) -> None:
-        for dim, names in zip(dims, _DIMS, strict=False):
-            if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
-                rule = "Must be (time, y, x): rename or transpose"
-                raise ValueError(f"Invalid dims {[*dims]} of '{label}'. {rule}.")
-        attrs = getattr(values, "attrs", {})
-        attributes.update({name: attrs[name] for name in _ATTRIBUTES if name in attrs})
-        for scale in {"scale_factor", "add_offset"} & attributes.keys():
-            raise ValueError(f"Invalid '{scale}' of '{label}'. Must be counts as measured.")
-        dtype = getattr(values, "dtype", np.dtype(object))
-        _check(getattr(values, "shape", ()), dtype, memory, label)
-        text = attributes.get("units", attributes.get("unit", unit))
-        recordings.check_unit(text.decode() if isinstance(text, bytes) else str(text), label)
-        if times is not None:
-            _check_times(times, clock, label)
-
+    stored, path = np.inf, Path()
+    if isinstance(source, str | Path):
+        (path,) = recordings.files([source], "array")
+        inside = path.rglob("*") if path.is_dir() else [path]
+        stored = sum(file.lstat().st_size for file in inside)
+    rules = _Rules(label, unit, clock, memory, stored, {})
     # The array, checked before it is read.
     with ExitStack() as stack:
         values: Any = source
         if not isinstance(source, str | Path):
+            rules.check(source, containers.dims_of(source))
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            times = [axis for axis in coords if containers.are_times(axis.name, axis)]
-            check(source, containers.dims_of(source), *times[:1])
-        elif containers.kind_of(Path(source)):
-            values = containers.read(Path(source), name, check, memory, stack)
+            for times in [axis for axis in coords if containers.are_times(axis.name, axis)][:1]:
+                rules.compare(times)
+        elif (kind := recordings.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
+            values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
-            (path,) = recordings.files([source])
-            values = _numpy_file(path, name, memory, stack)
-        counts: Any = values if isinstance(source, str | Path) else recordings.film(values)
+            values = _numpy_file(path, name, rules, stack)
+        read = values if isinstance(source, str | Path) else recordings.film(values)
+    counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
-    judged = isinstance(source, str | Path) and any(np.any(frame & 0xFF) for frame in counts)
+    judged = stored < np.inf and any(np.any(frame & 0xFF) for frame in counts)
     if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
+    attributes = rules.attributes
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
+    fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
     return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
-def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:
-    """Raise ValueError for what is no stack of counts, before it is read."""
-    if dtype.kind != "u" or dtype.itemsize != 2:
-        rule = "Must be uint16: counts, neither temperatures nor objects"
-        raise ValueError(f"Invalid dtype {dtype} of '{name}'. {rule}.")
-    recordings.check_memory(shape, memory, name)
+class _Rules(NamedTuple):
+    """What an array must be: of counts, of a size, of times that the clock does not contradict."""
+
+    label: str
+    unit: str
+    clock: Clock
+    memory: float
+    stored: float  # size of its file [byte]
+    attributes: dict[str, Any]  # of the array, as it is checked
+
+    def check(self, values: Any, dims: Sequence[Any] = ()) -> None:
+        """Raise ValueError for what is no stack of counts, before it is read."""
+        for dim, names in zip(dims, _DIMS, strict=False):
+            if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
+                rule = "Must be (time, y, x): rename or transpose"
+                raise ValueError(f"Invalid dims {[*dims]} of '{self.label}'. {rule}.")
+        texts = {name: containers.attribute(values, name) for name in _ATTRIBUTES}
+        attributes = self.attributes
+        attributes.update({name: text for name, text in texts.items() if text is not None})
+        for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
+            if attributes.get(scale, neutral) != neutral:
+                rule = f"Must be {neutral:g}: counts as measured"
+                raise ValueError(f"Invalid '{scale}' of '{self.label}'. {rule}.")
+        dtype = np.dtype(getattr(values, "dtype", object))
+        unsigned = str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}
+        if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):
+            rule = "Must be uint16: counts, neither temperatures nor objects"
+            raise ValueError(f"Invalid dtype {dtype} of '{self.label}'. {rule}.")
+        shape = getattr(values, "shape", ())
+        recordings.check_memory(shape, self.memory, self.label, self.stored)
+        text = str(attributes.get("units", attributes.get("unit", self.unit))).strip()
+        recordings.check_unit(self.unit if text in {"", "1"} else text, self.label)
+
+    def compare(self, times: Any) -> None:
+        """Raise ValueError for times that the clock contradicts."""
+        if (moments := containers.moments(times)) is not None:
+            text = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
+            recordings.check_times(moments, str(text or ""), self.clock, self.label)
 
 
-def _check_times(times: Any, clock: Clock, name: str) -> None:
-    """Raise ValueError for an array's own times that do not rise, or that the clock contradicts."""
-    values, unit = np.asarray(times[...]), times.attrs.get("units", "s")
-    unit = (unit.decode() if isinstance(unit, bytes) else str(unit)).partition(" since ")[0]
-    if values.dtype.kind in "mM":
-        values, unit = (values - values[0]) / np.timedelta64(1, "s"), "s"
-    if values.dtype.kind not in "iuf":
-        return
-    if (unit := _UNITS.get(unit, unit)) not in _SECONDS:
-        raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
-    seconds = (values.astype(np.float64) - values[0]) * _SECONDS[unit]
-    stated = recordings.stamps(clock, len(seconds), name)
-    agrees = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
-    agrees &= np.diff(seconds, prepend=-1.0) > 0
-    if not agrees.all():
-        first = int(np.argmin(agrees))
-        mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
-        rule = "Must agree to half a frame, and rise: give clock= the times, or leave those out"
-        raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
-
-
-def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:
+def _numpy_file(path: Path, name: str | None, rules: _Rules, stack: ExitStack) -> Any:
     """Array of a .npy or of a .npz, whose checksums must be right."""
     stream: IO[bytes] = stack.enter_context(path.open("rb"))
     with recordings.damage_named(f"Damaged '{path.name}'", "a whole .npz"):
-        if stream.read(2) == b"PK":
-            archive = stack.enter_context(zipfile.ZipFile(path))
-            names = [member.removesuffix(".npy") for member in archive.namelist()]
-            place = names.index(recordings.array_name(names, name, path))
-            stream = stack.enter_context(archive.open(archive.namelist()[place]))
-        else:
+        if stream.read(2) != b"PK":
             stream.seek(0)
-        return _numpy_array(stream, path.name, memory)
+            return _numpy_array(stream, path.name, rules)
+        archive = stack.enter_context(zipfile.ZipFile(path))
+        names = [member.removesuffix(".npy") for member in archive.namelist()]
+        member = archive.infolist()[names.index(recordings.array_name(names, name, path))]
+        if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            label = f"compression {member.compress_type} of '{member.filename}' of '{path.name}'"
+            raise ValueError(f"Invalid {label}. Must be none or deflate, as of NumPy.")
+        return _numpy_array(stack.enter_context(archive.open(member)), path.name, rules)
 
 
-def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any]:
+def _numpy_array(stream: IO[bytes], name: str, rules: _Rules) -> npt.NDArray[Any]:
     """Array in NumPy's format, which must end where its header says."""
     with recordings.damage_named(f"Invalid '{name}'", ".npy, .npz, HDF5, NetCDF or zarr"):
         version = np.lib.format.read_magic(stream)
-        headers = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }
+        read, width = {
+            (1, 0): (np.lib.format.read_array_header_1_0, 2),
+            (2, 0): (np.lib.format.read_array_header_2_0, 4),
+        }[version]
+        start = stream.read(width)
+        if (length := int.from_bytes(start, "little")) > _LONGEST:
+            raise ValueError(f"Header of {length} bytes. Must be at most {_LONGEST}.")
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
-            shape, by_columns, dtype = headers[version](stream)
-    _check(shape, dtype, memory, name)
+            shape, by_columns, dtype = read(BytesIO(start + stream.read(length)))
+    rules.check(SimpleNamespace(shape=shape, dtype=dtype))
     counts, size = empty(shape[::-1] if by_columns else shape, np.uint16), 0
     for frames in parts(counts):
         size += stream.readinto(counts[frames].view("u1").data)  # type: ignore[attr-defined]
@@ -183,6 +192,6 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any
             counts[frames].byteswap(inplace=True)
     size += len(stream.read(1))
     if size != counts.nbytes:
-        read = f"{size} bytes or more of counts in '{name}'"
-        raise ValueError(f"Truncated or damaged {read}. Must be {counts.nbytes}, by its header.")
+        actual = f"{size} bytes or more of counts in '{name}'"
+        raise ValueError(f"Truncated or damaged {actual}. Must be {counts.nbytes}, by its header.")
     return counts.T if by_columns else counts

@@ -1,35 +1,40 @@
 """Arrays in files of HDF5, NetCDF and zarr, which are left on disk."""
 
+import bz2
+import lzma
 import math
 import re
 import struct
 import warnings
+import zlib
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
+import numpy.typing as npt
 import zarr
 
 from dbthermal import _text as texts
+from dbthermal.readers import _netcdf
 from dbthermal.readers import _recording as recordings
 
+# Names of times: of a dim, and of an array beside another.
+_BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
+_TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
+_MOMENT: Final = 40  # longest text of a moment [character]
+_OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
+_CHUNKS: Final = 2**16  # of less than 1 kB in an array of HDF5
+_DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
-
-
-def kind_of(path: Path) -> str:
-    """Format of a container, by its first bytes; empty for any other file."""
-    if path.is_dir():
-        return "zarr"
-    with recordings.files([path])[0].open("rb") as stream:
-        start = stream.read(8)
-    return "HDF5" if start == b"\x89HDF\r\n\x1a\n" else "NetCDF" if start[:3] == b"CDF" else ""
 
 
 def dims_of(values: Any) -> list[Any]:
@@ -45,34 +50,81 @@ def dims_of(values: Any) -> list[Any]:
 
 def are_times(name: object, values: Any) -> bool:
     """Tell whether an array is a coordinate of times, by its name."""
-    return values.ndim == 1 and str(name).rpartition("/")[2].lower() in {"time", "t"}
+    is_line = 0 < values.ndim < 3 and values.size == max(values.shape)  # MATLAB has no vectors
+    return is_line and bool(_TIMES.fullmatch(str(name).rpartition("/")[2]))
+
+
+def attribute(values: Any, name: str) -> Any:
+    """Attribute of an array, None if missing; ValueError for a list, which may take any memory."""
+    attrs = getattr(values, "attrs", {})
+    if name not in attrs:
+        return None
+    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:
+        raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")
+    value = attrs[name]
+    value = value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    return value.decode() if isinstance(value, bytes) else value
+
+
+def moments(times: Any) -> npt.NDArray[Any] | None:
+    """Times as numbers or dates, those in text as seconds; None of other text."""
+    if times.dtype.kind in "iufmM":
+        return np.asarray(times[...]).reshape(-1)
+    seconds = list[float]()
+    for number in range(times.size) if times.dtype.kind in "OSU" and times.ndim == 1 else ():
+        text = times[number]  # of any length, which one after another is no danger
+        text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
+        try:
+            moment = datetime.fromisoformat(text if len(text) <= _MOMENT else "")
+        except ValueError:
+            return None
+        seconds.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
+    return np.array(seconds) if seconds else None
+
+
+def _times_of(arrays: dict[str, Any], name: str, frames: int) -> list[Any]:
+    """Times of an array of a file: of its first dim, or by their names, of many films beside it."""
+    group, dims = name.rpartition("/")[0], dims_of(arrays[name])[:1]
+    lines = {key.rpartition("/")[::2]: array for key, array in arrays.items() if array.ndim < 3}
+    if dims and (group, dims[0]) in lines:
+        return [lines[group, dims[0]]]
+    films = sum(array.ndim == 3 for array in arrays.values())
+    return [
+        array
+        for (place, key), array in lines.items()
+        if _BESIDE.fullmatch(key) and array.size == frames and (place == group or films == 1)
+    ]
 
 
 def read(
-    path: Path, name: str | None, check: Callable[..., None], memory: float, stack: ExitStack
+    path: Path,
+    kind: str,
+    name: str | None,
+    check: Callable[[Any, list[Any]], None],
+    compare: Callable[[Any], None],
+    stack: ExitStack,
 ) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
-    # Size, for NetCDF is read at once.
-    kind = kind_of(path)
-    limit = max(2 * memory, 2**20)
-    if kind == "NetCDF" and path.stat().st_size > limit:
-        rule = f"Must be at most {limit:.3g} bytes, twice memory=, for it is read at once"
-        raise ValueError(f"Invalid size of '{path.name}'. {rule}.")
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
-        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
-        # The array, by its name, and its times.
+        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _variables}[kind](path, stack)
         films = [key for key, array in arrays.items() if array.ndim == 3]
         name = recordings.array_name(films, name, path)
-        values, dims = arrays[name], dims_of(arrays[name])
-        times = arrays.get("/".join([*name.split("/")[:-1], *map(str, dims[:1])]))
-        if isinstance(times, zarr.Array):
-            _check_chunks(times, path)
-        check(values, dims, times if times is not None and times.ndim == 1 else None)
-        if isinstance(values, zarr.Array):
-            _check_chunks(values, path)
-        return recordings.film(values)
+        # Shapes first, then what is stored, then times and numbers.
+        values = arrays[name]
+        check(values, dims_of(values))
+        for times in _times_of(arrays, name, frames := values.shape[0]):
+            if times.size != frames:
+                rule = f"Must be {frames}, one for each frame"
+                raise ValueError(f"Invalid number {times.size} of times of '{name}'. {rule}.")
+            _check_whole(times, path)
+            compare(times)
+        _check_whole(values, path)
+        with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
+            by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
+        counts = recordings.film(values)
+        return np.swapaxes(counts, 1, 2) if by_columns else counts
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
@@ -81,11 +133,14 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
     arrays, headers = dict[str, Any](), [8]
 
     def visit(name: str, array: Any) -> None:
-        headers.append(h5py.h5o.get_info(array.id).addr)
-        if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(array.attrs.get("NAME")):
+        headers.append(h5py.h5o.get_info(array.id).addr + file.userblock_size)
+        if len(headers) > _OBJECTS or name.count("/") > _DEPTH:
+            label = f"{len(headers)} objects, {name.count('/')} deep, in '{path.name}'"
+            raise ValueError(f"Invalid tree of {label}. Must be {_OBJECTS}, {_DEPTH} at most.")
+        if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(attribute(array, "NAME")):
             arrays.update({name: array} if array.ndim == 3 or are_times(name, array) else {})
 
-    # All arrays of the file itself: no other file, no overlap, every chunk.
+    # All arrays of the file itself: no other file, no overlap.
     file.visititems(visit)  # follows no link to another file
     for name, array in arrays.items():
         if array.is_virtual or array.external:
@@ -93,46 +148,67 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
         start = array.id.get_offset() if array.chunks is None else None
         if start is not None and any(start <= place < start + array.nbytes for place in headers):
             raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-        if array.chunks is None and (stored := array.id.get_storage_size()) != array.nbytes:
-            rule = f"Must be all of the {stored} bytes stored"
-            raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
-        pieces = zip(array.shape, array.chunks or array.shape, strict=True)
-        wanted = math.prod(-(-size // piece) for size, piece in pieces) if array.chunks else 0
-        chunks = [
-            array.id.get_chunk_info(n) for n in range(array.id.get_num_chunks() if wanted else 0)
-        ]
-        if len(chunks) != wanted or any(chunk.filter_mask for chunk in chunks):
-            raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
     return arrays
 
 
-def _netcdf(path: Path, stack: ExitStack) -> dict[str, Any]:
-    opened = xr.open_dataset(
-        path,
-        engine="scipy",
-        mmap=False,  # what is mapped cannot be closed while an error refers to it
-        decode_times=False,
-        decode_coords=False,
-        concat_characters=False,
-        create_default_indexes=False,
-    )
-    variables = stack.enter_context(opened).variables
-    if not opened.encoding.get("unlimited_dims"):  # else they lie frame by frame
-        # One variable after another up to the end: a place in the header that is damaged shows.
-        content = np.memmap(path, "u1", "r")
-        kinds = [variable.encoding.get("dtype", variable.dtype) for variable in variables.values()]
-        sizes = [
-            -(-variable.size * kind.itemsize // 4) * 4
-            for variable, kind in zip(variables.values(), kinds, strict=True)
-        ]
-        start = len(content) - sum(sizes)
-        for name, kind, size in zip(variables, kinds, sizes, strict=True):
-            variable, start = variables[name], start + size
-            if variable.ndim == 3 and variable.dtype.kind == "u":
-                stored = content[start - size :][: variable[0].size * kind.itemsize].view(">u2")
-                if not np.array_equal(variable[0].values.ravel(), stored):
-                    raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
-    return {str(n): v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
+def _filters(array: Any, path: Path) -> list[int]:
+    """Codes of the filters of an array of HDF5; deflate may be the last, before a checksum."""
+    h5py, form = recordings.optional("h5py", "recordings"), array.id.get_create_plist()
+    filters = [form.get_filter(n) for n in range(form.get_nfilters())]
+    codes = [code for code, *_ in filters]
+    if not all(map(h5py.h5z.filter_avail, codes)):
+        with suppress(ImportError):
+            import_module("hdf5plugin")
+    for code, _, _, label in filters:
+        if not h5py.h5z.filter_avail(code):
+            text = f"filter {code}, {label.decode(errors='replace')}, that compresses"
+            rule = "Must be installed, many with: python -m pip install hdf5plugin"
+            raise ValueError(f"Missing {text} '{array.name}' of '{path.name}'. {rule}.")
+    before = codes[:-1] if codes[-1:] == [h5py.h5z.FILTER_FLETCHER32] else codes
+    if _DEFLATE in before[:-1]:
+        raise ValueError(f"Invalid filters {codes} of '{array.name}'. Must be deflate last.")
+    return codes
+
+
+def _check_whole(array: Any, path: Path) -> None:
+    """Refuse an array that is not all there, or whose chunks unpack to more than itself."""
+    if isinstance(array, zarr.Array):
+        _check_chunks(array, path)
+    elif hasattr(array, "is_virtual"):  # of HDF5; one of NetCDF 3 is whole by its header
+        _check_pieces(array, path)
+
+
+def _check_pieces(array: Any, path: Path) -> None:
+    """Refuse an array of HDF5 that is not all there, or whose chunks unpack to more than itself."""
+    name = array.name.strip("/")
+    stored = array.id.get_storage_size()
+    if array.chunks is None:
+        if array.dtype.kind != "O" and stored != array.nbytes:
+            rule = f"Must be all of the {stored} bytes stored"
+            raise ValueError(f"Invalid shape {array.shape} of '{name}' of '{path.name}'. {rule}.")
+        return
+    codes = _filters(array, path)
+    # Chunks, all there, and none larger than it says.
+    size = math.prod(array.chunks) * array.dtype.itemsize
+    wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
+    if wanted > (most := max(_CHUNKS, array.nbytes // 2**10)):  # HDF5 takes 6 kB for each
+        raise ValueError(f"Invalid number {wanted} of chunks of '{name}'. Must be at most {most}.")
+    chunks = list[tuple[tuple[int, ...], int, int]]()
+    array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
+    if len(chunks) != wanted or any(mask for _, mask, _ in chunks):
+        raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
+    if size > max(recordings.SMALL, array.nbytes):
+        raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
+    for place, _, length in chunks if _DEFLATE in codes else ():
+        if length * _MOST_DEFLATED > recordings.SMALL:
+            _, packed = array.id.read_direct_chunk(place)
+            if len(zlib.decompressobj().decompress(packed, size + 64)) > size + 4:
+                raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
+
+
+def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
+    variables = _netcdf.arrays(path)
+    return {n: v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
@@ -146,8 +222,6 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     arrays = {n: array for n, array in members.items() if isinstance(array, zarr.Array)}
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
     for name, array in arrays.items():
-        chunk = (1, 1, *(array.shards or array.chunks))[-3:]
-        recordings.check_memory(chunk, 2.0**30, f"a chunk of '{name}'")
         for code in array.filters:
             kind = getattr(code, "codec_id", type(code).__name__)
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
@@ -169,12 +243,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     # Files of chunks, which must be of their stated size.
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
-    if values.shards is None and "Blosc" in str(values.compressors[-1:]):
-        for key in keys:  # Blosc reads as far as its header says, and past the end of the memory
-            with key.open("rb") as stream:
-                sizes = struct.unpack("<4xI4xI", stream.read(16).ljust(16, b"\0"))
-            if sizes != (values.dtype.itemsize * math.prod(pieces), key.stat().st_size):
-                raise ValueError(f"Damaged chunk '{key.name}' of '{path.name}'. Must be whole.")
+    _check_unpacked(values, keys, path)
     # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
     if values.shards:
         fill = values.dtype.type(values.fill_value == 0)
@@ -195,3 +264,57 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     if more:
         rule = "Must be all that its chunks hold: there is more"
         raise ValueError(f"Invalid shape {values.shape} of '{path.name}'. {rule}.")
+
+
+def _check_unpacked(values: zarr.Array[Any], keys: list[Path], path: Path) -> None:
+    """Refuse files of chunks that unpack to another size than that of a chunk."""
+    pieces = values.shards or values.chunks
+    size = values.dtype.itemsize * math.prod(values.chunks)
+    if math.prod(pieces) * values.dtype.itemsize > max(recordings.SMALL, values.nbytes):
+        raise ValueError(f"Invalid chunk {pieces} of '{path.name}'. Must be its size at most.")
+    codecs = [getattr(codec, "codec_id", type(codec).__name__) for codec in values.compressors]
+    kinds = [kind.lower().removesuffix("codec") for kind in codecs]
+    if len(kinds) > 1 or not {*kinds} <= _UNPACKED.keys():
+        rule = f"Must be one of {[*_UNPACKED]}"
+        raise ValueError(f"Invalid compressors {kinds} of '{path.name}'. {rule}.")
+    for key in keys if kinds else ():
+        parts = math.prod(pieces) // math.prod(values.chunks)
+        for packed in _pieces(key.read_bytes(), parts if values.shards else 0):
+            if not _UNPACKED[kinds[0]](packed, size):
+                label = f"chunk '{key.name}' of '{path.name}'"
+                raise ValueError(f"Damaged {label}. Must be whole, and unpack to {size} bytes.")
+
+
+def _pieces(content: bytes, number: int) -> list[bytes]:
+    """Chunks of the file of a chunk, or of a shard by the index at its end."""
+    index = np.frombuffer(content[-16 * number - 4 : -4], "<u8").reshape(-1, 2).tolist()
+    listed = [content[start : start + length] for start, length in index if start < len(content)]
+    return listed if number else [content]
+
+
+def _zstd(packed: bytes, size: int) -> bool:
+    """Tell whether the header of Zstandard states a size."""
+    about = packed[4] if len(packed) > 4 else 0
+    width = (about >> 5 & 1, 2, 4, 8)[about >> 6]
+    start = 5 + (not about & 32) + (0, 1, 2, 4)[about & 3]
+    stated = int.from_bytes(packed[start : start + width], "little")
+    return width > 0 and stated + 256 * (width == 2) == size
+
+
+def _unpacks(make: Callable[[], Any]) -> Callable[[bytes, int], bool]:
+    """Test whether a piece unpacks to a size, which never unpacks farther."""
+    return lambda packed, size: len(make().decompress(packed, size + 1)) == size
+
+
+# Test by compressor whether a piece unpacks to a size, beyond which it would take any memory.
+_UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
+    "blosc": lambda packed, size: (
+        struct.unpack("<4xI4xI", packed[:16].ljust(16, b"\0")) == (size, len(packed))
+    ),
+    "lz4": lambda packed, size: int.from_bytes(packed[:4], "little") == size,
+    "zstd": _zstd,
+    "gzip": _unpacks(lambda: zlib.decompressobj(31)),
+    "zlib": _unpacks(zlib.decompressobj),
+    "bz2": _unpacks(bz2.BZ2Decompressor),
+    "lzma": _unpacks(lzma.LZMADecompressor),
+}

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
+from dbthermal._warnings import warned
 from dbthermal.readers import _flir_records as container
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._flir_records import Content, Frame
@@ -53,13 +55,12 @@ _TIME: Final = 0x384  # whole seconds since 1970 UTC, milliseconds
 _CAMERA_SIZE: Final = 0x466
 _IMAGE_SIZE: Final = 32  # of what precedes the counts
 _NUMBER: Final = 24  # place of the frame's number, in image and camera
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
 _FIRST_CLOCK: Final = datetime(2001, 1, 1, tzinfo=UTC).timestamp()  # clocks never set begin before
 _CONSTANTS: Final = ("planck_R1", "planck_R2", "planck_B", "planck_F", "planck_O")
 
 
 class _Image(NamedTuple):
-    """Counts as a file holds them: numbers as they are, or compressed by a codec of FFmpeg."""
+    """Counts as a file holds them: numbers as they are, or compressed by a codec."""
 
     shape: tuple[int, int]
     order: str  # of the bytes, as numpy writes it; "" if a codec gives numbers
@@ -112,8 +113,8 @@ def flir(
     Raises
     ------
     OSError, ImportError
-        If a file cannot be opened, or an image is compressed and PyAV, the extra ``recordings``, is
-        not installed.
+        If a file cannot be opened, or an image is compressed and imagecodecs, the extra
+        ``recordings``, is not installed.
     TypeError, ValueError
         If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
         differ in size or in the maker's constants; the byte order is unclear or contradicts the
@@ -126,7 +127,7 @@ def flir(
     Traceback (most recent call last):
     ValueError: Refused 'recording.ravi': export its counts as 16-bit TIFF with the maker's program and use readers.tiff.
     """  # noqa: E501
-    paths = recordings.files(path)
+    paths = recordings.files(path, "flir")
     name = recordings.label(paths)
     recordings.check_number(memory, "memory")
     wanted = slice(None) if frames is None else frames
@@ -141,7 +142,8 @@ def flir(
             raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
         # Images, all of the form of the first.
         form = _image(*listed[0])._replace(body=b"")
-        recordings.check_memory((len(listed), *form.shape), memory, name)
+        stored = sum(file.stat().st_size for file in paths)
+        recordings.check_memory((len(listed), *form.shape), memory, name, stored)
         counts = empty((len(listed), *form.shape), np.uint16)
         for number, listing in enumerate(listed):
             image = _image(*listing)
@@ -152,7 +154,7 @@ def flir(
                 image = image._replace(order=recordings.byte_order(name, byte_order))
             counts[number] = _decoded(image, listing[-1])
             release()
-        seconds, same_number, attrs = _cameras(listed)
+        seconds, same_number, attrs = _cameras(listed, timed=clock is None)
     # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
@@ -161,7 +163,9 @@ def flir(
         seconds = recordings.stamps(clock, len(counts), name)
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
-    return recordings.recording(counts, seconds, name, about, flags)
+    doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
+    made = recordings.recording(counts, seconds, name, about, flags)
+    return warned(made, *(f"Wrong {note}: has it been edited?" for note in doubts[:1]))
 
 
 _Found = tuple[Content, Frame, str]
@@ -173,12 +177,12 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
         content: Content = stack.enter_context(
             mmap(stack.enter_context(path.open("rb")).fileno(), 0, access=ACCESS_READ)
         )
-        if content[:2] == b"\xff\xd8":
+        if still := content[:2] == b"\xff\xd8":
             texts.regular_file(path, int(memory))
             content = container.of_jpeg(content, path.name)
         number = 0
         try:
-            for records in container.frames(content, path.name):
+            for records in container.frames(content, path.name, still=still):
                 yield content, records, f"frame {number} of '{path.name}'"
                 number += 1
         except ValueError as error:
@@ -188,7 +192,9 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
 
 def _image(content: Content, records: Frame, place: str) -> _Image:
     """Form and bytes of an image, whose sizes agree in all places that state them."""
-    body = container.body(content, records[container.IMAGE], place)
+    body, fault = container.body(content, records[container.IMAGE])
+    if fault:
+        raise ValueError(f"Damaged image in {place}: {fault}.")
     head, body = body[:_IMAGE_SIZE], body[_IMAGE_SIZE:]
     order = {b"\2\0": "<", b"\0\2": ">"}.get(head[:2])
     if order is None or len(head) < _IMAGE_SIZE:
@@ -197,10 +203,9 @@ def _image(content: Content, records: Frame, place: str) -> _Image:
     width, height = struct.unpack_from(f"{order}HH", head, 2)
     image = _Image((height, width), order, "none", body)
     stated = (height, width, 16)
-    if body[:8] == _PNG:
+    if body[:8] == recordings.PNG:
         image = image._replace(order="", codec="png")
-        columns, rows, bits, *_ = struct.unpack_from(">IIB", body.ljust(25), 16)
-        stated = (rows, columns, bits)
+        stated = recordings.png_size(body, place)
     elif body[:2] == b"\xff\xd8":
         image = image._replace(order="", codec="jpegls")
         stated = _jpegls_size(body, place)
@@ -228,19 +233,12 @@ def _decoded(image: _Image, place: str) -> Counts:
     """Counts (y, x) of an image; ValueError where its codec finds damage."""
     if image.codec == "none":
         return np.frombuffer(image.body, f"{image.order}u2").reshape(image.shape)
-    av = recordings.optional("av", "recordings")
-    codec = av.CodecContext.create(image.codec, "r")
-    largest = 4 * image.shape[0] * image.shape[1] + 2**16  # with what FFmpeg adds to each side
-    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(largest)}
-    codec.thread_count = 1
-    try:
-        pictures = [*codec.decode(av.Packet(image.body)), *codec.decode(None)]
-    except av.FFmpegError as error:
-        raise ValueError(f"Damaged image in {place}: '{error}'. Must decode.") from error
-    sizes = [(picture.height, picture.width) for picture in pictures if not picture.is_corrupt]
-    if sizes != [image.shape] or not pictures[0].format.name.startswith("gray16"):
-        raise ValueError(f"Damaged image in {place}: {sizes}. Must be one of {image.shape}.")
-    return np.asarray(pictures[0].to_ndarray(), dtype=np.uint16)
+    codecs = recordings.optional("imagecodecs", "recordings")
+    if image.codec == "png":
+        return recordings.png(image.body, place)
+    with recordings.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
+        counts = codecs.jpegls_decode(image.body)
+    return recordings.decoded(counts, image.shape, place)
 
 
 def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple[str, str]:
@@ -269,26 +267,34 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     return "little" if swap else "big", "caller" if stated else "smoothness"
 
 
-def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
+def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dict[str, Any]]:
     """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records.
 
-    Image and camera begin with the same 32 bytes, of which two number the frame: different ones
-    mean that one of the two is of another frame. From frame to frame they may rise by any number.
+    A record whose checksum is wrong, as after its texts were edited, is doubted: its time counts if
+    there is no other. Without times to take, one that is damaged is passed over.
     """
-    same_number = np.ones(len(listed), dtype=bool)
     milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
+    numbers, doubts = np.zeros((len(listed), 3), dtype=np.int64), dict[int, str]()
     for number, (content, records, place) in enumerate(listed):
         if container.CAMERA not in records:
             continue
         # The record, in its byte order.
-        body = container.body(content, records[container.CAMERA], place)
+        body, fault = container.body(content, records[container.CAMERA])
+        if fault:
+            doubts[number] = f"checksum of the camera's record in {place}, {fault}"
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
+            if not timed:
+                continue
             label = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
-            raise ValueError(f"Damaged {label}. Must be {_CAMERA_SIZE} at least, and begin with 2.")
+            rule = f"Must be {_CAMERA_SIZE} at least, and begin with 2; with clock= it is not read"
+            raise ValueError(f"Damaged {label}. {rule}.")
         order = "<" if body[0] else ">"
-        # Number and time of the frame.
-        place_of = records[container.IMAGE].start + _NUMBER
-        same_number[number] = content[place_of : place_of + 2] == body[_NUMBER : _NUMBER + 2]
+        # Numbers and time of the frame.
+        start = records[container.IMAGE].start
+        image = "<" if content[start] else ">"
+        (of_image,) = struct.unpack_from(f"{image}H", content, start + _NUMBER)
+        (of_camera,) = struct.unpack_from(f"{order}H", body, _NUMBER)
+        numbers[number] = id(content), of_image, of_camera
         whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
@@ -303,9 +309,31 @@ def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
                 change = f"{key} {camera[key]:g} of {place}, {first[key]:g} before"
                 rule = "Must be one range of the camera: select its frames by frames="
                 raise ValueError(f"Invalid {change}. {rule}.")
+    if len(doubts) < len(listed):
+        milliseconds[[*doubts]] = np.nan
     first_time = milliseconds[np.isfinite(milliseconds)][:1]
     attrs = _attrs(first, *first_time / 1000) if first else {"implausible": ""}
-    return (milliseconds - (first_time if first_time.size else 0)) / 1000, same_number, attrs
+    attrs["implausible"] = "; ".join(filter(None, [attrs["implausible"], *doubts.values()]))
+    seconds = (milliseconds - (first_time if first_time.size else 0)) / 1000
+    return seconds, _numbers_agree(numbers), attrs
+
+
+def _numbers_agree(numbers: npt.NDArray[np.int64]) -> Mask:
+    """Agreement (time) of the numbers (time, [file, image, camera]) of frames.
+
+    Image and camera begin with the same 32 bytes, of which two number the frame. Each may count
+    from a start of its own, or not at all: in a file the two must rise together, or one of them is
+    of another frame.
+    """
+    agree = np.ones(len(numbers), dtype=bool)
+    for file in np.unique(numbers[:, 0]):
+        (frames,) = np.nonzero(numbers[:, 0] == file)
+        image, camera = numbers[frames, 1:].T
+        if np.ptp(image) and np.ptp(camera):
+            apart, shares = np.unique((image - camera) % 2**16, return_counts=True)
+            usual = apart[shares.argmax()] if 2 * shares.max() > len(frames) else 0
+            agree[frames] = (image - camera) % 2**16 == usual
+    return agree
 
 
 def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, Any]:

@@ -21,6 +21,7 @@ _MARKS: Final = (b"FFF\0", b"AFF\0")
 _HEADER, _ENTRY = 64, 32  # sizes [byte]
 _MOST_RECORDS: Final = 1024  # in a frame; the files at hand have up to 14
 _PADDING: Final = 32  # by which the last record of a file may seem to pass its end [byte]
+_ALIGNED: Final = 4  # to a multiple of which some cameras fill up [byte]
 _SEGMENT: Final = b"FLIR\0\x01"
 _NO_ZERO: Final = re.compile(rb"[^\0]")
 
@@ -38,24 +39,38 @@ class Record(NamedTuple):
 Frame = Mapping[int, Record]  # record by its type
 
 
-def frames(content: Content, name: str) -> Iterator[Frame]:
-    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
-    at, number = 0, 0
-    while (following := _NO_ZERO.search(content, at)) or number == 0:
-        at = following.start() if number and following else 0
-        place = f"frame {number} of '{name}', at byte {at}"
-        records, at = _frame(content, at, place)
+def frames(content: Content, name: str, *, still: bool) -> Iterator[Frame]:
+    """Yield the records of each frame of a file; ValueError by frame and byte where damaged.
+
+    Behind the last record lie zeros, or bytes that fill up to a multiple of 4. A still has one
+    frame: what follows without a mark fills it up.
+    """
+    at: int | None = 0
+    number = 0
+    while at is not None:
+        records, stop = _frame(content, at, f"frame {number} of '{name}', at byte {at}")
         yield records
-        number += 1
+        at, number = _following(content, at, stop, still=still), number + 1
 
 
-def body(content: Content, record: Record, place: str) -> bytes:
-    """Bytes of a record, whose checksum, if it has one, must be right."""
+def _following(content: Content, start: int, stop: int, *, still: bool) -> int | None:
+    """Place of the frame behind one that lies from start to stop; None at the end of the file."""
+    filled = start + -(-(stop - start) // _ALIGNED) * _ALIGNED
+    for behind in (stop, filled):
+        if (byte := _NO_ZERO.search(content, behind)) is None:
+            return None
+        at, head = byte.start(), content[byte.start() : byte.start() + _HEADER]
+        if any(mark.startswith(head[: len(mark)]) for mark in _MARKS):
+            return at
+    return None if still or len(head) < _HEADER else at
+
+
+def body(content: Content, record: Record) -> tuple[bytes, str]:
+    """Bytes of a record, and a sentence on its checksum if it has one that is wrong."""
     value = content[record.start : record.stop]
-    if record.checksum and zlib.crc32(value) != record.checksum:
-        label = f"CRC-32 {zlib.crc32(value):08x} of a record of {place}"
-        raise ValueError(f"Damaged file: {label}. Must be {record.checksum:08x}, as listed.")
-    return value
+    if record.checksum in {0, checksum := zlib.crc32(value)}:
+        return value, ""
+    return value, f"CRC-32 {checksum:08x}. Must be {record.checksum:08x}, as listed"
 
 
 def segments(content: Content, name: str) -> Iterator[tuple[int, int, int]]:

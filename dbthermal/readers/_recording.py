@@ -19,18 +19,45 @@ import xarray as xr
 from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array, empty, made_on_disk, parts
+from dbthermal._warnings import warned
 
 Counts = npt.NDArray[np.uint16]
 
 Paths = str | Path | Sequence[str | Path]
 Clock = float | npt.ArrayLike
 
-_EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
-_RECORD: Final = "its 8 bits are drawn, not measured: record 16-bit counts"
-_REFUSED: Final = {
-    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".sfmov"), _EXPORT),
-    **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
+# First bytes of a format: place, bytes, and its name.
+_MAGIC: Final = (
+    *((0, mark, "FLIR") for mark in (b"FFF\0", b"AFF\0")),
+    *((0, mark, "TIFF") for mark in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
+    *((0, mark, "NetCDF") for mark in (b"CDF\1", b"CDF\2", b"CDF\5")),
+    *((0, mark, "film") for mark in (b"\x1aE\xdf\xa3", b"GIF8")),
+    *((8, b"AVI ", "film"), (4, b"ftyp", "film"), (8, b"WEBP", "picture"), (0, b"BM", "picture")),
+    *((0, b"\xff\xd8\xff", "JPEG"), (0, b"\x89PNG\r\n\x1a\n", "PNG")),
+    *((0, b"\x93NUMPY", "NumPy"), (0, b"PK\3\4", "zip"), (0, b"MATLAB 5.0", "MATLAB 5")),
+    *((0, b"\x0e\x03\x13\x01", "HDF4"), (0, b"SIMPLE  =", "FITS")),
+)
+PNG: Final = b"\x89PNG\r\n\x1a\n"
+_HDF5: Final = b"\x89HDF\r\n\x1a\n"  # at 0, 512, 1024, ...: what precedes is the user's
+_READER: Final = {
+    **dict.fromkeys(("FLIR", "JPEG"), "flir"),
+    **dict.fromkeys(("TIFF", "PNG"), "tiff"),
+    **dict.fromkeys(("NumPy", "zip", "HDF5", "NetCDF", "zarr"), "array"),
 }
+_EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
+_DRAWN: Final = (
+    "most have 8 bits that are drawn, not measured: record 16-bit counts; one of 16-bit counts is "
+    "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
+)
+_FOREIGN: Final = {
+    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".hcc"), _EXPORT),
+    ".sfmov": f"{_EXPORT}, or readers.raw with header=, up to the line of DATA",
+    **dict.fromkeys(("film", "picture"), _DRAWN),
+    "MATLAB 5": "save it anew by save(..., '-v7.3') and use readers.array",
+    "HDF4": "convert it by h4toh5 and use readers.array",
+    "FITS": "save its array with NumPy and use readers.array",
+}
+"""What to do with a format that no reader opens, by suffix or first bytes."""
 MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default [byte]
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _FASTEST: Final = 1e6  # frame rate of a camera [Hz]
@@ -44,6 +71,24 @@ DAMAGE: Final = (
 # An image is smoother than with its bytes swapped, or its rows cut at another place, by this
 # factor, or the form is not known.
 _SMOOTHER: Final = 2.0
+_ALONG: Final = 64  # samples along each axis that tell which of them is time
+_APART: Final = 1.3  # axes whose roughness differs by this factor are of another kind
+# Most bytes of counts in a byte of a file: the .csq at hand has 11, its counts in a packed TIFF 3.
+_PACKED: Final = 64
+SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
+# Names of a digital number, and of units of time.
+_COUNTS: Final = re.compile(
+    r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
+)
+_SECONDS: Final = {
+    r"s(ec(ond)?s?)?": 1.0,
+    r"m(illi)?s(ec(ond)?s?)?": 1e-3,
+    r"(u|\N{MICRO SIGN}|\N{GREEK SMALL LETTER MU}|micro)s(ec(ond)?s?)?": 1e-6,
+    r"n(ano)?s(ec(ond)?s?)?": 1e-9,
+    r"min(ute)?s?": 60.0,
+    r"h(ou)?rs?|h": 3600.0,
+    r"days?|d": 86400.0,
+}
 
 
 class FileFlag(schema.Flags):
@@ -55,7 +100,32 @@ class FileFlag(schema.Flags):
     NUMBERS_DIFFER = 8, "image and time are of frames of different numbers"
 
 
-def files(path: Paths) -> list[Path]:
+def format_of(path: Path) -> str:
+    """Format of a file by its first bytes, empty if unknown; of a folder zarr."""
+    if path.is_dir():
+        return "zarr"
+    size = texts.regular_file(path, _LARGEST).stat().st_size
+    with path.open("rb") as stream:
+        start, place = stream.read(16), 0
+        while place < size:
+            stream.seek(place)
+            if stream.read(8) == _HDF5:
+                return "HDF5"
+            place = 2 * place or 512
+    return next((name for at, mark, name in _MAGIC if start[at:].startswith(mark)), "")
+
+
+def reader_of(path: Path) -> str:
+    """Reader of a file by its first bytes, empty if unknown; ValueError for a foreign format."""
+    form, suffix = format_of(path) if path.exists() else "", path.suffix.lower()
+    if suffix in _FOREIGN and form in {"", "film", "picture", "zip"}:
+        raise ValueError(f"Refused '{path.name}': {_FOREIGN[suffix]}.")
+    if form in _FOREIGN:
+        raise ValueError(f"Refused '{path.name}', a {form}: {_FOREIGN[form]}.")
+    return _READER.get(form, "")
+
+
+def files(path: Paths, reader: str) -> list[Path]:
     """Regular files of a recording, in the order of time; ValueError by what to do instead."""
     listed = path if isinstance(path, list | tuple) else [path]
     paths = [texts.as_path(file) for file in listed]
@@ -67,9 +137,12 @@ def files(path: Paths) -> list[Path]:
             rule = "Must rise: 'frame10' comes after 'frame9', which the order of text does not"
             raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
     for file in paths:
-        if file.suffix.lower() in _REFUSED:
-            raise ValueError(f"Refused '{file.name}': {_REFUSED[file.suffix.lower()]}.")
-        if texts.regular_file(file, _LARGEST).stat().st_size == 0:
+        actual = "" if reader == "raw" else reader_of(file)
+        if actual not in {"", reader}:
+            label = f"Invalid '{file.name}' for readers.{reader}, by its first bytes"
+            raise ValueError(f"{label}. Must be read by readers.{actual}.")
+        is_store = actual == "array" and file.is_dir()
+        if not is_store and texts.regular_file(file, _LARGEST).stat().st_size == 0:
             raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
     return paths
 
@@ -102,25 +175,33 @@ def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bo
         raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
 
 
-def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
-    """Raise ValueError if counts (time, y, x) take more memory than is allowed."""
+def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
+    """Raise ValueError if counts (time, y, x) take more memory than allowed, or the file holds."""
     check_number(memory, "memory")
     if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
     frames, height, width = map(int, shape)
     needed = 2 * (frames + 3) * height * width  # 3 while one is decoded
+    label = f"{frames} frames of {height} x {width} pixels take {needed:.3g} bytes"
     if needed > memory and not made_on_disk():
-        raise ValueError(
-            f"Invalid size of '{name}': {frames} frames of {height} x {width} pixels take "
-            f"{needed:.3g} bytes. Must be at most memory={memory:.3g}."
-        )
+        raise ValueError(f"Invalid size of '{name}': {label}. Must be at most memory={memory:.3g}.")
+    if needed > max(SMALL, _PACKED * stored):
+        rule = f"Must be at most {_PACKED} times the {stored:.3g} bytes of the file"
+        raise ValueError(f"Invalid size of '{name}': {label}. {rule}.")
 
 
 def film(values: Any) -> Counts:
-    """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time."""
+    """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time.
+
+    Those that come must be of the type and shape that the array declares.
+    """
     counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
     for frames in parts(counts):
-        counts[frames] = values[frames]
+        actual, place = np.asarray(values[frames]), counts[frames]
+        if (actual.dtype, actual.shape) != (values.dtype, place.shape):
+            label = f"{actual.dtype} {actual.shape} of frames from {frames.start} on"
+            raise ValueError(f"Invalid {label}. Must be {values.dtype} {place.shape}, as declared.")
+        place[...] = actual
     return counts
 
 
@@ -153,12 +234,35 @@ def array_name(names: Collection[str], name: str | None, path: Path) -> str:
 
 def check_unit(unit: str, name: str) -> None:
     """Raise ValueError if the numbers of a file are no counts."""
-    if str(unit) not in {"count", "counts"}:
+    if not _COUNTS.fullmatch(str(unit).strip()):
         raise ValueError(
             f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
             "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
             "counts."
         )
+
+
+def check_times(values: npt.NDArray[Any], unit: str, clock: Clock, name: str) -> None:
+    """Raise ValueError for a file's own times that do not rise, or that the clock contradicts."""
+    # Seconds since the first frame; of numbers without a unit in any that is in use.
+    word = unit.partition(" since ")[0].strip()
+    scales = [scale for text, scale in _SECONDS.items() if re.fullmatch(text, word, re.IGNORECASE)]
+    if values.dtype.kind in "mM":
+        values, scales = (values - values[0]) / np.timedelta64(1, "s"), [1.0]
+    elif not word:
+        scales = [1.0, 1e-3, 1e-6, 1e-9]
+    if not scales:
+        raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
+    stated = stamps(clock, len(values), name)
+    apart = values.astype(np.float64) - float(values[0])
+    seconds = min((apart * scale for scale in scales), key=lambda s: np.abs(s - stated).max())
+    agrees = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
+    agrees &= np.diff(seconds, prepend=-1.0) > 0
+    if not agrees.all():
+        first = int(np.argmin(agrees))
+        mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
+        rule = "Must agree to half a frame, and rise: give clock= the times, or leave those out"
+        raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
 
 
 def byte_order(name: str, value: str) -> str:
@@ -195,12 +299,10 @@ def recording(
     flags: npt.NDArray[np.uint16] | None = None,
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
-    # Counts, of which both bytes are used.
-    empty = (not any(np.any(frame & byte) for frame in counts) for byte in (0x00FF, 0xFF00))
-    if any(empty):
+    if _of_8_bits(counts):
         raise ValueError(
-            f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
-            "bits or with automatic gain. Must be 16-bit counts of the detector: record those."
+            f"Invalid counts of '{name}': they have 8 bits, alone or spread over two bytes, as in "
+            "pictures or with automatic gain. Must be 16-bit counts of the detector: record those."
         )
     # Times, which must rise where they are known.
     (stamped,) = np.nonzero(np.isfinite(seconds))
@@ -237,10 +339,80 @@ def recording(
     return xr.Dataset(variables, {"time": coordinate}, {"origin": schema.MEASURED, **attrs})
 
 
-def clocked(counts: Counts, clock: Clock, name: str, **attrs: str) -> xr.Dataset:
+def _of_8_bits(counts: Counts) -> bool:
+    """Tell whether all counts are of 256 numbers below 256, or 256 or more apart."""
+    used = np.zeros(2**16, dtype=bool)
+    for frame in counts:
+        used[frame] = True
+        if np.count_nonzero(used) > 2**8:
+            return False
+    levels = np.flatnonzero(used)
+    return bool(levels[-1] < 2**8 or np.gcd.reduce(np.diff(levels), initial=0) >= 2**8)
+
+
+def clocked(counts: Counts, clock: Clock, name: str, *sentences: str, **attrs: str) -> xr.Dataset:
     """Dataset of one band of a file that tells no times, from a rate [Hz] or times [s]."""
     seconds = stamps(clock, len(counts), name)
-    return recording(counts, seconds, name, {"source": name, **attrs})
+    made = recording(counts, seconds, name, {"source": name, **attrs})
+    return warned(made, *sentences, *_time_elsewhere(counts, name))
+
+
+def _time_elsewhere(counts: Counts, name: str) -> list[str]:
+    """Sentence on counts (time, y, x) whose time may be along another axis.
+
+    Rows and columns of an image are about as rough; time is smoother, or changes faster, for its
+    neighbours share their pattern. Roughness is the mean second difference without its largest
+    quarter, and that of rounding.
+    """
+    sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
+    middle = counts[tuple(sides)]
+    if min(middle.shape) < 8:
+        return []
+    rough = list[float]()
+    for axis in range(3):
+        means = middle.mean(axis=tuple({0, 1, 2} - {axis}), keepdims=True)
+        steps, turns = (np.abs(np.diff(means, order, axis=axis)).mean() for order in (1, 2))
+        values = middle - (means if turns > steps else 0.0)  # without a pattern of columns
+        bends = np.sort(np.abs(np.diff(values, 2, axis=axis)), axis=None)
+        rough.append(float(np.log(bends[: 3 * bends.size // 4].mean() + 0.3)))
+    for axis, like in ((1, 2), (2, 1)):
+        alike, unlike = abs(rough[0] - rough[like]), np.abs(np.subtract(rough, rough[axis]))
+        if max(_SMOOTHER * alike, np.log(_APART)) < np.delete(unlike, axis).min():
+            rule = "Must be (time, y, x): transpose it if it is not"
+            return [f"Axis {axis} of '{name}' may be time, by how its neighbours differ. {rule}."]
+    return []
+
+
+def png_size(content: bytes, place: str) -> tuple[int, int, int]:
+    """Height, width and bits that a PNG states, which must be gray, of 16 bits."""
+    columns, rows, bits, colours = struct.unpack_from(">IIBB", content.ljust(26), 16)
+    if bits != 16 or colours or not rows * columns:
+        label = f"{rows} x {columns} pixels of {bits} bits, colours {colours}, of PNG in {place}"
+        raise ValueError(f"Invalid {label}. Must be of 16 bits and gray: counts, not a picture.")
+    return rows, columns, bits
+
+
+def png(content: bytes, place: str) -> Counts:
+    """Counts (y, x) of a PNG of 16 bits, from its pixels' chunks alone, whose CRC must be right."""
+    at, pieces = len(PNG), [PNG]
+    while at < len(content) and pieces[-1][4:8] != b"IEND":
+        length, kind = struct.unpack_from(">I4s", content.ljust(at + 8, b"\0"), at)
+        chunk = content[at : at + 12 + length]
+        if len(chunk) != 12 + length or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:]):
+            raise ValueError(f"Damaged PNG in {place}: chunk {kind!r}. Must fit its checksum.")
+        pieces += [chunk] if kind in {b"IHDR", b"IDAT", b"IEND"} else []
+        at += 12 + length
+    with damage_named(f"Damaged PNG in {place}", "a PNG that decodes"):
+        counts = optional("imagecodecs", "recordings").png_decode(b"".join(pieces))
+    return decoded(counts, png_size(content, place)[:2], place)
+
+
+def decoded(counts: npt.NDArray[Any], shape: tuple[int, int], place: str) -> Counts:
+    """Counts that a codec gave, which must be of the shape and type that the file states."""
+    if counts.shape != shape or counts.dtype != np.uint16:
+        label = f"{counts.dtype} of {counts.shape} of {place}"
+        raise ValueError(f"Damaged {label}. Must be uint16 of {shape}, as stated.")
+    return counts
 
 
 def label(paths: Sequence[Path]) -> str:

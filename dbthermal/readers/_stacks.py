@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import re
+from collections.abc import Iterator
 from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
@@ -12,14 +13,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal._arrays import empty, parts
+from dbthermal._arrays import empty, release
 from dbthermal.readers import _recording as recordings
-from dbthermal.readers._recording import MEMORY, Clock, Paths
+from dbthermal.readers._recording import MEMORY, Clock, Counts, Paths
 
 # What a page must say: the attribute of tifffile's page, or the tag, which is 1 where it is
 # missing; its name in messages, and the value.
 _FORM: Final = (
-    ("compression", "compression", 1, "none: save it uncompressed"),
     ("bitspersample", "bits of a pixel", 16, "16: counts, not a picture"),
     ("sampleformat", "sample format", 1, "1: whole numbers from 0, counts and no temperatures"),
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
@@ -28,8 +28,15 @@ _FORM: Final = (
     (262, "photometric interpretation", 1, "1: more counts are whiter"),
     (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
+# Compressions without loss, and the codec that undoes them.
+_CODECS: Final = {1: "", 32946: "zlib"} | dict(
+    zip((5, 8, 32773, 34925, 50000), ("lzw", "zlib", "packbits", "lzma", "zstd"), strict=True)
+)
 _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
+_LONGER: Final = 64  # factor of roughness between the parts of a longer number
+_LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
+_AT_ONCE: Final = 2**25  # of a span [byte]
 _FIRST: Final = 8  # frames that tell rows from columns
 _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
@@ -43,13 +50,21 @@ _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re
 _AXES: Final = re.compile(
     r"""(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""", re.MULTILINE
 )
+# Intervals of frames, their unit, frame rates, and times, as ImageJ, OME and JSON write them.
+_STATED: Final = r"""(?i)\b(?:{})["']?\s*[:=]\s*["']?({})"""
+_NUMBER: Final = r"[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?"
+_INTERVAL: Final = re.compile(_STATED.format("finterval|frame[ _]?interval|TimeIncrement", _NUMBER))
+_TIMES: Final = re.compile(_STATED.format("DeltaT", _NUMBER))
+_RATE: Final = re.compile(_STATED.format("fps|frame[ _]?rate", _NUMBER))
+_TIME_UNIT: Final = re.compile(_STATED.format("tunit|TimeIncrementUnit|DeltaTUnit", r"\w+"))
 _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slices are ImageJ's own
 
 
 def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
-    """Counts of a TIFF or BigTIFF stack, or of one file a frame, in 16 bits.
+    """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
-    TIFF tells neither the unit nor the time of its frames, so both must be stated.
+    These tell neither the unit nor, for sure, the time of frames, so both must be stated. An
+    interval of frames in a description of ImageJ or OME must agree with the clock.
 
     Parameters
     ----------
@@ -73,15 +88,22 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     Raises
     ------
     OSError, ImportError
-        If a file cannot be opened, or tifffile, the extra ``recordings``, is not installed.
+        If a file cannot be opened, or tifffile or imagecodecs, the extra ``recordings``, is not
+        installed.
     ValueError
         If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, two
-        bands in one, or axes that are not time, rows, columns; a page is compressed, in tiles, in
-        colours or not of 16 bits, or differs in size; it is mirrored, rotated, scaled (GDAL), or
-        white where it is 0; counts are those of no data, take too much memory or have 8 bits; or
-        the clock does not fit.
+        bands in one, or axes that are not time, rows, columns; a page is compressed with loss, in
+        tiles, in colours or not of 16 bits, or differs in size; it is mirrored, rotated, scaled
+        (GDAL), or white where it is 0; counts are those of no data, take too much memory or have 8
+        bits; or the clock does not fit, or contradicts the description.
     TypeError
         If clock, memory or a header are no numbers.
+
+    Warns
+    -----
+    UserWarning
+        If a description has another frame rate, which may be that of playing it, or if another
+        axis than the first may be time.
 
     Examples
     --------
@@ -94,7 +116,7 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     >>> bool((capture.counts == frames).all()), capture.time.values.round(3).tolist()  # [s]
     (True, [0.0, 0.033])
     """
-    paths = recordings.files(path)
+    paths = recordings.files(path, "tiff")
     name = recordings.label(paths)
     recordings.check_unit(unit, name)
     # Pages of one size, and the memory that they take.
@@ -104,23 +126,22 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
             label = f"Invalid page of {page.shape} in '{page.path.name}'"
             raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
     shape = (sum(page.images for page in pages), *pages[0].shape)
-    recordings.check_memory(shape, memory, name)
+    stored = sum(length for page in pages for _, length in page.spans)
+    recordings.check_memory(shape, memory, name, stored)
+    sentences = _check_clock(pages[0].description, shape[0], clock, name)
     # Their pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
-    values = counts.reshape(-1)
+    flat = counts.reshape(-1)
     for page in pages:
-        for offset, length in page.spans:
-            span = values[at : at + length // 2]
-            for part in parts(span):
-                place = offset + 2 * part.start
-                span[part] = np.fromfile(
-                    page.path, f"{page.order}u2", span[part].size, offset=place
-                )
-            at += length // 2
+        for values in _values(page):
+            flat[at : at + values.size] = values
+            at += values.size
+            release()
     recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
-    return recordings.clocked(counts, clock, name, format="TIFF", **decided)
+    form = "PNG" if pages[0].codec == "png" else "TIFF"
+    return recordings.clocked(counts, clock, name, *sentences, format=form, **decided)
 
 
 def raw(
@@ -137,8 +158,8 @@ def raw(
     """Counts of a file of bare 16-bit numbers, frame after frame.
 
     Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
-    fit the size of the file without remainder, and an image that is smoother with its bytes
-    swapped, or rows and columns exchanged, is refused.
+    fit the size of the file without remainder. An image is refused that is smoother, or as rough,
+    with its bytes swapped, smoother with rows and columns exchanged, or of longer numbers.
 
     Parameters
     ----------
@@ -164,7 +185,7 @@ def raw(
     >>> bool((capture.counts == frames).all())
     True
     """
-    (file,) = recordings.files([path])
+    (file,) = recordings.files([path], "raw")
     name = file.name
     recordings.check_unit(unit, name)
     # Form, as stated.
@@ -188,14 +209,49 @@ def raw(
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
     counts = recordings.film(np.memmap(file, form, "r", offset=header)["counts"])
-    if recordings.smoother(counts) < 0:
+    if (sign := recordings.smoother(counts)) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+    if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
+        rule = (
+            "Must be 16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
+        )
+        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
     if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return recordings.clocked(counts, clock, name, format="raw", **decided)
+
+
+def _are_longer(counts: Counts) -> bool:
+    """Tell whether numbers of 16 bits are parts of longer ones, whole or floating-point.
+
+    Then neighbours, or every fourth number of some of the four, are much rougher than those of the
+    smoothest of the four. Columns of a camera differ by far less.
+    """
+    values = counts[0].ravel().astype(np.int32)
+    if values.size < _FIRST * 4:
+        return False
+    fourths = [float(np.median(np.abs(np.diff(values[n::4])))) for n in range(4)]
+    near = float(np.median(np.abs(np.diff(values))))
+    return max(near, *fourths) > _LONGER * (min(fourths) + 1)
+
+
+def _check_clock(text: str, frames: int, clock: Clock, name: str) -> list[str]:
+    """Refuse a clock that times in a description contradict; sentence on a frame rate that does."""
+    unit = (_TIME_UNIT.findall(text) or ["s"])[0]
+    interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
+    times = np.array(_TIMES.findall(text), dtype=np.float64)
+    times = times if times.size == frames else np.multiply(interval, np.arange(frames))
+    if times.any():
+        recordings.check_times(times, unit, clock, name)
+    elif (
+        rate and abs((frames - 1) / rate - recordings.stamps(clock, frames, name)[-1]) > 0.5 / rate
+    ):
+        rule = "Must be the rate of recording; that in the file may be of playing it"
+        return [f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."]
+    return []
 
 
 class _Page(NamedTuple):
@@ -207,10 +263,44 @@ class _Page(NamedTuple):
     order: str
     spans: list[tuple[int, int]]
     missing: list[float]
+    codec: str = ""
+    rows: int = 0  # of a span, where they are compressed
+    differences: bool = False  # from column to column
+    description: str = ""
+
+
+def _values(page: _Page) -> Iterator[Counts]:
+    """Yield the counts of the spans of a page; what is compressed must be of the right length."""
+    if page.codec == "png":
+        yield recordings.png(page.path.read_bytes(), f"'{page.path.name}'").ravel()
+        return
+    for number, (start, length) in enumerate(page.spans):
+        if not page.codec:
+            for place in range(start, start + length, _AT_ONCE):
+                size = min(_AT_ONCE, start + length - place) // 2
+                yield np.fromfile(page.path, f"{page.order}u2", size, offset=place)
+            continue
+        stored = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
+        rows = min(page.rows, page.shape[0] - number * page.rows)
+        size = 2 * rows * page.shape[1]
+        decode = getattr(recordings.optional("imagecodecs", "recordings"), f"{page.codec}_decode")
+        with recordings.damage_named(f"Damaged TIFF '{page.path.name}'", f"whole {page.codec}"):
+            content = decode(stored, out=size + 1)  # and no more
+        if len(content) != size:
+            label = f"{len(content)} bytes of a strip of '{page.path.name}'"
+            raise ValueError(f"Damaged TIFF: {label}. Must be {size}, as its page states.")
+        values = np.frombuffer(content, f"{page.order}u2").reshape(rows, -1)
+        if page.differences:
+            values = np.cumsum(values, axis=1, dtype=np.uint16)
+        yield values.ravel()
 
 
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
+    if recordings.format_of(path) == "PNG":
+        with path.open("rb") as stream:
+            rows, columns, _ = recordings.png_size(stream.read(32), f"'{path.name}'")
+        return [_Page(path, (rows, columns), 1, ">", [(0, path.stat().st_size)], [], "png")]
     tifffile = recordings.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
     # Complaints that tifffile logs, without an error.
@@ -223,12 +313,14 @@ def _pages(path: Path) -> list[_Page]:
             for number, page in enumerate(file.pages):
                 pages.append(_page(page, path, file.byteorder, number))
                 total += sum(length for _, length in pages[-1].spans)
+                total += sum(tag.valuebytecount for tag in page.tags)
                 if total > size:  # as of a chain of pages that returns to itself
-                    raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
+                    raise ValueError(f"{total} bytes of pixels, tags. Must fit into its {size}.")
             description = str(file.pages[0].description)
             if stated_unit := _TEMPERATURES.search(description):
                 recordings.check_unit(stated_unit.group(1), path.name)
             stated = _stated(description)
+            pages[0] = pages[0]._replace(description=description)
             if not complaints.empty():  # which tifffile logs, and goes on
                 raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)
@@ -239,7 +331,9 @@ def _pages(path: Path) -> list[_Page]:
     finally:
         log.removeHandler(handler)
     # Number of the pages, as the description states it.
-    if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
+    if (
+        len(pages) == 1 and stated > 1 and not pages[0].codec
+    ):  # one page for a stack without gaps: ImageJ beyond 4 GB
         (start, length), *further = pages[0].spans
         if further or start + stated * length > size:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
@@ -281,19 +375,30 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         actual = page.tags.valueof(key, 1) if isinstance(key, int) else getattr(page, key)
         if actual != value:
             raise ValueError(f"Invalid {label} {actual} of page {number}. Must be {rule}.")
+    codec, predictor = _CODECS.get(int(page.compression)), int(page.predictor)
+    if codec is None or predictor > 2:
+        label = f"compression {page.compression} with predictor {predictor} of page {number}"
+        raise ValueError(f"Invalid {label}. Must be none, or one without loss: {_LOSSLESS}.")
     # Places of its pixels, joined where they follow one another.
     shape = (int(page.imagelength), int(page.imagewidth))
     spans = list[tuple[int, int]]()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
-        if start < 8 or length < 1 or length % 2 or start + length > path.stat().st_size:
+        odd = length % 2 and not codec
+        if start < 8 or length < 1 or odd or start + length > path.stat().st_size:
             label = f"{length} bytes at {start} of page {number}"
             raise ValueError(f"Truncated: {label}. Must be within {path.stat().st_size}.")
-        begun, before = spans.pop() if spans and sum(spans[-1]) == start else (start, 0)
+        joined = spans and sum(spans[-1]) == start and not codec
+        begun, before = spans.pop() if joined else (start, 0)
         spans.append((int(begun), int(before + length)))
-    total = sum(length for _, length in spans)
-    if not shape[0] * shape[1] or total != 2 * shape[0] * shape[1]:
+    total, rows = sum(length for _, length in spans), min(int(page.rowsperstrip), shape[0])
+    if not math.prod(shape) or not (total == 2 * math.prod(shape) if not codec else rows):
         raise ValueError(f"Truncated: {total} bytes of page {number}. Must be 2 x {shape}.")
-    return _Page(path, shape, 1, order, spans, _no_data(page, number))
+    if codec and len(spans) != -(-shape[0] // rows):
+        raise ValueError(
+            f"Truncated: {len(spans)} strips of page {number}. Must be of {rows} rows."
+        )
+    form = (codec, rows, predictor == 2)
+    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form)
 
 
 def _no_data(page: Any, number: int) -> list[float]:

@@ -1,9 +1,16 @@
 """Arrays of counts: files of NumPy without objects, and what other libraries have opened."""
 
+import gzip
 import json
+import struct
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
+import h5py
+import numcodecs
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,7 +18,7 @@ import zarr
 from flir_files import scene
 from hostile_files import write
 from numpy.testing import assert_allclose, assert_array_equal
-from zarr.codecs import BloscCodec
+from zarr.codecs import BloscCodec, GzipCodec
 
 from dbthermal import readers, store
 
@@ -146,6 +153,10 @@ def test_dims_of_netcdf_without_variables(tmp_path: Path) -> None:
         ([0.2, 0.1, 0.0], "s", "frame 1 at -0.1 s.* Must agree to half a frame, and rise"),
         ([0.0, np.nan, 0.2], "s", "frame 1 at nan s"),
         ([0, 1, 2], "frames", "Invalid units 'frames' of the times of"),
+        ([0, 1 / 600, 1 / 300], "minutes since 2024-05-06 07:08:09", ""),
+        ([0, 100_000, 200_000], "usec", ""),
+        ([0, 10**8, 2 * 10**8], None, ""),
+        ([0.0, 0.1, 0.2], "h", "frame 1 at 360 s"),
     ],
 )
 def test_times_of_an_array_agree_with_the_clock(
@@ -212,7 +223,7 @@ def test_other_units_dims_and_files_are_refused(tmp_path: Path) -> None:
     for changed, message in (
         (frames.assign_attrs(units="K"), "Invalid unit 'K'"),
         (frames.rename(t="y", y="time"), r"Invalid dims \['y', 'time', 'x'\] .* Must be \(time, y"),
-        (frames.assign_attrs(scale_factor=0.1), "Invalid dtype float"),
+        (frames.assign_attrs(scale_factor=0.1), "Invalid 'scale_factor' of"),
     ):
         changed.to_netcdf(tmp_path / "a.nc", engine="scipy")
         with pytest.raises(ValueError, match=message):
@@ -294,4 +305,265 @@ def test_objects_are_not_loaded(tmp_path: Path) -> None:
         read(path)
     path.write_bytes(b"nothing at all")
     with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy, \.npz, HDF5"):
+        read(path)
+
+
+def hdf5(path: Path, frames: Any = None, **arrays: Any) -> Path:
+    """HDF5 of frames and of arrays beside them; attributes of the frames by names that begin _."""
+    with h5py.File(path, "w", userblock_size=arrays.pop("userblock", 0)) as file:
+        file["frames"] = scene() if frames is None else frames
+        for name, values in arrays.items():
+            if name.startswith("_"):
+                file["frames"].attrs[name[1:]] = values
+            else:
+                file[name] = values
+    return path
+
+
+@pytest.mark.parametrize("unit", ["DN", "Counts", "digital number", "raw counts", "ADU", "1", ""])
+def test_usual_words_for_counts(tmp_path: Path, unit: str) -> None:
+    """Words for digital numbers are counts; those of temperatures and radiances are not."""
+    assert_array_equal(read(hdf5(tmp_path / "a.h5", _units=unit)).counts, scene())
+    for wrong in ("degC", "K", "W m-2 sr-1", "percent"):
+        with pytest.raises(ValueError, match=f"Invalid unit '{wrong}'"):
+            read(hdf5(tmp_path / "a.h5", _units=wrong))
+
+
+def test_unsigned_numbers_of_netcdf_4(tmp_path: Path) -> None:
+    """Numbers that are unsigned by an attribute, and their fill value, are counts."""
+    counts = scene() + np.uint16(20000)
+    signed, fill = counts.view("i2"), counts[1, 2, 3].astype("i2")
+    path = hdf5(tmp_path / "a.nc", signed, __Unsigned="true")
+    assert_array_equal(read(path).counts, counts)
+    with pytest.raises(ValueError, match="Missing counts"):
+        read(hdf5(path, signed, __Unsigned=b"true", __FillValue=fill))
+    with pytest.raises(ValueError, match="Invalid dtype int16"):
+        read(hdf5(path, signed))
+
+
+MOMENTS = [f"2024-05-06T07:08:09.{n}00000Z" for n in range(3)]
+
+
+@pytest.mark.parametrize("name", ["time", "timestamps", "Frame_Time", "time_s"])
+def test_times_beside_frames(tmp_path: Path, name: str) -> None:
+    """Times without a dim that names them must agree with the clock, as numbers and as text."""
+    path = tmp_path / "a.h5"
+    for times in ([7.0, 7.1, 7.2], MOMENTS, np.array(MOMENTS, "S"), ["a", "b", "c"]):
+        assert_array_equal(read(hdf5(path, **{name: times})).counts, scene())
+    for times in (
+        [7.0, 7.2, 7.4],
+        [moment.replace(":09.", f":1{moment[-7]}.") for moment in MOMENTS],
+    ):
+        with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
+            read(hdf5(path, **{name: times}))
+    assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
+    with pytest.raises(ValueError, match="Invalid times"):
+        read(hdf5(path, **{f"other/{name}": np.arange(3.0)}))
+    two = {f"other/{name}": np.arange(3.0), "other/frames": scene()}
+    assert_array_equal(read(hdf5(path, **two), "frames").counts, scene())
+
+
+def test_user_block_and_matlab(tmp_path: Path) -> None:
+    """HDF5 begins behind a block of the user's; MATLAB's is by columns: (y, x, time)."""
+    path = hdf5(tmp_path / "a.hdf", userblock=1024)
+    assert_array_equal(read(path).counts, scene())
+    path = hdf5(tmp_path / "a.mat", np.swapaxes(scene(), 1, 2), userblock=512)
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file")
+    assert_array_equal(read(path).counts, scene())
+    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    with pytest.raises(ValueError, match=r"a MATLAB 5: save it anew by save\(\.\.\., '-v7\.3'"):
+        read(path)
+
+
+def chunked(path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]], **options: Any) -> Path:
+    """HDF5 of one chunk, as it is stored, by filters."""
+    with h5py.File(path, "w") as file:
+        form = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        form.set_chunk(options.get("chunks", scene().shape))
+        for code, values in filters.items():
+            form.set_filter(code % 1000 if code < 10**6 else code // 1000, 1, values)
+        limits = (h5py.h5s.UNLIMITED,) * 3
+        space = h5py.h5s.create_simple(scene().shape, limits)
+        array = h5py.h5d.create(file.id, b"frames", h5py.h5t.STD_U16LE, space, form)
+        array.write_direct_chunk((0, 0, 0), chunk)
+    return path
+
+
+def test_filters_of_hdf5(tmp_path: Path) -> None:
+    """A filter that is missing is named; deflate may come once, last, and unpacks to its chunk."""
+    path, values = tmp_path / "a.h5", scene().tobytes()
+    assert_array_equal(read(chunked(path, zlib.compress(values), {1: (6,)})).counts, scene())
+    with pytest.raises(ValueError, match=r"Missing filter 32001, .*python -m pip install hdf5plug"):
+        read(chunked(path, values, {32001000: ()}))
+    with pytest.raises(ValueError, match=r"Invalid filters \[1, 1\] .* Must be deflate last"):
+        read(chunked(path, zlib.compress(zlib.compress(values)), {1: (6,), 1001: (6,)}))
+    with pytest.raises(ValueError, match=r"Invalid chunk of 'frames' .* Must unpack to 4608"):
+        read(chunked(path, zlib.compress(values + bytes(10**8)), {1: (6,)}))
+    with pytest.raises(ValueError, match="Invalid chunk of 800000000 bytes of 'frames'"):
+        read(chunked(path, b"x", {1: (6,)}, chunks=(400, 1000, 1000)))
+
+
+def test_trees_of_hdf5(tmp_path: Path) -> None:
+    """Groups that are very deep, or very many objects, are refused before they are listed."""
+    path = hdf5(tmp_path / "a.h5", **{"/".join("a" * 40): 1})
+    with pytest.raises(ValueError, match=r"Invalid tree of .* objects, 33 deep"):
+        read(path)
+    with h5py.File(path, "w") as file:
+        for number in range(4100):
+            file.create_group(f"{number}")
+    with pytest.raises(ValueError, match="Invalid tree of 4097 objects"):
+        read(path)
+
+
+def test_chunks_are_not_too_many(tmp_path: Path) -> None:
+    """Chunks of a few bytes, of which HDF5 takes kilobytes for each, are limited."""
+    with h5py.File(path := tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (40, 40, 60), "u2", chunks=(1, 1, 1))
+    with pytest.raises(ValueError, match=r"Invalid number 96000 of chunks .* at most 65536"):
+        read(path)
+
+
+def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
+    """A scale of another length is refused before it is read; an attribute is one value."""
+    with h5py.File(hdf5(tmp_path / "a.h5"), "r+") as file:
+        file.create_dataset("time", (10**9,), "f8", chunks=(10**6,)).make_scale("time")
+        file["frames"].dims[0].attach_scale(file["time"])
+    with pytest.raises(ValueError, match=r"Invalid number 1000000000 of times .* Must be 3"):
+        read(tmp_path / "a.h5")
+    with pytest.raises(ValueError, match="Invalid attribute 'units', a list"):
+        read(hdf5(tmp_path / "a.h5", _units=["count", "K"]))
+
+
+def netcdf(path: Path, version: int, *, records: bool, time: bool = False) -> Path:
+    """NetCDF 3 of a form, by its specification, written here: scipy knows two of the three."""
+    wide = ">q" if version == 5 else ">i"
+
+    def numbers(*values: int) -> bytes:
+        return b"".join(struct.pack(wide, value) for value in values)
+
+    def named(name: bytes) -> bytes:
+        return numbers(len(name)) + name.ljust(-(-len(name) // 4) * 4, b"\0")
+
+    def tagged(tag: int, *entries: bytes) -> bytes:
+        return struct.pack(">i", tag if entries else 0) + numbers(len(entries)) + b"".join(entries)
+
+    counts, times = scene().astype(">u2"), np.array([0, 0.1, 0.2], ">f8")
+    unit = tagged(12, named(b"units") + struct.pack(">i", 2) + named(b"count"))
+    unit = tagged(
+        12,
+        named(b"units") + struct.pack(">i", 2) + named(b"count"),
+        named(b"_Unsigned") + struct.pack(">i", 2) + named(b"true"),
+    )
+    dims = zip((b"time", b"y", b"x"), (0 if records else 3, 24, 32), strict=True)
+    start = b"CDF" + bytes([version]) + numbers(3 if records else 0)
+    start += tagged(10, *(named(name) + numbers(size) for name, size in dims)) + tagged(12)
+    arrays: dict[bytes, Any] = {b"frames": counts} | ({b"time": times} if time else {})
+    offset, at, entries = ">i" if version == 1 else ">q", 0, list[bytes]()
+    for place in range(2):  # once without, once with the place where data begin
+        at, entries = place and len(start + tagged(11, *entries)), []
+        for name, values in arrays.items():
+            over = numbers(values.ndim, *range(values.ndim)) + (
+                unit if name == b"frames" else tagged(12)
+            )
+            kind = 6 if name == b"time" else 8 if version == 5 else 3
+            size = values.nbytes // (3 if records else 1)
+            entry = struct.pack(">i", kind) + numbers(size) + struct.pack(offset, at)
+            entries.append(named(name) + over + entry)
+            at += size
+    start += tagged(11, *entries)
+    parts = [[values[n : n + 1] for values in arrays.values()] for n in range(3)]
+    content = [v for part in parts for v in part] if records else arrays.values()
+    path.write_bytes(start + b"".join(values.tobytes() for values in content))
+    return path
+
+
+@pytest.mark.parametrize("time", [False, True])
+@pytest.mark.parametrize("version", [1, 2, 5])
+def test_forms_of_netcdf_3(tmp_path: Path, version: int, time: bool) -> None:
+    """All three forms, with frames one after another or as records, must end as they state."""
+    path = tmp_path / "a.nc"
+    for records in (False, True):
+        netcdf(path, version, records=records, time=time)
+        assert_array_equal(read(path).counts, scene())
+        content = path.read_bytes()
+        for changed in (content[:-4], content + bytes(8000)):
+            path.write_bytes(changed)
+            with pytest.raises(ValueError, match=r"Damaged 'a\.nc': .*Must end at|Must end at"):
+                read(path)
+    for number in (0, 1, 2, 4, 2**31 - 1):
+        fewer = struct.pack(">q" if version == 5 else ">i", number)
+        path.write_bytes(content[:4] + fewer + content[4 + len(fewer) :])
+        with pytest.raises(ValueError, match=r"Must"):
+            read(path)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_time_along_another_axis_is_noticed(axis: int) -> None:
+    """Frames that are the last axis, or rows before time, are a warning; those in order are not."""
+    rng, (time, y, x) = np.random.default_rng(3), np.ogrid[:40, :24, :32]
+    scenes = (
+        40 * y + 25 * x + 400 * np.sin(time / 4),
+        300 * rng.random((1, 24, 32)) + time,
+        200 * np.sin(y / 2) * np.cos(x / 2) + 900 * np.exp(-((x - time / 2) ** 2) / 30),
+    )
+    for values in scenes:
+        counts = np.rint(18000 + values + rng.normal(0, 4, (40, 24, 32))).astype("u2")
+        read(counts)
+        with pytest.warns(UserWarning, match=rf"Axis {axis} of 'array' may be time.* transpose"):
+            read(np.moveaxis(counts, 0, axis))
+
+
+def test_a_lazy_array_is_as_it_says() -> None:
+    """Blocks of dask that are not of the type or the shape that was declared are refused."""
+    array = pytest.importorskip("dask.array")
+    frames = array.from_array(scene(), chunks=(1, 24, 32))
+    assert_array_equal(read(frames).counts, scene())
+    for change in (
+        lambda block: block - 17999.5,
+        lambda block: block.astype("i4") - 20000,
+        lambda block: block.astype("u4"),
+        lambda block: block[:, :9],
+    ):
+        with pytest.raises((TypeError, ValueError), match="Must be"):
+            read(frames.map_blocks(change, dtype="u2", meta=np.empty((0, 0, 0), "u2")))
+
+
+def test_headers_and_members_of_npz(tmp_path: Path) -> None:
+    """A header of more than 64 kB is not read, nor a member that NumPy does not write."""
+    path, start = tmp_path / "a.npz", b"\x93NUMPY\2\0" + struct.pack("<I", 10**9)
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a.npy", start + b" " * 1000)
+    with pytest.raises(ValueError, match=r"Header of 1000000000 bytes\. Must be at most 65536"):
+        read(path)
+    np.save(tmp_path / "b.npy", scene())
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+        file.write(tmp_path / "b.npy", "b.npy")
+    with pytest.raises(ValueError, match=r"Invalid compression 14 .* Must be none or deflate"):
+        read(path)
+
+
+@pytest.mark.parametrize("name", ["gzip", "zlib", "bz2", "lzma", "zstd", "lz4"])
+def test_a_chunk_of_zarr_unpacks_to_its_size(tmp_path: Path, name: str) -> None:
+    """A chunk that unpacks, or states to unpack, farther than its array is not unpacked."""
+    path, codec = tmp_path / "a.zarr", numcodecs.get_codec({"id": name})
+    options: Any = {"chunks": (1, 24, 32), "compressors": codec, "zarr_format": 2}
+    zarr.create_array(path, data=scene(), **options)
+    assert_array_equal(read(path).counts, scene())
+    (path / "1.0.0").write_bytes(codec.encode(scene()[1].tobytes() + bytes(10**6)))
+    with pytest.raises(ValueError, match=r"Damaged chunk '1\.0\.0' .* unpack to 1536 bytes"):
+        read(path)
+
+
+def test_a_chunk_in_a_shard_unpacks_to_its_size(tmp_path: Path) -> None:
+    """Chunks within a shard are held against their size, too."""
+    path: Path = tmp_path / "a.zarr"
+    options: Any = {"chunks": (1, 24, 32), "shards": (3, 24, 32), "compressors": GzipCodec()}
+    zarr.create_array(path, data=scene(), **options)
+    assert_array_equal(read(path).counts, scene())
+    shard = path / "c/0/0/0"
+    packed = gzip.compress(bytes(10**6))
+    index = np.array([[0, len(packed)]] * 3, "<u8").tobytes()
+    shard.write_bytes(packed + index + struct.pack("<I", google_crc32c.value(index)))
+    with pytest.raises(ValueError, match=r"Damaged chunk '0' of 'a\.zarr'"):
         read(path)

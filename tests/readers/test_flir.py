@@ -3,8 +3,10 @@
 import hashlib
 import struct
 import sys
+import zlib
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from flir_files import CONSTANTS, compressed, jpeg, scene, sequence
@@ -119,9 +121,9 @@ def test_pictures(tmp_path: Path, codec: str) -> None:
 def test_checksum_of_a_record(path: Path) -> None:
     """A record whose checksum is wrong is refused."""
     content = bytearray(sequence(scene(1), sums=True))
-    content[-200] ^= 1
+    content[-200] ^= 1  # of the image
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"Damaged file: CRC-32 .* of frame 0 of 'a\.seq'. Must"):
+    with pytest.raises(ValueError, match=r"Damaged image in frame 0 of 'a\.seq': CRC-32 .* Must"):
         readers.flir(path)
 
 
@@ -163,6 +165,88 @@ def test_exchanged_images_are_marked(path: Path) -> None:
     found = schema.has_flag(read.frame_flags, "numbers_differ").values
     assert found.tolist() == [False, True, True, False, False, False]
     assert_array_equal(np.isnan(read.exposure_time), found)
+
+
+def renumbered(content: bytes, image: int, camera: int | None = None) -> bytes:
+    """Sequence of frames whose image, and camera, count from another number, or not at all."""
+    size = len(content) // 3
+    changed = bytearray(content)
+    for number in range(3):
+        for record, first in ((2692, image), (216, camera)):  # numbers of image and camera
+            place, count = number * size + record, 0 if first is None else first + number
+            assert content[place - 24 : place - 22] == b"\2\0"
+            changed[place : place + 2] = struct.pack("<H", count % 2**16)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(("image", "camera"), [(2862, 0), (65535, 9), (7, None)])
+def test_records_that_count_apart(path: Path, image: int, camera: int | None) -> None:
+    """Image and camera count from other numbers, or the camera not at all: no flag, all times."""
+    path.write_bytes(renumbered(sequence(scene()), image, camera))
+    read = readers.flir(path)
+    assert not read.frame_flags.any()
+    assert_allclose(read.exposure_time, [0, 0.1, 0.2], rtol=0, atol=1e-9)
+
+
+def test_bytes_that_fill_up(tmp_path: Path) -> None:
+    """Bytes up to a multiple of 4 are no frame, of a still or a sequence; a cut frame is seen."""
+    still, odd = tmp_path / "a.jpg", sequence(scene(1), sums=True)[:-8]
+    for filling in (b"\x85", b"c\2", b"x" * 200):
+        still.write_bytes(jpeg(odd + filling))
+        assert_array_equal(readers.flir(still).counts, scene(1))
+    first, second = (sequence(scene()[n : n + 1], seconds=[1.5e9 + n])[:-8] for n in (0, 1))
+    path = tmp_path / "a.seq"
+    for between in (b"", b"\xff" * (-len(first) % 4), bytes(60)):
+        path.write_bytes(first + between + second + b"\xff" * (-len(second) % 4))
+        assert_array_equal(readers.flir(path).counts, scene()[:2])
+    path.write_bytes(first + second[:30])
+    with pytest.raises(ValueError, match="Invalid header b'FFF"):
+        readers.flir(path)
+
+
+def test_an_edited_record_of_the_camera(path: Path) -> None:
+    """Counts open though texts of the camera were edited: a warning, and its times if all are."""
+    frames = [sequence(scene()[n : n + 1], sums=True, seconds=[1.5e9 + n]) for n in range(3)]
+    edited = [frame.replace(b"Made up 1", b"XXXX XX X") for frame in frames]
+    path.write_bytes(edited[0])
+    with pytest.warns(UserWarning, match="Wrong checksum of the camera's record in frame 0"):
+        read = readers.flir(path)
+    assert_array_equal(read.counts, scene(1))
+    assert "CRC-32" in read.attrs["implausible"]
+    assert read.attrs["start"] == "2017-07-14T02:40:00.000+00:00"
+    path.write_bytes(frames[0] + edited[1] + frames[2])
+    with pytest.warns(UserWarning, match="in frame 1"):
+        read = readers.flir(path)
+    assert np.isnan(read.exposure_time.values).tolist() == [False, True, False]
+    blank = frames[0][:192] + bytes(400) + frames[0][592:]
+    path.write_bytes(blank)
+    with pytest.raises(ValueError, match=r"Damaged record of the camera.* with clock= it is not"):
+        readers.flir(path)
+    with pytest.warns(UserWarning, match="Wrong checksum"):
+        assert_array_equal(readers.flir(path, clock=1.0).counts, scene(1))
+
+
+def test_a_codec_gets_the_pixels_alone(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts and profiles in a PNG, which may unpack to any size, do not reach the codec."""
+    image = compressed(scene(1)[0], "png")
+    text = b"zTXta\0\0" + zlib.compress(bytes(10**6))
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    content = sequence(scene(1), "png", packed=image[:33] + chunk + image[33:])
+    path.write_bytes(content)
+    seen = list[bytes]()
+    decode = imagecodecs.png_decode
+
+    def seen_decode(content: bytes) -> object:
+        seen.append(content)
+        return decode(content)
+
+    monkeypatch.setattr(imagecodecs, "png_decode", seen_decode)
+    assert_array_equal(readers.flir(path).counts, scene(1))
+    assert b"zTXt" in content
+    assert b"zTXt" not in seen[0]
+    path.write_bytes(content.replace(b"IDAT", b"IDAt"))
+    with pytest.raises(ValueError, match=r"Damaged PNG in frame 0 .* Must fit its checksum"):
+        readers.flir(path)
 
 
 def test_implausible_values_are_named(path: Path) -> None:
@@ -237,9 +321,13 @@ def test_parts_of_a_recording(path: Path) -> None:
         ("a.ravi", b"", r"Refused 'a\.ravi': export its counts as 16-bit TIFF"),
         ("a.irb", b"", "readers.tiff"),
         ("a.ats", b"", "readers.tiff"),
-        ("a.mp4", b"", r"8 bits are drawn, not measured"),
+        ("a.mp4", b"\0\0\0\x18ftypmp42", "film: most have 8 bits that are drawn.*gray16le"),
+        ("a.seq", b"BM" * 40, "picture: most have 8 bits"),
+        ("a.mat", b"MATLAB 5.0 MAT-file", r"MATLAB 5: save it anew by save\(\.\.\., '-v7\.3'\)"),
+        ("a.hdf", b"\x0e\x03\x13\x01", "HDF4: convert it"),
+        ("a.seq", b"II*\0" * 9, r"by its first bytes\. Must be read by readers\.tiff"),
         ("a.seq", b"", "Empty file"),
-        ("a.seq", sequence(scene(1) // np.uint16(256)), "one of their two bytes is always 0"),
+        ("a.seq", sequence(scene(1) // np.uint16(256)), "they have 8 bits, alone or spread"),
         ("a.seq", b"RIFF" * 40, r"Invalid header b'RIFF'.*no recording of FLIR\? Then export"),
         ("a.jpg", b"\xff\xd8\xff\xda\0\2", "No thermal data of FLIR .* of another maker"),
         ("a.jpg", b"\xff\xd8\xff\xe1\xff\xff", "Damaged JPEG"),
@@ -262,9 +350,19 @@ def test_size_before_memory(path: Path) -> None:
         readers.flir(path)
 
 
+def test_a_sequence_unpacks_to_no_bomb(path: Path) -> None:
+    """Constant images, which pack a thousandfold, take no more memory than a camera's could."""
+    image = np.full((1, 1024, 1024), 17000, dtype=np.uint16)
+    path.write_bytes(sequence(image, "jpegls") * 40)
+    with pytest.raises(ValueError, match=r"40 frames .* Must be at most 64 times the .* bytes"):
+        readers.flir(path, clock=10.0)
+
+
 def test_missing_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without PyAV the extra is named."""
+    """Without imagecodecs the extra is named."""
     path.write_bytes(sequence(scene(1), "jpegls"))
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[recordings\]"):
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    with pytest.raises(
+        ImportError, match=r"Missing library 'imagecodecs'.*dbthermal\[recordings\]"
+    ):
         readers.flir(path)

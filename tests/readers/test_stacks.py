@@ -1,8 +1,10 @@
 """TIFF stacks and raw numbers: all that other programs write, refused where it is no count."""
 
+import struct
 from pathlib import Path
 from typing import Any
 
+import imagecodecs
 import numpy as np
 import pytest
 import tifffile
@@ -65,6 +67,109 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         read(paths)
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("predictor", [False, True])
+@pytest.mark.parametrize("codec", ["lzw", "zlib", "packbits", "zstd", "lzma"])
+def test_compressed_without_loss(tmp_path: Path, codec: str, predictor: bool, order: str) -> None:
+    """Strips of the usual codecs, also as differences; one that unpacks to another size is not."""
+    options: dict[str, Any] = {"compression": codec, "predictor": predictor, "rowsperstrip": 10}
+    write(path := tmp_path / "a.tif", scene(), byteorder=order, **options)
+    assert_array_equal(read(path).counts, scene())
+    with tifffile.TiffFile(path) as file:
+        page: Any = file.pages[1]
+        place, number = page.tags[279].valueoffset, len(page.databytecounts)
+        kind = f"{order}{'I' if page.tags[279].dtype == 4 else 'H'}"
+    assert number == 3
+    content = bytearray(path.read_bytes())
+    (length,) = struct.unpack_from(kind, content, place)
+    struct.pack_into(kind, content, place, length // 2)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="Damaged TIFF"):
+        read(path)
+
+
+def test_a_strip_unpacks_no_farther_than_its_page(tmp_path: Path) -> None:
+    """Pages of few bytes that state, or unpack to, a large picture are refused for their size."""
+    large = np.full((1, 6000, 6000), 17000, dtype=np.uint16)
+    write(path := tmp_path / "a.tif", large, compression="zlib")
+    with pytest.raises(ValueError, match=r"Must be at most 64 times the .* bytes of the file"):
+        read(path)
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
+        for tag in (256, 257, 278):  # width, length, and rows of a strip
+            struct.pack_into("<H", content, page.tags[tag].valueoffset, 90)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="TIFF"):
+        read(path)
+
+
+def picture(path: Path, counts: Any) -> Path:
+    """PNG of gray values or colours."""
+    path.write_bytes(imagecodecs.png_encode(counts))
+    return path
+
+
+def test_png_of_16_bits(tmp_path: Path) -> None:
+    """A PNG a frame, of 16 bits and gray; its form decides, not its name."""
+    paths = [picture(tmp_path / f"a{n}.tif", image) for n, image in enumerate(scene())]
+    found = read(paths)
+    assert_array_equal(found.counts, scene())
+    assert found.attrs["format"] == "PNG"
+    with pytest.raises(ValueError, match=r"Invalid 'a0.tif' .* read by readers\.tiff"):
+        readers.flir(paths[0])
+    for counts, message in (
+        (
+            scene()[0].astype("u1"),
+            "24 x 32 pixels of 8 bits, .* Must be of 16 bits and gray: counts",
+        ),
+        (np.stack([scene()[0]] * 3, axis=-1), "colours 2, .*Must be of 16 bits and gray"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(picture(tmp_path / "b.png", counts))
+    paths[1].write_bytes(paths[1].read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"Damaged PNG in 'a1\.tif'"):
+        read(paths)
+
+
+IMAGE_J = {"imagej": True}
+
+
+@pytest.mark.parametrize(
+    ("options", "agrees"),
+    [
+        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 0.1}}, True),
+        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 100, "tunit": "ms"}}, True),
+        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 0.2}}, False),
+        ({"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 0.1}}, True),
+        ({"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 0.3}}, False),
+        *(
+            ({"ome": True, "metadata": {"axes": "TYX", "Plane": {"DeltaT": times}}}, agrees)
+            for times, agrees in (([5.0, 5.1, 5.2], True), ([5.0, 5.5, 6.0], False))
+        ),
+    ],
+)
+def test_intervals_of_a_description(tmp_path: Path, options: Any, agrees: bool) -> None:
+    """An interval or times of ImageJ and OME that the clock contradicts are refused."""
+    write(path := tmp_path / "a.tif", scene(), **options)
+    if agrees:
+        assert_array_equal(read(path).counts, scene())
+    else:
+        with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
+            read(path)
+
+
+def test_frame_rate_of_a_description(tmp_path: Path) -> None:
+    """A frame rate may be that of playing: another one than the clock's is a warning."""
+    for text, warned in (("fps=10.0", False), ("fps=30", True), ('{"frame_rate": 5}', True)):
+        write(path := tmp_path / "a.tif", scene(), description=text)
+        if not warned:
+            read(path)
+            continue
+        with pytest.warns(UserWarning, match=r"frames a second, and clock= .*of playing"):
+            assert_array_equal(read(path).counts, scene())
+
+
 FOUR = scene(4).reshape(2, 2, 24, 32)
 BANDS: dict[str, Any] = {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None}
 SCALE, OFFSET = GDAL.format("SCALE", "scale", 0.01), GDAL.format("OFFSET", "offset", 9)
@@ -78,7 +183,7 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("counts", "options", "message"),
     [
-        (scene(), {"compression": "zlib"}, "Invalid compression 8 of page 0. Must be none"),
+        (scene(), {"compression": "jpeg2000"}, "Invalid compression .* one without loss: LZW, de"),
         (
             0.5 * scene().astype("f4"),
             {},
@@ -89,7 +194,9 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
         (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
         (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
-        (scene() // np.uint16(256), {}, "one of their two bytes is always 0"),
+        (scene() // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
+        (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
+        (scene() // np.uint16(256) * np.uint16(256) + np.uint16(9), {}, "they have 8 bits"),
         (FOUR, {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
         (FOUR, BANDS, r"Invalid axes of \[2, 2\] images"),
         (FOUR, {"ome": True, "metadata": {"axes": "CTYX"}}, r"Invalid axes of \[1, 2, 2\] images"),
@@ -173,6 +280,28 @@ def bare(path: Path, **options: Any) -> xr.Dataset:
     return readers.raw(path, stated.pop("shape", (24, 32)), **stated)
 
 
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", "<i4", ">u4"])
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_longer_numbers_are_no_counts(tmp_path: Path, kind: str, order: str) -> None:
+    """Numbers of 32 or 64 bits, whole or floating-point, are not taken for twice as many counts."""
+    values = scene() if kind[1] in "iu" else 20 + (scene() - 17900.0) / 100
+    values.astype(kind).tofile(path := tmp_path / "a.raw")
+    shape = (24, 32 * np.dtype(kind).itemsize // 2)
+    with pytest.raises(ValueError, match=r"no images of 16-bit numbers|rougher"):
+        bare(path, shape=shape, byte_order=order)
+
+
+def test_bytes_of_a_picture_are_no_counts(tmp_path: Path) -> None:
+    """Numbers of 8 bits, of which two would make a count, and noise are refused."""
+    path, rng = tmp_path / "a.raw", np.random.default_rng(1)
+    picture = (np.hypot(*np.mgrid[:24, :64]) * 3 + rng.integers(0, 3, (3, 24, 64))).astype("u1")
+    for content in (picture.tobytes(), rng.bytes(picture.size)):
+        path.write_bytes(content)
+        for order in ("little", "big"):
+            with pytest.raises(ValueError, match="no images of 16-bit numbers"):
+                bare(path, byte_order=order)
+
+
 def test_raw(tmp_path: Path) -> None:
     """Bare numbers with and without headers, in both orders; what does not fit is refused."""
     path, counts = tmp_path / "a.raw", scene()
@@ -202,3 +331,19 @@ def test_raw(tmp_path: Path) -> None:
             bare(path, **{"byte_order": "big", argument: wrong})
     with pytest.raises(ValueError, match=r"Must be at most memory=100"):
         bare(path, byte_order="big", memory=100)
+
+
+def test_pages_share_no_description(tmp_path: Path) -> None:
+    """Pages whose tags lie at one place, which takes hours to read, are refused at the second."""
+    image, text = scene()[0].tobytes(), b"x" * 20000
+    tags = {256: 32, 257: 24, 258: 16, 259: 1, 262: 1, 273: 8, 277: 1, 278: 24, 279: len(image)}
+    content = b"II*\0" + struct.pack("<I", 8 + len(image) + len(text)) + image + text
+    for _ in range(3):
+        content += struct.pack("<H", len(tags) + 1)
+        for tag in sorted([*tags, 270]):
+            kind, number = (2, len(text)) if tag == 270 else (4, 1)
+            content += struct.pack("<HHII", tag, kind, number, tags.get(tag, 8 + len(image)))
+        content += struct.pack("<I", len(content) + 4)
+    (path := tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ValueError, match=r"bytes of pixels, tags\. Must fit into its"):
+        read(path)

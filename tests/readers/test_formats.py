@@ -1,0 +1,88 @@
+"""What a file is, by its first bytes: for commands and for readers, whatever its name."""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+from flir_files import scene, sequence
+
+from dbthermal import readers
+from dbthermal.__main__ import main
+
+STATED = ["--unit", "count", "--clock", "10"]
+
+
+def info(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, str]:
+    """Exit status of `info`, and all that it prints."""
+    status = main(["info", *map(str, words)])
+    return int(status or 0), "".join(capsys.readouterr())
+
+
+def test_commands_read_by_first_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """HDF5, TIFF, PNG and FLIR of any name open by the same command."""
+    with h5py.File(tmp_path / "a.hdf", "w") as file:
+        file["frames"] = scene()
+    tifffile.imwrite(tmp_path / "a.dat", scene(), photometric="minisblack")
+    (tmp_path / "a1.bin").write_bytes(imagecodecs.png_encode(scene()[0]))
+    for name in ("a.hdf", "a.dat", "a1.bin"):
+        status, text = info(capsys, tmp_path / name, *STATED)
+        assert status == 0, text
+        assert "recording of one band" in text
+    (tmp_path / "b.bin").write_bytes(sequence(scene()))
+    assert info(capsys, tmp_path / "b.bin")[0] == 0
+
+
+@pytest.mark.parametrize("name", ["a.raw", "a.bin", "a", "a.dat"])
+def test_bare_numbers_ask_for_their_form(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    """A file of unknown first bytes is no FLIR recording: its form must be stated."""
+    scene().tofile(path := tmp_path / name)
+    status, text = info(capsys, path, *STATED)
+    assert status == 1
+    assert "bare numbers need --shape and --byte-order" in text
+    assert "FLIR" not in text
+    form = ["--shape", "24", "32", "--byte-order", "little"]
+    assert info(capsys, path, *STATED, *form)[0] == 0
+
+
+def test_foreign_formats_are_named(tmp_path: Path) -> None:
+    """Formats without a reader are called by their names, with a way on, by every reader."""
+    starts = {
+        "RIFFxxxxAVI ": "film: .* gray16le",
+        "\x1aE\xdf\xa3": "film: .* gray16le",
+        "GIF89a": "film: .* 8 bits",
+        "RIFFxxxxWEBP": "picture: .* 8 bits",
+        "MATLAB 5.0 MAT-file": r"MATLAB 5: save it anew by save\(\.\.\., '-v7\.3'\)",
+        "\x0e\x03\x13\x01": "HDF4: convert it",
+        "SIMPLE  =    T": "FITS: save its array",
+    }
+    path, options = tmp_path / "a.dat", {"unit": "count", "clock": 10.0}
+    for start, expected in starts.items():
+        path.write_bytes(start.encode("latin-1") + bytes(100))
+        for read in (readers.flir, readers.tiff, readers.array):
+            stated: Any = {} if read is readers.flir else options
+            with pytest.raises(ValueError, match=rf"Refused 'a\.dat', a {expected}"):
+                read(path, **stated)
+    for suffix in ("ravi", "irb", "ats", "hcc", "sfmov"):
+        (tmp_path / f"a.{suffix}").write_bytes(b"something else")
+        with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': export its counts"):
+            readers.flir(tmp_path / f"a.{suffix}")
+
+
+def test_another_reader_is_named(tmp_path: Path) -> None:
+    """A file of a format that another reader opens says which."""
+    np.save(tmp_path / "a.npy", scene())
+    (tmp_path / "a.seq").write_bytes(sequence(scene()))
+    tifffile.imwrite(tmp_path / "a.tif", scene(), photometric="minisblack")
+    for name, wrong, right in (
+        ("a.npy", readers.tiff, "array"),
+        ("a.seq", readers.array, "flir"),
+        ("a.tif", readers.array, "tiff"),
+    ):
+        with pytest.raises(ValueError, match=rf"Must be read by readers\.{right}"):
+            wrong(tmp_path / name, unit="count", clock=10.0)
