@@ -11,8 +11,7 @@ that the model misses, pixels that drift).
 """
 
 from dataclasses import dataclass, fields
-from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt

@@ -5,8 +5,8 @@ motion s of each band's image, times the gradient of its mean:
 
 .. math:: r(t) = \sum_b w_b \, s_b(t) \cdot \nabla \bar z_b
 
-Least squares over all pixels, frame by frame, with a prior for s: cameras on one support move alike.
-Motion that is slow, as smooth functions of time, is not seen.
+Least squares over all pixels, frame by frame, with a prior for s: cameras on one support move
+alike. Motion that is slow, as smooth functions of time, is not seen.
 """
 
 from dataclasses import dataclass

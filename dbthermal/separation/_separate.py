@@ -20,11 +20,11 @@ from dbthermal.schema import Status
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
+from dbthermal.separation._blur import equalise
 from dbthermal.separation._budget import without_calibration
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
-from dbthermal.separation._blur import equalise
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
 from dbthermal.separation._motion import stabilise
@@ -209,7 +209,7 @@ def _separated(
     materials: xr.DataArray | None,
     alone: xr.Dataset | None,
     workers: int,
-    progress: bool,
+    progress: bool,  # noqa: FBT001 - passed on
 ) -> _Parts:
     """Separate each pixel, with the shift of the reflections, and then over materials."""
     # Find the shift of the reflections, where cameras stand apart.

@@ -410,10 +410,10 @@ def cut(
 
 
 def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
-    """Signals (band, frame, pixel) [K] of some rows, the quietest band first, in the frames of most.
+    """Signals (band, frame, pixel) [K] of some rows, the quietest band first.
 
-    And these frames (time), the pixels that have them all, and the noise (band, pixel) over that of
-    a sample.
+    In the frames that most pixels have; and these (time), the pixels that have them all, and the
+    noise (band, pixel) over that of a sample.
     """
     displacement, fewest = inputs.displacement, inputs.method.minimum_frames
     source = rows if displacement is None else displacement.source(rows)
