@@ -153,7 +153,8 @@ def save_figure(
 
     Examples
     --------
-    >>>     >>> from matplotlib.figure import Figure
+    >>> from tempfile import TemporaryDirectory
+    >>> from matplotlib.figure import Figure
     >>> from PIL import Image
     >>> from dbthermal import store
     >>> with TemporaryDirectory() as folder:
