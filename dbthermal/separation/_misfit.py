@@ -10,7 +10,9 @@ bodies, unlike blurs, a camera that shakes), and by changes that no reflection e
 that the model misses, pixels that drift).
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -74,9 +76,10 @@ class _Blocks:
 _NAMES: Final = tuple(field.name for field in fields(_Blocks))
 
 
-def measure(inputs: Inputs, result: xr.Dataset) -> Misfit:
+def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
     """What a result leaves in the bands of its pixels without a flag, in one reading."""
-    parts = [_of_rows(inputs, result, rows) for rows in inputs.blocks]
+    with ThreadPoolExecutor(workers) as threads:
+        parts = list(threads.map(partial(_of_rows, inputs, result), inputs.blocks))
     blocks = _Blocks(
         *(np.concatenate([getattr(part, name) for part in parts], axis=-2) for name in _NAMES)
     )

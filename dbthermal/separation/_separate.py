@@ -136,7 +136,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         parts = _separated(
             capture, scope, reflection_shift, materials, per_pixel, workers, progress
         )
-        return parts, misfits.measure(parts.inputs, parts.result)
+        return parts, misfits.measure(parts.inputs, parts.result, workers)
 
     # Separate, and widen the bars by what is left.
     corrected, (parts, misfit), mended = _mended(corrected, once, alone)
