@@ -10,7 +10,7 @@ from dbthermal import _rows, schema
 from dbthermal import _text as texts
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
-from dbthermal.correction._shutter import find_shutter, mark_shutter
+from dbthermal.correction._shutter import distinct, events_of, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
 
@@ -58,7 +58,8 @@ def correct_capture(
     """Correct a raw capture: gain, offset, shutter events, lag, bad pixels and drift, in order.
 
     1. `find_shutter` on raw counts, in which a repeated frame is an exact copy; frames recorded as
-       closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added.
+       closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added. Of a stream that repeats
+       each frame, as one faster than its sensor, the distinct frames are kept, with their times.
     2. `renew_offset` and `correct`, while the limits of the detector still hold for each sample.
     3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN.
        Pixels whose raw counts heap on one level are saturated, those that repeat their counts for
@@ -127,9 +128,13 @@ def correct_capture(
     schema.check(correction, "correction")
     if not isinstance(shutter, bool | np.bool_):
         raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
+    # Steps 1 and 2: distinct frames, shutter events, new offsets.
+    events, repeats = None, np.empty(0, dtype=bool)
+    if shutter:
+        capture, repeats = distinct(capture)
     closed = _closed(capture)
-    # Steps 1 and 2: shutter events, new offsets.
-    events = find_shutter(capture, closed=closed) if shutter else None
+    if shutter:
+        events = events_of(capture["counts"], repeats, closed)
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
 

@@ -36,7 +36,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
     successive frames, free of drift. Its median over pixels and temperatures is divided by that of
     a chi-square distribution of the degrees of freedom that n differences leave, :math:`2 n^2 /
-    (3 n - 1)`: a median of few frames is else too low (by 33 % for two frames, 5 % for ten).
+    (3 n - 1)`: a median of few frames is else too low (by 33 % for two frames, 5 % for ten). Exact
+    copies of the frame before, as of a stream faster than the sensor, do not count.
 
     Parameters
     ----------
@@ -48,8 +49,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
-        [count], the standard deviation of one sample. TypeError or ValueError if the movies hold
-        NaN or do not vary.
+        [count], the standard deviation of one sample; attribute ``frames``, the fewest that are no
+        copies. TypeError or ValueError if the movies hold NaN or do not vary.
 
     Examples
     --------
@@ -73,7 +74,11 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     variance = np.empty((*counts.shape[:2], *counts.shape[3:]))
     for place in np.ndindex(*counts.shape[:2]):
         movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
-        variance[place] = 0.5 * np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
+        change = np.diff(movie, axis=0)
+        # The differences of a copy are 0 in every pixel.
+        number = max(1, int(change.any(axis=(1, 2)).sum()))
+        variance[place] = 0.5 * np.square(change).sum(axis=0, dtype=float) / number
+        frames = min(frames, number + 1)
     # Median over pixels and temperatures, over that of the chi-square distribution.
     variance = variance.reshape(len(variance), -1)
     freedom = 2 * (frames - 1) ** 2 / (3 * (frames - 1) - 1)

@@ -14,6 +14,7 @@ import xarray as xr
 from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
+from dbthermal._warnings import warned
 
 Integers = npt.NDArray[np.int64]
 
@@ -68,10 +69,15 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     [21, 5, 2.1, 2.5, True]
     """
     counts = schema.check(corrected, "corrected")["counts"]
+    return events_of(counts, copies(counts), closed)
+
+
+def events_of(counts: xr.DataArray, repeats: Mask, closed: xr.DataArray | None) -> xr.Dataset:
+    """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`."""
     shut = _closed_frames(counts, closed)
     runs = []
     for index, name in enumerate(counts["band"].values):
-        marked = shut[index] | _copies(counts.isel(band=index))
+        marked = shut[index] | repeats[index]
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
             renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
@@ -149,6 +155,58 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
     return np.broadcast_to(closed.values, shape)
 
 
+def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
+    """Capture without the repetitions of a stream faster than its sensor, and its copies.
+
+    A stream repeats if half of the frames are shown twice or more, r times in the median. Of each
+    frame shown m times, m / r are kept, rounded, and at least one: an image that the sensor itself
+    repeats, as behind a closed shutter, stays so (band, time). Frames keep their times; bands whose
+    copies are not simultaneous get an `exposure_time` each, NaN behind their last frame.
+    """
+    counts = schema.check(capture, "capture")["counts"]
+    repeats, frames = copies(counts), np.arange(counts.sizes["time"])
+    kept, shown = [], []
+    for band in repeats:
+        (starts,) = np.nonzero(~band)
+        number = np.diff(np.append(starts, frames.size))
+        shown.append(max(1, int(np.median(number))))
+        place = frames - np.repeat(starts, number)
+        least = np.repeat(np.maximum(1, np.rint(number / shown[-1])), number)
+        kept.append(np.flatnonzero((place % shown[-1] == 0) & (place < shown[-1] * least)))
+    if max(shown) == 1:
+        return capture, repeats
+    label = ", ".join(
+        f"{number} times in band '{band}'"
+        for band, number in zip(counts["band"].values, shown, strict=True)
+        if number > 1
+    )
+    said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
+    longest = max(kept, key=len)
+    # Common copies: a shorter capture.
+    if all(np.array_equal(band, longest) for band in kept):
+        return warned(capture.isel(time=longest), said), repeats[:, longest]
+    # Copies of each band by itself: its distinct frames first, without a time behind the last.
+    if "exposure_time" not in capture:
+        stamps = np.tile(capture["time"].values.astype(np.float64), (len(kept), 1))
+        stamped = ("band", "time"), stamps, schema.EXPOSURE_TIME.attrs
+        capture = capture.assign(exposure_time=stamped)
+    bands, marked = [], np.zeros((len(kept), longest.size), dtype=bool)
+    for index, band in enumerate(kept):
+        place = np.pad(band, (0, longest.size - band.size), mode="edge")
+        part = capture.isel(band=[index], time=place).drop_vars("time")
+        valid = xr.DataArray(np.arange(longest.size) < band.size, dims="time")
+        bands.append(part.assign(exposure_time=part["exposure_time"].where(valid)))
+        marked[index, : band.size] = repeats[index, band]
+    rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
+    result = xr.concat(bands, "band", combine_attrs="override", **rule)
+    return warned(result.assign_coords(time=capture["time"][longest]), said), marked
+
+
+def copies(counts: xr.DataArray) -> Mask:
+    """Frames (band, time) of counts (band, time, y, x) that repeat the frame before."""
+    return np.stack([_copies(band) for band in counts])
+
+
 def _copies(counts: xr.DataArray) -> Mask:
     """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
     step = stride((counts.sizes["y"], counts.sizes["x"]), _SAMPLE)
@@ -160,17 +218,17 @@ def _copies(counts: xr.DataArray) -> Mask:
             f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the "
             f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
         )
-    copies = np.zeros(counts.sizes["time"], dtype=bool)
+    repeats = np.zeros(counts.sizes["time"], dtype=bool)
     # Compare the whole image where the sample of pixels repeats.
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
     if candidates.size:
-        copies[candidates] = True
+        repeats[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
         after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
         for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
             block = counts.isel(time=needed, y=rows).values
-            copies[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
-    return copies
+            repeats[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
+    return repeats
 
 
 def _changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> tuple[Mask, Mask]:
