@@ -8,6 +8,9 @@ import xarray as xr
 
 from dbthermal import _rows, schema
 from dbthermal import _text as texts
+from dbthermal._arrays import Mask
+from dbthermal._warnings import warned
+from dbthermal.correction._frames import row_step, unreported
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import distinct, events_of, mark_shutter
@@ -61,7 +64,10 @@ def correct_capture(
        closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added. Of a stream that repeats
        each frame, as one faster than its sensor, the distinct frames are kept, with their times.
     2. `renew_offset` and `correct`, while the limits of the detector still hold for each sample.
-    3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN.
+    3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN,
+       and so do frames that neither those before nor those after predict: a shutter that is seen,
+       black, torn or random frames, the rarer of two gains. A segment begins, too, where the fixed
+       pattern of one band changes.
        Pixels whose raw counts heap on one level are saturated, those that repeat their counts for
        longer than noise does are frozen.
     4. `undo_lag`, after 3, because a repeated frame says nothing of the pixel's past.
@@ -81,7 +87,7 @@ def correct_capture(
     flat : DataArray, optional
         Mean raw frames (band, y, x) [count] of a uniform view before the capture, for new offsets.
     shutter : bool
-        False if no camera had a shutter, and no frame was lost.
+        False if no camera had a shutter, and no frame was lost or bad.
     time_constant : float or DataArray, optional
         Thermal time constant of the pixels [s], of all bands or (band); by default no correction.
     bad_pixels : float, optional
@@ -129,18 +135,17 @@ def correct_capture(
     if not isinstance(shutter, bool | np.bool_):
         raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
     # Steps 1 and 2: distinct frames, shutter events, new offsets.
-    events, repeats = None, np.empty(0, dtype=bool)
-    if shutter:
-        capture, repeats = distinct(capture)
-    closed = _closed(capture)
-    if shutter:
-        events = events_of(capture["counts"], repeats, closed)
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
+    events, notes, stamped = None, [], capture
+    if shutter:
+        capture, repeats = distinct(capture)
+        stamped, events, notes = _events(capture, repeats, before, maximum)
+    closed = _closed(capture)
 
     def measured(rows: slice) -> xr.Dataset:
         """Correct some rows, in the steps that need no other rows."""
-        corrected = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
+        corrected = correct(stamped.isel(y=rows), before.isel(y=rows), maximum=maximum)
         corrected = _without_damaged(
             corrected if events is None else mark_shutter(corrected, events)
         )
@@ -152,8 +157,10 @@ def correct_capture(
         result = mark_bad(result, threshold=bad_pixels)
     if drift_reference is not None:
         result = undo_drift(result, drift_reference, lazy=lazy)
+    if "exposure_time" not in capture:
+        result = result.drop_vars("exposure_time", errors="ignore")
     number = -1 if closed is None else closed.sum("time").values.tolist()
-    return result.assign_attrs(shutter_closed_frames=number)
+    return warned(result.assign_attrs(shutter_closed_frames=number), *notes)
 
 
 def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
@@ -170,6 +177,34 @@ def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.D
     counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
+
+
+def _events(
+    capture: xr.Dataset, repeats: Mask, correction: xr.Dataset, maximum: int
+) -> tuple[xr.Dataset, xr.Dataset, list[str]]:
+    """Capture with bad frames without exposure time, its events, and sentences on both."""
+    counts, closed = capture["counts"], _closed(capture)
+    stamps = capture.get("exposure_time", xr.zeros_like(counts[:, :, 0, 0], dtype=np.float64))
+    shut = xr.zeros_like(stamps, dtype=bool) if closed is None else closed
+    valid = ~repeats & ~shut.values & stamps.notnull().values
+    # First frames after the events that are known.
+    events = events_of(counts, repeats, closed)
+    renewals, names = (
+        np.zeros(valid.shape, dtype=bool),
+        [str(name) for name in counts["band"].values],
+    )
+    for event in np.flatnonzero(events["renewed"]):
+        after = int(events["first_frame"][event] + events["frames"][event])
+        renewals[names.index(str(events["band"].values[event])), after : after + 1] = True
+    # What no camera reports, in some rows.
+    rows = slice(None, None, row_step(counts))
+    found = unreported(
+        correct(capture.isel(y=rows), correction.isel(y=rows), maximum=maximum), valid, renewals
+    )
+    if found.bad.any():
+        capture = capture.assign(exposure_time=stamps.where(~found.bad))
+    events = events_of(counts, repeats, shut | found.shutter, found.steps)
+    return capture, events, found.notes(names)
 
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:

@@ -251,9 +251,10 @@ def correct(
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), with the
-        bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0) of
-        `schema.Status`, whose counts are kept; `pattern_std` (band) [count] where the correction
-        has its deviations, root mean square over the levels of the capture. Attributes:
+        bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0, in a
+        frame that has an exposure time) of `schema.Status`, whose counts are kept; `pattern_std`
+        (band) [count] where the correction has its deviations, root mean square over the levels of
+        the capture. Attributes:
         ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
         (``gain_offset_...``), and the numbers of marked pixels.
     """
@@ -273,7 +274,11 @@ def correct(
         gain, offset = maps["gain"].values[band], maps["offset"].values[band]
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
-        saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
+        if "exposure_time" in capture:  # a damaged frame saturates no pixel
+            stamped = capture["exposure_time"].values[band] == capture["exposure_time"].values[band]
+            raw = raw if stamped.all() else raw[stamped]
+        saturated |= raw.max(axis=0, initial=0) >= maximum
+        saturated |= raw.min(axis=0, initial=DETECTOR_MAXIMUM) <= 0
     # Flags, pattern and attributes.
     bad = maps["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)

@@ -72,10 +72,20 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     return events_of(counts, copies(counts), closed)
 
 
-def events_of(counts: xr.DataArray, repeats: Mask, closed: xr.DataArray | None) -> xr.Dataset:
-    """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`."""
+def events_of(
+    counts: xr.DataArray,
+    repeats: Mask,
+    closed: xr.DataArray | None,
+    steps: Mask | None = None,
+) -> xr.Dataset:
+    """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`.
+
+    First frames (band, time) of `steps` of the pattern are events of two frames: the place of a
+    step is uncertain by one.
+    """
     shut = _closed_frames(counts, closed)
-    runs = []
+    places = () if steps is None else np.argwhere(steps)
+    runs = [(str(counts["band"].values[band]), frame - 1, 2, True) for band, frame in places]
     for index, name in enumerate(counts["band"].values):
         marked = shut[index] | repeats[index]
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
