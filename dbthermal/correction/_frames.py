@@ -6,6 +6,7 @@ those after predict such an image. All of it is found on a few pixels of correct
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -34,13 +35,17 @@ _ENDS: Final = 4  # changes of the image after the first that may end a run
 _BLOCKS: Final = (6, 8)  # parts of an image whose means are compared
 _LAGS: Final = 5  # by which the cameras may be apart [frame]
 _SHARED: Final = 0.7  # least correlation of a deviation that two bands see
-_UNIFORM: Final = 0.3  # largest contrast of a shutter, relative to the scene's
+# Largest contrast of a shutter, relative to that which the scene has less of in few frames.
+_UNIFORM, _FEW = 0.3, 0.1
 _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
+_ALIKE: Final = 0.9  # and least correlation of the images before and after
 _NEAR: Final = 10  # frames before and after it whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
 # Variance of a step of the pattern over that of noise, from which it is one.
 _STEP: Final = 2.5
 _BOTH: Final = 1.5  # the same in another band, from which the scene has stepped
+_SIGNS: Final = 0.1  # and mean product of the signs of both steps
+_AT_ONCE: Final = 0.7  # least share of a step that a single frame brings
 _SHOWN: Final = 10  # runs of bad frames that are named
 _BAD: Final = (
     "{} frames of band '{}' are left out, which neither the frames before nor those after predict: "
@@ -103,7 +108,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
         good &= (corrected["status"].values & int(schema.Status.DEAD_PIXEL)) == 0
     time = counts["time"].values.astype(np.float64)
     longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
-    bad, shutter, steps = (np.zeros(valid.shape, dtype=bool) for _ in range(3))
+    bad, shutter = np.zeros(valid.shape, dtype=bool), np.zeros(valid.shape, dtype=bool)
     # Films without the pixels that are no measurement.
     films = []
     for band, movie in enumerate(counts):
@@ -113,30 +118,31 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     noise = np.array([_noise(film[row]) for film, row in zip(films, valid, strict=True)])
     judged = np.flatnonzero((valid.sum(axis=1) >= MINIMUM_FRAMES) & (noise > 0.0))
     # Bad frames, then steps among the others.
+    parts = [_coarse(film) for film in films]
     for band in judged:
+        blank = _uniform(parts[band], valid[band], noise[band] / np.sqrt(films[band][0].size))
         for _ in range(_PASSES):
             (frames,) = np.nonzero(valid[band] & ~bad[band])
-            runs = list(_runs(films[band][frames], noise[band], longest))
-            for start, stop in runs:
-                places = frames[[max(start - 1, 0), (start + stop - 1) // 2, stop % frames.size]]
-                sides = places[[start > 0, False, stop < frames.size]]
-                blank = _is_uniform(films[band], places[1], sides, noise[band])
-                if blank or not _is_shared(films, valid & ~bad, band, places[1], sides):
+            for start, stop, places in _runs(films[band][frames], noise[band], longest):
+                middle, *sides = frames[places]
+                closed = blank[middle] and not blank[sides].any()
+                if closed or not _is_shared(parts, valid & ~bad, band, middle, sides):
                     bad[band, frames[start:stop]] = True
-                    shutter[band, frames[start:stop]] = blank and stop - start >= FEWEST_COPIES
+                    shutter[band, frames[start:stop]] = closed and stop - start >= FEWEST_COPIES
             if not bad[band, frames].any():
                 break
         (frames,) = np.nonzero(valid[band] & ~bad[band])
-        bad[band, frames[_other_gain(films[band][frames])]] = True
-    scores = {
-        band: _pattern_scores(films[band], valid[band] & ~bad[band], renewals[band])
-        for band in judged
-    }
-    for band, score in scores.items():
-        for frame in _peaks(score):
-            near = slice(max(frame - _WINDOW, 0), frame + _WINDOW)
-            others = [scores[other][near].max() for other in scores if other != band]
-            steps[band, frame] = max(others, default=0.0) < _BOTH
+        gain = np.zeros(frames.size)
+        for place, change in _gains(films[band][frames], parts[band][frames]):
+            if not _is_shared(parts, valid, band, frames[place], [frames[place - 1]]):
+                gain[place:] += change
+        near = np.abs(gain[:, np.newaxis] - np.unique(gain)) < 0.5 * _GAIN
+        bad[band, frames[~near[:, np.argmax(near.sum(axis=0))]]] = True
+    steps = np.zeros(valid.shape, dtype=bool)
+    if judged.size:
+        steps[judged] = _steps(
+            [films[band] for band in judged], (valid & ~bad)[judged], renewals[judged]
+        )
     return Findings(bad, shutter, steps)
 
 
@@ -147,131 +153,145 @@ def _noise(film: Film) -> float:
     return float(np.median(level[level > 0.0])) if np.any(level > 0.0) else np.nan
 
 
-def _runs(film: Film, noise: float, longest: int) -> Iterator[tuple[int, int]]:
-    """Yield first frames, and frames after the last, of runs that neither side predicts."""
-    limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
-    edges = np.array(
-        [
-            1 + place
-            for place in range(len(film) - 1)
-            if np.mean(np.abs(film[place + 1] - film[place]) > limit) > _EDGE
-        ],
-        dtype=np.int64,
+def _uniform(parts: Array, valid: Mask, noise: float) -> Mask:
+    """Frames (time) of far less contrast than nearly all of a film, by its means (time, part)."""
+    contrast = parts.std(axis=1)
+    scene = float(np.quantile(contrast[valid], _FEW))
+    return np.asarray(
+        (contrast < _UNIFORM * scene) & (scene > OUTLIER * noise * parts.shape[1] ** 0.5)
     )
-    pairs = [(0, int(stop)) for stop in edges[:_ENDS] if stop <= _AT_END]
-    for place, start in enumerate(edges.tolist()):
-        ends = edges[place + 1 : place + 1 + _ENDS].tolist()
+
+
+def _runs(film: Film, noise: float, longest: int) -> Iterator[tuple[int, int, list[int]]]:
+    """Yield first frames, and frames after the last, of runs that neither side predicts.
+
+    And the frames that prove it: in the middle, and on both sides. At an end of the capture one
+    twice as far away stands for the missing side.
+    """
+    limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
+    changes = [np.mean(np.abs(after - before) > limit) for before, after in pairwise(film)]
+    edges = (1 + np.flatnonzero(np.array(changes) > _EDGE)).tolist()
+    pairs = [(0, stop) for stop in edges[:_ENDS] if stop <= _AT_END]
+    for place, start in enumerate(edges):
+        ends = edges[place + 1 : place + 1 + _ENDS]
         pairs += [(start, stop) for stop in ends if stop - start <= longest]
         pairs += [(start, len(film))] if len(film) - start <= _AT_END else []
-    after = 0
+    done = 0
     for start, stop in pairs:
-        if start >= after and _deviates(film, start, stop, limit):
-            yield start, stop
-            after = stop
+        before = start - 1 if start > 0 else 2 * stop
+        after = stop if stop < len(film) else 2 * start - stop - 1
+        places = [(start + stop - 1) // 2, before, after]
+        if start >= done and max(places) < len(film) and _deviates(film[places], limit):
+            yield start, stop, places
+            done = stop
 
 
-def _deviates(film: Film, start: int, stop: int, limit: np.float32) -> bool:
-    """Return whether the middle of a run deviates from both frames beside it, which are alike."""
-    sides = [film[place] for place in (start - 1, stop) if 0 <= place < len(film)]
-    least = np.min([np.abs(film[(start + stop - 1) // 2] - side) for side in sides], axis=0)
-    deviant = (least > limit) & (np.abs(sides[-1] - sides[0]) < _RETURN * least)
+def _deviates(film: Film, limit: np.float32) -> bool:
+    """Return whether a frame deviates from two others, which are alike."""
+    least = np.abs(film[0] - film[1:]).min(axis=0)
+    deviant = (least > limit) & (np.abs(film[2] - film[1]) < _RETURN * least)
     torn = deviant.mean(axis=1) > _ROW
     return bool(deviant.mean() > _MOST or torn.mean() > _ROWS)
 
 
-def _coarse(image: Film) -> Array:
-    """Means over parts of an image."""
+def _coarse(film: Film) -> Array:
+    """Means (time, part) over parts of the image of a film (time, y, x)."""
     rows, columns = (
-        np.linspace(0, size, parts, endpoint=False).astype(int)
-        for size, parts in zip(image.shape, _BLOCKS, strict=True)
+        np.unique(np.linspace(0, size, parts, endpoint=False).astype(int))
+        for size, parts in zip(film.shape[1:], _BLOCKS, strict=True)
     )
-    sums = np.add.reduceat(np.add.reduceat(image, np.unique(rows), 0), np.unique(columns), 1)
-    number = np.ones(image.shape)
-    number = np.add.reduceat(np.add.reduceat(number, np.unique(rows), 0), np.unique(columns), 1)
-    return np.asarray(sums / number)
+    sums, area = (
+        np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1)
+        for values in (film, np.ones(film.shape[1:]))
+    )
+    return np.asarray(sums / area).reshape(len(film), -1)
 
 
-def _is_uniform(film: Film, frame: int, sides: Frames, noise: float) -> bool:
-    """Return whether a frame shows far less contrast than those beside it."""
-    grain = noise / np.sqrt(film[0].size / np.prod(_BLOCKS))
-    scene = min(float(_coarse(film[side]).std()) for side in sides)
-    return bool(scene > OUTLIER * grain and _coarse(film[frame]).std() < _UNIFORM * scene)
-
-
-def _is_shared(films: list[Film], valid: Mask, band: int, frame: int, sides: Frames) -> bool:
+def _is_shared(parts: list[Array], valid: Mask, band: int, frame: int, sides: list[int]) -> bool:
     """Return whether another band deviates alike, a few frames earlier or later."""
-
-    def deviation(film: Film, lag: int) -> Array:
-        beside = np.mean([_coarse(film[side + lag]) for side in sides], axis=0)
-        return np.asarray(_coarse(film[frame + lag]) - beside).ravel()
-
-    present = deviation(films[band], 0)
-    for other, film in enumerate(films):
+    deviation = parts[band][frame] - parts[band][sides].mean(axis=0)
+    for other, part in enumerate(parts):
         for lag in range(-_LAGS, _LAGS + 1) if other != band else ():
-            places = np.append(sides, frame) + lag
-            if places.min() < 0 or places.max() >= len(film) or not valid[other, places].all():
+            places = np.array([frame, *sides]) + lag
+            if places.min() < 0 or places.max() >= len(part) or not valid[other, places].all():
                 continue
-            partner = deviation(film, lag)
-            energy = np.linalg.norm(present) * np.linalg.norm(partner)
-            if present @ partner > _SHARED * energy:
+            partner = part[places[0]] - part[places[1:]].mean(axis=0)
+            energy = np.linalg.norm(deviation) * np.linalg.norm(partner)
+            if deviation @ partner > _SHARED * energy:
                 return True
     return False
 
 
-def _other_gain(film: Film) -> Frames:
-    """Frames with another gain than most, in which contrast and noise are larger or smaller."""
-    flat = film.reshape(len(film), -1)
-    level = np.zeros(len(film))  # logarithm of the gain
-    change = np.array([np.median(np.abs(flat[i + 1] - flat[i])) for i in range(len(flat) - 1)])
-    for place in 1 + np.flatnonzero(change > OUTLIER * np.median(change)):
-        before, after = film[max(place - _NEAR, 0) : place], film[place : place + _NEAR]
-        if min(len(before), len(after)) < 3:
+def _gains(film: Film, parts: Array) -> Iterator[tuple[int, float]]:
+    """Yield frames from which contrast and noise are larger or smaller, and by what logarithm."""
+    change = np.array([np.median(np.abs(after - film[i])) for i, after in enumerate(film[1:])])
+    large = 1 + np.flatnonzero(change > OUTLIER * np.median(change))
+    for place in large[(large >= FEWEST_COPIES) & (large <= len(film) - FEWEST_COPIES)]:
+        sides = film[max(place - _NEAR, 0) : place], film[place : place + _NEAR]
+        noises = [np.median(np.abs(side[1:-1] - 0.5 * (side[:-2] + side[2:]))) for side in sides]
+        scenes = parts[place - 1 : place + 1]
+        if min(*scenes.std(axis=1), *noises) == 0.0:
             continue
-        first, second = _coarse(before[-1]).ravel(), _coarse(after[0]).ravel()
-        noises = [
-            np.median(np.abs(part[1:-1] - 0.5 * (part[:-2] + part[2:]))) for part in (before, after)
-        ]
-        if first.std() == 0.0 or second.std() == 0.0 or min(noises) == 0.0:
-            continue
-        gain = float(np.log(second.std() / first.std()))
-        like = np.log(noises[1] / noises[0]) / gain if gain else 0.0
-        if abs(gain) > _GAIN and 0.5 < like < 1.5 and np.corrcoef(first, second)[0, 1] > 0.9:
-            level[place:] += gain
-    near = np.abs(level[:, np.newaxis] - np.unique(level)) < 0.5 * _GAIN
-    usual = near[:, np.argmax(near.sum(axis=0))]
-    return np.flatnonzero(~usual)
+        gain = float(np.log(scenes[1].std() / scenes[0].std()))
+        like = abs(gain) > _GAIN and 0.5 < np.log(noises[1] / noises[0]) / gain < 1.5
+        if like and np.corrcoef(scenes)[0, 1] > _ALIKE:
+            yield int(place), gain
 
 
-def _pattern_scores(film: Film, valid: Mask, renewals: Mask) -> Array:
-    """Variance (time) of a step of the pattern at each frame, over that of noise and motion."""
+def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
+    """First frames (band, time) after which the pattern of one band is another, at once."""
     # Detail from pixel to pixel, in which object and reflections are weak.
-    detail = film[..., 1:-1] - 0.5 * (film[..., :-2] + film[..., 2:])
-    scores = np.zeros(len(film))
-    pieces = np.cumsum(renewals)
+    details = [film[..., 1:-1] - 0.5 * (film[..., :-2] + film[..., 2:]) for film in films]
+    details = [detail.reshape(len(detail), -1) for detail in details]
+    scores = np.stack(list(map(_scores, details, valid, renewals)))
+    steps, ahead = np.zeros(valid.shape, dtype=bool), scores.copy()
+    while ahead.max() > _STEP:
+        band, frame = np.unravel_index(np.argmax(ahead), ahead.shape)
+        near = slice(max(frame - _WINDOW, 0), frame + _WINDOW)
+        ahead[band, near] = 0.0
+        change = _change(details[band], valid[band], frame)
+        # Share of the change that each frame brings, median of the pixels with most of it.
+        strong = np.abs(change) > np.median(np.abs(change))
+        inner = near.start + np.flatnonzero(valid[band, near])
+        jumps = np.diff(details[band][inner][:, strong], axis=0)
+        shares = np.median(jumps / change[strong], axis=1)
+        frame = int(inner[1 + np.argmax(shares)])
+        change = np.sign(_change(details[band], valid[band], frame))
+        signs = [
+            np.mean(change * np.sign(_change(details[other], valid[other], frame)))
+            for other in range(len(films))
+            if other != band and scores[other, near].any()
+        ]
+        alone = np.delete(scores[:, near], band, axis=0).max(initial=0.0) < _BOTH
+        alone &= np.abs(signs).max(initial=0.0) < _SIGNS
+        steps[band, frame] = alone and shares.max() > _AT_ONCE
+    return steps
+
+
+def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
+    """Variance (time) of a step of the pattern at each frame, over that of noise and motion."""
+    scores, pieces = np.zeros(len(detail)), np.cumsum(renewals)
     for piece in np.unique(pieces):
         (frames,) = np.nonzero(valid & (pieces == piece))
         width = min(_WINDOW, len(frames) // 3)
-        if width < 8:
+        if width < _NEAR:
             continue
-        flat = detail[frames].reshape(len(frames), -1).astype(np.float64)
-        noise = MAD * np.median(np.abs(np.diff(flat, axis=0))) / np.sqrt(2.0)
+        flat = detail[frames].astype(np.float64)
+        noise = MAD * float(np.median(np.abs(np.diff(flat, axis=0)))) / np.sqrt(2.0)
+        if noise == 0.0:
+            continue
         total = np.cumsum(np.pad(flat, ((1, 0), (0, 0))), axis=0)
         places = np.arange(width, len(frames) - width + 1)
-        ratio = np.array(
-            [
-                np.median(np.abs(total[i + width] - 2.0 * total[i] + total[i - width]))
-                for i in places
-            ]
-        )
-        ratio = (MAD * ratio) ** 2 / (2.0 * width * noise**2)
-        scores[frames[places]] = ratio / max(1.0, float(np.median(ratio)))
+        steps = total[2 * width :] - 2.0 * total[width:-width] + total[: -2 * width]
+        ratio = (MAD * np.median(np.abs(steps), axis=1)) ** 2 / (2.0 * width * noise**2)
+        scores[frames[places[:-1]]] = ratio[:-1] / max(1.0, float(np.median(ratio)))
     return scores
 
 
-def _peaks(score: Array) -> Iterator[int]:
-    """Yield the frames at which a score (time) is highest, and large, one per window."""
-    score = score.copy()
-    while score.max() > _STEP:
-        frame = int(np.argmax(score))
-        yield frame
-        score[max(frame - _WINDOW, 0) : frame + _WINDOW] = 0.0
+def _change(detail: Film, valid: Mask, frame: int) -> Film:
+    """Change of the detail (pixel) between the means before and after a frame."""
+    before = np.flatnonzero(valid[:frame])[-_WINDOW:]
+    after = frame + np.flatnonzero(valid[frame:])[:_WINDOW]
+    if min(before.size, after.size) == 0:
+        return np.zeros(detail.shape[1], dtype=np.float32)
+    return np.asarray(detail[after].mean(axis=0) - detail[before].mean(axis=0))
