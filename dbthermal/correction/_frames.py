@@ -33,19 +33,21 @@ _RETURN: Final = 0.5  # largest change across a run of bad frames, relative to i
 _LONGEST, _AT_END = 5.0, 5  # longest run of bad frames [s], at an end of the capture [frame]
 _ENDS: Final = 4  # changes of the image after the first that may end a run
 _BLOCKS: Final = (6, 8)  # parts of an image whose means are compared
+_COMES: Final = 0.4  # least share of a deviation that comes with one frame, and goes with one
 _LAGS: Final = 5  # by which the cameras may be apart [frame]
 _SHARED: Final = 0.7  # least correlation of a deviation that two bands see
 # Largest contrast of a shutter, relative to that which the scene has less of in few frames.
 _UNIFORM, _FEW = 0.3, 0.1
+_RANDOM: Final = 20.0  # differences of neighbouring pixels, relative to usual ones, of a random one
 _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
 _ALIKE: Final = 0.9  # and least correlation of the images before and after
 _NEAR: Final = 10  # frames before and after it whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
 # Variance of a step of the pattern over that of noise, from which it is one.
 _STEP: Final = 2.5
-_BOTH: Final = 1.5  # the same in another band, from which the scene has stepped
-_SIGNS: Final = 0.1  # and mean product of the signs of both steps
-_AT_ONCE: Final = 0.7  # least share of a step that a single frame brings
+# Least share of a step that a single frame brings; this and variance in another band, and mean
+# product of the signs, from which the scene has stepped.
+_AT_ONCE, _ALSO, _BOTH, _SIGNS = 0.7, 0.4, 1.5, 0.15
 _SHOWN: Final = 10  # runs of bad frames that are named
 _BAD: Final = (
     "{} frames of band '{}' are left out, which neither the frames before nor those after predict: "
@@ -120,21 +122,30 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     # Bad frames, then steps among the others.
     parts = [_coarse(film) for film in films]
     for band in judged:
-        blank = _uniform(parts[band], valid[band], noise[band] / np.sqrt(films[band][0].size))
+        limit = np.float32(OUTLIER * np.sqrt(2.0) * noise[band])
+        uniform = _uniform(parts[band], valid[band], noise[band] / np.sqrt(films[band][0].size))
+        rough = [float(np.median(np.abs(np.diff(frame, axis=1)))) for frame in films[band]]
+        blank = uniform | (np.array(rough) > _RANDOM * np.median(np.array(rough)[valid[band]]))
         for _ in range(_PASSES):
             (frames,) = np.nonzero(valid[band] & ~bad[band])
-            for start, stop, places in _runs(films[band][frames], noise[band], longest):
-                middle, *sides = frames[places]
-                closed = blank[middle] and not blank[sides].any()
-                if closed or not _is_shared(parts, valid & ~bad, band, middle, sides):
+            for start, stop, places in _runs(films[band][frames], limit, longest):
+                trio = frames[places]
+                closed = blank[trio[0]] and not blank[trio[1:]].any()
+                span = frames[start], frames[stop - 1]
+                if closed or not _is_shared(parts, valid & ~bad, band, trio, span):
+                    seen = uniform[trio[0]] and stop - start >= FEWEST_COPIES
+                    shutter[band, frames[start:stop]] = seen
+                    if seen:  # it moves in the frames beside
+                        start, stop = _with_edges(films[band][frames], start, stop, limit)
                     bad[band, frames[start:stop]] = True
-                    shutter[band, frames[start:stop]] = closed and stop - start >= FEWEST_COPIES
             if not bad[band, frames].any():
                 break
         (frames,) = np.nonzero(valid[band] & ~bad[band])
         gain = np.zeros(frames.size)
         for place, change in _gains(films[band][frames], parts[band][frames]):
-            if not _is_shared(parts, valid, band, frames[place], [frames[place - 1]]):
+            if not _is_shared(
+                parts, valid, band, frames[[place, place - 1]], (frames[place], frames[place - 1])
+            ):
                 gain[place:] += change
         near = np.abs(gain[:, np.newaxis] - np.unique(gain)) < 0.5 * _GAIN
         bad[band, frames[~near[:, np.argmax(near.sum(axis=0))]]] = True
@@ -162,14 +173,13 @@ def _uniform(parts: Array, valid: Mask, noise: float) -> Mask:
     )
 
 
-def _runs(film: Film, noise: float, longest: int) -> Iterator[tuple[int, int, list[int]]]:
+def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, int, list[int]]]:
     """Yield first frames, and frames after the last, of runs that neither side predicts.
 
     And the frames that prove it: in the middle, and on both sides. At an end of the capture one
     twice as far away stands for the missing side.
     """
-    limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
-    changes = [np.mean(np.abs(after - before) > limit) for before, after in pairwise(film)]
+    changes = [_changed(before, after, limit) for before, after in pairwise(film)]
     edges = (1 + np.flatnonzero(np.array(changes) > _EDGE)).tolist()
     pairs = [(0, stop) for stop in edges[:_ENDS] if stop <= _AT_END]
     for place, start in enumerate(edges):
@@ -207,19 +217,59 @@ def _coarse(film: Film) -> Array:
     return np.asarray(sums / area).reshape(len(film), -1)
 
 
-def _is_shared(parts: list[Array], valid: Mask, band: int, frame: int, sides: list[int]) -> bool:
-    """Return whether another band deviates alike, a few frames earlier or later."""
-    deviation = parts[band][frame] - parts[band][sides].mean(axis=0)
+def _with_edges(film: Film, start: int, stop: int, limit: np.float32) -> tuple[int, int]:
+    """Run of frames with those beside it in which a part of the image changes."""
+    first = start - 1 if start > 1 and _changed(*film[start - 2 : start], limit) > _EDGE else start
+    after = film[stop : stop + 2]
+    return first, stop + 1 if len(after) == 2 and _changed(*after, limit) > _EDGE else stop
+
+
+def _changed(before: Film, after: Film, limit: np.float32) -> float:
+    """Share of the pixels that change between two images."""
+    return float(np.mean(np.abs(after - before) > limit))
+
+
+def _is_shared(
+    parts: list[Array], valid: Mask, band: int, places: Frames, span: tuple[int, int]
+) -> bool:
+    """Return whether another band deviates alike, a few frames earlier or later, and as suddenly.
+
+    Of the means of parts of the image (time, part); `places` are a frame and those that it deviates
+    from, `span` the first and last that do, of a step its frame and the one before.
+    """
+    deviation = parts[band][places[0]] - parts[band][places[1:]].mean(axis=0)
+    if not _is_sudden(parts[band], deviation, span, 0, _COMES):
+        return True  # the object, or people, who come and go
     for other, part in enumerate(parts):
         for lag in range(-_LAGS, _LAGS + 1) if other != band else ():
-            places = np.array([frame, *sides]) + lag
-            if places.min() < 0 or places.max() >= len(part) or not valid[other, places].all():
+            moved = places + lag
+            if moved.min() < 0 or moved.max() >= len(part) or not valid[other, moved].all():
                 continue
-            partner = part[places[0]] - part[places[1:]].mean(axis=0)
+            partner = part[moved[0]] - part[moved[1:]].mean(axis=0)
             energy = np.linalg.norm(deviation) * np.linalg.norm(partner)
-            if deviation @ partner > _SHARED * energy:
+            if deviation @ partner > _SHARED * energy and _is_sudden(
+                part, partner, span, lag, 0.5 * _COMES
+            ):
                 return True
     return False
+
+
+def _is_sudden(
+    part: Array, deviation: Array, span: tuple[int, int], lag: int, share: float
+) -> bool:
+    """Return whether a deviation (part) comes with the first frame and goes with the last one."""
+    energy = deviation @ deviation
+    first, last = span[0] + lag, span[1] + lag
+    if last < first:  # a step, unlike the changes before and after
+        near = [
+            part[place] - part[place - 1]
+            for place in (first - 1, first + 1)
+            if 0 < place < len(part)
+        ]
+        return all(change @ deviation < _RETURN * energy for change in near)
+    comes = first < 1 or (part[first] - part[first - 1]) @ deviation > share * energy
+    goes = last + 1 >= len(part) or (part[last] - part[last + 1]) @ deviation > share * energy
+    return bool(comes and goes)
 
 
 def _gains(film: Film, parts: Array) -> Iterator[tuple[int, float]]:
@@ -247,24 +297,21 @@ def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
     steps, ahead = np.zeros(valid.shape, dtype=bool), scores.copy()
     while ahead.max() > _STEP:
         band, frame = np.unravel_index(np.argmax(ahead), ahead.shape)
-        near = slice(max(frame - _WINDOW, 0), frame + _WINDOW)
-        ahead[band, near] = 0.0
-        change = _change(details[band], valid[band], frame)
-        # Share of the change that each frame brings, median of the pixels with most of it.
-        strong = np.abs(change) > np.median(np.abs(change))
-        inner = near.start + np.flatnonzero(valid[band, near])
-        jumps = np.diff(details[band][inner][:, strong], axis=0)
-        shares = np.median(jumps / change[strong], axis=1)
-        frame = int(inner[1 + np.argmax(shares)])
-        change = np.sign(_change(details[band], valid[band], frame))
-        signs = [
-            np.mean(change * np.sign(_change(details[other], valid[other], frame)))
-            for other in range(len(films))
-            if other != band and scores[other, near].any()
-        ]
-        alone = np.delete(scores[:, near], band, axis=0).max(initial=0.0) < _BOTH
-        alone &= np.abs(signs).max(initial=0.0) < _SIGNS
-        steps[band, frame] = alone and shares.max() > _AT_ONCE
+        ahead[band, max(frame - _WINDOW, 0) : frame + _WINDOW] = 0.0
+        change, shares = _change(details[band], valid[band], frame)
+        first = int(np.argmax(shares))
+        if shares[first] < _AT_ONCE:
+            continue
+        # A step of the scene: of the same pixels in another band, or at once in its detail, too.
+        alone = True
+        for other in np.flatnonzero(scores.any(axis=1)):
+            partner, shared = _change(details[other], valid[other], first)
+            at_once = shared[max(first - 1, 0) : first + 2].max() > _ALSO
+            alone &= other == band or not (
+                np.abs(np.mean(np.sign(change) * np.sign(partner))) > _SIGNS
+                or (at_once and scores[other, first] > _BOTH)
+            )
+        steps[band, first] = alone
     return steps
 
 
@@ -288,10 +335,20 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
     return scores
 
 
-def _change(detail: Film, valid: Mask, frame: int) -> Film:
-    """Change of the detail (pixel) between the means before and after a frame."""
+def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array]:
+    """Change of the detail (pixel) at a frame, from mean to mean; share (time) of each frame in it.
+
+    The share is a median of the pixels that change most.
+    """
     before = np.flatnonzero(valid[:frame])[-_WINDOW:]
     after = frame + np.flatnonzero(valid[frame:])[:_WINDOW]
+    shares = np.zeros(len(detail))
     if min(before.size, after.size) == 0:
-        return np.zeros(detail.shape[1], dtype=np.float32)
-    return np.asarray(detail[after].mean(axis=0) - detail[before].mean(axis=0))
+        return np.zeros(detail.shape[1], dtype=np.float32), shares
+    change = detail[after].mean(axis=0) - detail[before].mean(axis=0)
+    strong = np.abs(change) > np.median(np.abs(change))
+    near = detail[np.concatenate([before, after])][:, strong]
+    shares[np.concatenate([before, after])[1:]] = np.median(
+        np.diff(near, axis=0) / change[strong], axis=1
+    )
+    return change, shares
