@@ -96,65 +96,85 @@ def row_step(counts: xr.DataArray) -> int:
 def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     """Find bad frames and steps of the pattern among the `valid` frames (band, time) of some rows.
 
-    A run of at most 5 s is bad if in half of the pixels, or in all pixels of a tenth of the rows,
-    its image deviates by more than 6 standard deviations of a difference from the frames before and
-    after, which differ by less than half of that; and if no other band sees a like deviation, or it
-    shows no contrast. Of two gains, whose contrast and noise differ alike, the rarer is bad. A
-    pattern steps if the means of 25 frames before and after differ from pixel to pixel by more than
-    noise and usual motion make, in one band. `renewals` (band, time) are first frames after an
-    event that is marked already.
+    A run of at most 5 s is bad if its image deviates by 6 standard deviations of a difference, in
+    half of the pixels or in whole rows, from the frames before and after, which are alike; suddenly
+    so; and if it shows no scene, or no other band deviates alike. Of two gains, by which contrast
+    and noise change in one band, the rarer is bad. A pattern steps if the means of 25 frames before
+    and after differ from pixel to pixel by 2.5 times the variance of noise and usual motion, at
+    once, for longer, and in one band. `renewals` (band, time) are first frames after events that
+    are marked already.
+
+    Of 1e5 good frames of 50 harsh scenes at 2, 10 and 50 Hz 3 are taken for bad ones, all first
+    frames (people, pours, touches, flash lamps, fans, knocks, people behind another delay).
     """
     counts = corrected["counts"]
     good = np.ones(counts.shape[2:], dtype=bool)
     if "status" in corrected:
         good &= (corrected["status"].values & int(schema.Status.DEAD_PIXEL)) == 0
-    time = counts["time"].values.astype(np.float64)
-    longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
-    bad, shutter = np.zeros(valid.shape, dtype=bool), np.zeros(valid.shape, dtype=bool)
     # Films without the pixels that are no measurement.
     films = []
-    for band, movie in enumerate(counts):
+    for movie, frames in zip(counts, valid, strict=True):
         film = np.asarray(movie.values, dtype=np.float32)
-        usable = good & np.isfinite(film[valid[band]]).all(axis=0)
+        usable = good & np.isfinite(film[frames]).all(axis=0)
         films.append(np.where(usable, film, np.float32(0.0)))
-    noise = np.array([_noise(film[row]) for film, row in zip(films, valid, strict=True)])
+    noise = np.array([_noise(film[frames]) for film, frames in zip(films, valid, strict=True)])
     judged = np.flatnonzero((valid.sum(axis=1) >= MINIMUM_FRAMES) & (noise > 0.0))
-    # Bad frames, then steps among the others.
-    parts = [_coarse(film) for film in films]
+    time = counts["time"].values.astype(np.float64)
+    longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
+    # Runs of bad frames, rarer gains, then steps among the other frames.
+    parts, valid, shutter = [_coarse(film) for film in films], valid.copy(), ~valid & False
+    before = valid.copy()
     for band in judged:
-        limit = np.float32(OUTLIER * np.sqrt(2.0) * noise[band])
-        uniform = _uniform(parts[band], valid[band], noise[band] / np.sqrt(films[band][0].size))
-        rough = [float(np.median(np.abs(np.diff(frame, axis=1)))) for frame in films[band]]
-        blank = uniform | (np.array(rough) > _RANDOM * np.median(np.array(rough)[valid[band]]))
-        for _ in range(_PASSES):
-            (frames,) = np.nonzero(valid[band] & ~bad[band])
-            for start, stop, places in _runs(films[band][frames], limit, longest):
-                trio = frames[places]
-                closed = blank[trio[0]] and not blank[trio[1:]].any()
-                span = frames[start], frames[stop - 1]
-                if closed or not _is_shared(parts, valid & ~bad, band, trio, span):
-                    seen = uniform[trio[0]] and stop - start >= FEWEST_COPIES
-                    shutter[band, frames[start:stop]] = seen
-                    if seen:  # it moves in the frames beside
-                        start, stop = _with_edges(films[band][frames], start, stop, limit)
-                    bad[band, frames[start:stop]] = True
-            if not bad[band, frames].any():
-                break
-        (frames,) = np.nonzero(valid[band] & ~bad[band])
+        _leave_out(band, films[band], parts, valid, shutter[band], noise[band], longest)
+    for band in judged:
+        (frames,) = np.nonzero(valid[band])
         gain = np.zeros(frames.size)
         for place, change in _gains(films[band][frames], parts[band][frames]):
-            if not _is_shared(
-                parts, valid, band, frames[[place, place - 1]], (frames[place], frames[place - 1])
-            ):
+            sides = frames[place - 1 : place + 1][::-1]
+            if not _is_shared(parts, valid, band, sides, (sides[0], sides[1])):
                 gain[place:] += change
         near = np.abs(gain[:, np.newaxis] - np.unique(gain)) < 0.5 * _GAIN
-        bad[band, frames[~near[:, np.argmax(near.sum(axis=0))]]] = True
-    steps = np.zeros(valid.shape, dtype=bool)
+        valid[band, frames[~near[:, np.argmax(near.sum(axis=0))]]] = False
+    steps = ~valid & False
     if judged.size:
-        steps[judged] = _steps(
-            [films[band] for band in judged], (valid & ~bad)[judged], renewals[judged]
-        )
-    return Findings(bad, shutter, steps)
+        steps[judged] = _steps([films[band] for band in judged], valid[judged], renewals[judged])
+    return Findings(before & ~valid, shutter, steps)
+
+
+def _leave_out(
+    band: int,
+    film: Film,
+    parts: list[Array],
+    valid: Mask,
+    shutter: Mask,
+    noise: float,
+    longest: int,
+) -> None:
+    """Make bad frames of a band not valid (band, time), and mark those of a shutter (time)."""
+    limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
+    # Frames without a scene: far less contrast than nearly all have, or random from pixel to pixel.
+    contrast = parts[band].std(axis=1)
+    scene = float(np.quantile(contrast[valid[band]], _FEW))
+    grain = noise * np.sqrt(parts[band].shape[1] / film[0].size)
+    uniform = (contrast < _UNIFORM * scene) & (scene > OUTLIER * grain)
+    rough = np.abs(np.diff(film, axis=2)).mean(axis=(1, 2))
+    blank = uniform | (rough > _RANDOM * np.median(rough[valid[band]]))
+    for _ in range(_PASSES):
+        (frames,) = np.nonzero(valid[band])
+        for start, stop, places in _runs(film[frames], limit, longest):
+            trio, span = frames[places], (frames[start], frames[stop - 1])
+            alone = blank[trio[0]] and not blank[trio[1:]].any()
+            if alone or not _is_shared(parts, valid, band, trio, span):
+                valid[band, frames[start:stop]] = False
+                if uniform[trio[0]] and stop - start >= FEWEST_COPIES:
+                    shutter[frames[start:stop]] = True
+                    # It moves in the frames beside in which a part of the image changes.
+                    for side, far in ((start - 1, start - 2), (stop, stop + 1)):
+                        if 0 <= far < frames.size:
+                            beside = film[frames[[far, side]]]
+                            valid[band, frames[side]] &= _changed(*beside, limit) <= _EDGE
+        if valid[band, frames].all():
+            return
 
 
 def _noise(film: Film) -> float:
@@ -162,15 +182,6 @@ def _noise(film: Film) -> float:
     flat = film.reshape(len(film), -1)
     level = samples.noise(flat[:, :: stride((flat.shape[1],), 256)])
     return float(np.median(level[level > 0.0])) if np.any(level > 0.0) else np.nan
-
-
-def _uniform(parts: Array, valid: Mask, noise: float) -> Mask:
-    """Frames (time) of far less contrast than nearly all of a film, by its means (time, part)."""
-    contrast = parts.std(axis=1)
-    scene = float(np.quantile(contrast[valid], _FEW))
-    return np.asarray(
-        (contrast < _UNIFORM * scene) & (scene > OUTLIER * noise * parts.shape[1] ** 0.5)
-    )
 
 
 def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, int, list[int]]]:
@@ -215,13 +226,6 @@ def _coarse(film: Film) -> Array:
         for values in (film, np.ones(film.shape[1:]))
     )
     return np.asarray(sums / area).reshape(len(film), -1)
-
-
-def _with_edges(film: Film, start: int, stop: int, limit: np.float32) -> tuple[int, int]:
-    """Run of frames with those beside it in which a part of the image changes."""
-    first = start - 1 if start > 1 and _changed(*film[start - 2 : start], limit) > _EDGE else start
-    after = film[stop : stop + 2]
-    return first, stop + 1 if len(after) == 2 and _changed(*after, limit) > _EDGE else stop
 
 
 def _changed(before: Film, after: Film, limit: np.float32) -> float:
@@ -274,7 +278,7 @@ def _is_sudden(
 
 def _gains(film: Film, parts: Array) -> Iterator[tuple[int, float]]:
     """Yield frames from which contrast and noise are larger or smaller, and by what logarithm."""
-    change = np.array([np.median(np.abs(after - film[i])) for i, after in enumerate(film[1:])])
+    change = np.abs(np.diff(parts, axis=0)).mean(axis=1)
     large = 1 + np.flatnonzero(change > OUTLIER * np.median(change))
     for place in large[(large >= FEWEST_COPIES) & (large <= len(film) - FEWEST_COPIES)]:
         sides = film[max(place - _NEAR, 0) : place], film[place : place + _NEAR]
@@ -298,20 +302,17 @@ def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
     while ahead.max() > _STEP:
         band, frame = np.unravel_index(np.argmax(ahead), ahead.shape)
         ahead[band, max(frame - _WINDOW, 0) : frame + _WINDOW] = 0.0
-        change, shares = _change(details[band], valid[band], frame)
+        change, shares, _ = _change(details[band], valid[band], frame)
         first = int(np.argmax(shares))
-        if shares[first] < _AT_ONCE:
-            continue
+        change, _, stays = _change(details[band], valid[band], first)
         # A step of the scene: of the same pixels in another band, or at once in its detail, too.
-        alone = True
-        for other in np.flatnonzero(scores.any(axis=1)):
-            partner, shared = _change(details[other], valid[other], first)
+        scene = shares[first] < _AT_ONCE or stays < _AT_ONCE
+        for other in np.flatnonzero(scores.any(axis=1) & (np.arange(len(scores)) != band)):
+            partner, shared, _ = _change(details[other], valid[other], first)
             at_once = shared[max(first - 1, 0) : first + 2].max() > _ALSO
-            alone &= other == band or not (
-                np.abs(np.mean(np.sign(change) * np.sign(partner))) > _SIGNS
-                or (at_once and scores[other, first] > _BOTH)
-            )
-        steps[band, first] = alone
+            scene |= abs(np.mean(np.sign(change) * np.sign(partner))) > _SIGNS
+            scene |= at_once and scores[other, first] > _BOTH
+        steps[band, first] = not scene
     return steps
 
 
@@ -335,20 +336,23 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
     return scores
 
 
-def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array]:
-    """Change of the detail (pixel) at a frame, from mean to mean; share (time) of each frame in it.
+def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
+    """Change of the detail (pixel) at a frame, from mean to mean of the frames before and after.
 
-    The share is a median of the pixels that change most.
+    And the shares of it that each frame (time) brings, and that remains after as many frames more,
+    medians of the pixels that change most.
     """
-    before = np.flatnonzero(valid[:frame])[-_WINDOW:]
-    after = frame + np.flatnonzero(valid[frame:])[:_WINDOW]
-    shares = np.zeros(len(detail))
+    before, after = np.flatnonzero(valid[:frame])[::-1], frame + np.flatnonzero(valid[frame:])
     if min(before.size, after.size) == 0:
-        return np.zeros(detail.shape[1], dtype=np.float32), shares
-    change = detail[after].mean(axis=0) - detail[before].mean(axis=0)
-    strong = np.abs(change) > np.median(np.abs(change))
-    near = detail[np.concatenate([before, after])][:, strong]
-    shares[np.concatenate([before, after])[1:]] = np.median(
-        np.diff(near, axis=0) / change[strong], axis=1
+        return np.zeros(detail.shape[1], dtype=np.float32), np.zeros(len(detail)), 0.0
+    near, far = (
+        detail[after[part] if after[part].size else after].mean(axis=0)
+        - detail[before[part] if before[part].size else before].mean(axis=0)
+        for part in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
     )
-    return change, shares
+    strong = np.abs(near) > np.median(np.abs(near))
+    frames = np.sort(np.concatenate([before[:_WINDOW], after[:_WINDOW]]))
+    shares = np.zeros(len(detail))
+    jumps = np.diff(detail[frames][:, strong], axis=0)
+    shares[frames[1:]] = np.median(jumps / near[strong], axis=1)
+    return near, shares, float(np.median(far[strong] / near[strong]))
