@@ -164,15 +164,20 @@ def _leave_out(
         for start, stop, places in _runs(film[frames], limit, longest):
             trio, span = frames[places], (frames[start], frames[stop - 1])
             alone = blank[trio[0]] and not blank[trio[1:]].any()
+            if not valid[band, frames[start:stop]].all():
+                continue
             if alone or not _is_shared(parts, valid, band, trio, span):
                 valid[band, frames[start:stop]] = False
-                if uniform[trio[0]] and stop - start >= FEWEST_COPIES:
-                    shutter[frames[start:stop]] = True
-                    # It moves in the frames beside in which a part of the image changes.
-                    for side, far in ((start - 1, start - 2), (stop, stop + 1)):
-                        if 0 <= far < frames.size:
-                            beside = film[frames[[far, side]]]
-                            valid[band, frames[side]] &= _changed(*beside, limit) <= _EDGE
+                if not uniform[trio[0]]:
+                    continue
+                # A shutter moves in the frames beside, in which a part of the image changes.
+                for side, far in ((start - 1, start - 2), (stop, stop + 1)):
+                    if 0 <= far < frames.size:
+                        beside = film[frames[[far, side]]]
+                        valid[band, frames[side]] &= _changed(*beside, limit) <= _EDGE
+                closed = frames[max(start - 1, 0) : stop + 1]
+                closed = closed[~valid[band, closed]]
+                shutter[closed] = closed.size >= FEWEST_COPIES
         if valid[band, frames].all():
             return
 
@@ -185,7 +190,7 @@ def _noise(film: Film) -> float:
 
 
 def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, int, list[int]]]:
-    """Yield first frames, and frames after the last, of runs that neither side predicts.
+    """Yield first frames, and frames after the last, of unpredicted runs, by length.
 
     And the frames that prove it: in the middle, and on both sides. At an end of the capture one
     twice as far away stands for the missing side.
@@ -197,14 +202,12 @@ def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, in
         ends = edges[place + 1 : place + 1 + _ENDS]
         pairs += [(start, stop) for stop in ends if stop - start <= longest]
         pairs += [(start, len(film))] if len(film) - start <= _AT_END else []
-    done = 0
-    for start, stop in pairs:
+    for start, stop in sorted(pairs, key=lambda pair: pair[1] - pair[0]):
         before = start - 1 if start > 0 else 2 * stop
         after = stop if stop < len(film) else 2 * start - stop - 1
         places = [(start + stop - 1) // 2, before, after]
-        if start >= done and max(places) < len(film) and _deviates(film[places], limit):
+        if max(places) < len(film) and _deviates(film[places], limit):
             yield start, stop, places
-            done = stop
 
 
 def _deviates(film: Film, limit: np.float32) -> bool:
