@@ -127,14 +127,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     for band in judged:
         _leave_out(band, films[band], parts, valid, shutter[band], noise[band], longest)
     for band in judged:
-        (frames,) = np.nonzero(valid[band])
-        gain = np.zeros(frames.size)
-        for place, change in _gains(films[band][frames], parts[band][frames]):
-            sides = frames[place - 1 : place + 1][::-1]
-            if not _is_shared(parts, valid, band, sides, (sides[0], sides[1])):
-                gain[place:] += change
-        near = np.abs(gain[:, np.newaxis] - np.unique(gain)) < 0.5 * _GAIN
-        valid[band, frames[~near[:, np.argmax(near.sum(axis=0))]]] = False
+        valid[band] &= _usual_gain(band, films[band], parts, valid)
     steps = ~valid & False
     if judged.size:
         steps[judged] = _steps([films[band] for band in judged], valid[judged], renewals[judged])
@@ -245,7 +238,7 @@ def _is_shared(
     from, `span` the first and last that do, of a step its frame and the one before.
     """
     deviation = parts[band][places[0]] - parts[band][places[1:]].mean(axis=0)
-    if not _is_sudden(parts[band], deviation, span, 0, _COMES):
+    if not _is_sudden(parts[band], deviation, *span, _COMES):
         return True  # the object, or people, who come and go
     for other, part in enumerate(parts):
         for lag in range(-_LAGS, _LAGS + 1) if other != band else ():
@@ -254,45 +247,42 @@ def _is_shared(
                 continue
             partner = part[moved[0]] - part[moved[1:]].mean(axis=0)
             energy = np.linalg.norm(deviation) * np.linalg.norm(partner)
-            if deviation @ partner > _SHARED * energy and _is_sudden(
-                part, partner, span, lag, 0.5 * _COMES
-            ):
+            alike = deviation @ partner > _SHARED * energy
+            if alike and _is_sudden(part, partner, span[0] + lag, span[1] + lag, 0.5 * _COMES):
                 return True
     return False
 
 
-def _is_sudden(
-    part: Array, deviation: Array, span: tuple[int, int], lag: int, share: float
-) -> bool:
+def _is_sudden(part: Array, deviation: Array, first: int, last: int, share: float) -> bool:
     """Return whether a deviation (part) comes with the first frame and goes with the last one."""
     energy = deviation @ deviation
-    first, last = span[0] + lag, span[1] + lag
     if last < first:  # a step, unlike the changes before and after
-        near = [
-            part[place] - part[place - 1]
-            for place in (first - 1, first + 1)
-            if 0 < place < len(part)
-        ]
-        return all(change @ deviation < _RETURN * energy for change in near)
+        near = np.diff(part[max(first - 2, 0) : first + 2], axis=0) @ deviation
+        return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
     comes = first < 1 or (part[first] - part[first - 1]) @ deviation > share * energy
     goes = last + 1 >= len(part) or (part[last] - part[last + 1]) @ deviation > share * energy
     return bool(comes and goes)
 
 
-def _gains(film: Film, parts: Array) -> Iterator[tuple[int, float]]:
-    """Yield frames from which contrast and noise are larger or smaller, and by what logarithm."""
-    change = np.abs(np.diff(parts, axis=0)).mean(axis=1)
+def _usual_gain(band: int, film: Film, parts: list[Array], valid: Mask) -> Mask:
+    """Frames (time) of the gain that most have; with another, contrast and noise differ alike."""
+    (frames,) = np.nonzero(valid[band])
+    film, means, level = film[frames], parts[band][frames], np.zeros(valid.shape[1])
+    change = np.abs(np.diff(means, axis=0)).mean(axis=1)
     large = 1 + np.flatnonzero(change > OUTLIER * np.median(change))
     for place in large[(large >= FEWEST_COPIES) & (large <= len(film) - FEWEST_COPIES)]:
-        sides = film[max(place - _NEAR, 0) : place], film[place : place + _NEAR]
-        noises = [np.median(np.abs(side[1:-1] - 0.5 * (side[:-2] + side[2:]))) for side in sides]
-        scenes = parts[place - 1 : place + 1]
-        if min(*scenes.std(axis=1), *noises) == 0.0:
-            continue
-        gain = float(np.log(scenes[1].std() / scenes[0].std()))
-        like = abs(gain) > _GAIN and 0.5 < np.log(noises[1] / noises[0]) / gain < 1.5
-        if like and np.corrcoef(scenes)[0, 1] > _ALIKE:
-            yield int(place), gain
+        scenes, pair = means[place - 1 : place + 1], frames[[place, place - 1]]
+        noises = [
+            float(np.median(np.abs(np.diff(side, 2, axis=0))))
+            for side in (film[max(place - _NEAR, 0) : place], film[place : place + _NEAR])
+        ]
+        if min(*noises, *scenes.std(axis=1)) > 0.0 and np.corrcoef(scenes)[0, 1] > _ALIKE:
+            gain = float(np.log(scenes[1].std() / scenes[0].std()))
+            like = abs(gain) > _GAIN and 0.5 < np.log(noises[1] / noises[0]) / gain < 1.5
+            if like and not _is_shared(parts, valid, band, pair, (pair[0], pair[1])):
+                level[pair[0] :] += gain
+    near = np.abs(level[:, np.newaxis] - np.unique(level[valid[band]])) < 0.5 * _GAIN
+    return np.asarray(near[:, np.argmax(near[valid[band]].sum(axis=0))])
 
 
 def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
@@ -321,21 +311,17 @@ def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
 
 def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
     """Variance (time) of a step of the pattern at each frame, over that of noise and motion."""
-    scores, pieces = np.zeros(len(detail)), np.cumsum(renewals)
-    for piece in np.unique(pieces):
-        (frames,) = np.nonzero(valid & (pieces == piece))
-        width = min(_WINDOW, len(frames) // 3)
-        if width < _NEAR:
-            continue
-        flat = detail[frames].astype(np.float64)
-        noise = MAD * float(np.median(np.abs(np.diff(flat, axis=0)))) / np.sqrt(2.0)
-        if noise == 0.0:
-            continue
+    scores, (frames,) = np.zeros(len(detail)), np.nonzero(valid)
+    width = min(_WINDOW, len(frames) // 3)
+    flat = detail[frames].astype(np.float64)
+    noise = MAD * float(np.median(np.abs(np.diff(flat, axis=0)))) / np.sqrt(2.0)
+    if noise > 0.0:
         total = np.cumsum(np.pad(flat, ((1, 0), (0, 0))), axis=0)
-        places = np.arange(width, len(frames) - width + 1)
         steps = total[2 * width :] - 2.0 * total[width:-width] + total[: -2 * width]
         ratio = (MAD * np.median(np.abs(steps), axis=1)) ** 2 / (2.0 * width * noise**2)
-        scores[frames[places[:-1]]] = ratio[:-1] / max(1.0, float(np.median(ratio)))
+        scores[frames[width : 1 - width]] = ratio / max(1.0, float(np.median(ratio)))
+    for frame in np.flatnonzero(renewals):  # which has its segment
+        scores[max(frame - width, 0) : frame + width] = 0.0
     return scores
 
 
