@@ -184,7 +184,8 @@ def _events(
 ) -> tuple[xr.Dataset, xr.Dataset, list[str]]:
     """Capture with bad frames without exposure time, its events, and sentences on both."""
     counts, closed = capture["counts"], _closed(capture)
-    stamps = capture.get("exposure_time", xr.zeros_like(counts[:, :, 0, 0], dtype=np.float64))
+    even = counts["time"].astype(np.float64).expand_dims(band=counts["band"])
+    stamps = capture.get("exposure_time", even).assign_attrs(schema.EXPOSURE_TIME.attrs)
     shut = xr.zeros_like(stamps, dtype=bool) if closed is None else closed
     valid = ~repeats & ~shut.values & stamps.notnull().values
     # First frames after the events that are known.
@@ -202,7 +203,10 @@ def _events(
         correct(capture.isel(y=rows), correction.isel(y=rows), maximum=maximum), valid, renewals
     )
     if found.bad.any():
-        capture = capture.assign(exposure_time=stamps.where(~found.bad))
+        # Copies of a bad frame are bad, too.
+        last = np.maximum.accumulate(np.where(repeats, 0, np.arange(counts.sizes["time"])), axis=1)
+        bad = np.take_along_axis(found.bad, last, axis=1)
+        capture = capture.assign(exposure_time=stamps.where(~bad))
     events = events_of(counts, repeats, shut | found.shutter, found.steps)
     return capture, events, found.notes(names)
 
