@@ -137,7 +137,7 @@ def correct_capture(
     # Steps 1 and 2: distinct frames, shutter events, new offsets.
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
-    events, notes, stamped = None, [], capture
+    events, notes, stamped = None, list[str](), capture
     if shutter:
         capture, repeats = distinct(capture)
         stamped, events, notes = _events(capture, repeats, before, maximum)

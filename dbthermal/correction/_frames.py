@@ -118,7 +118,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
         usable = good & np.isfinite(film[frames]).all(axis=0)
         films.append(np.where(usable, film, np.float32(0.0)))
     noise = np.array([_noise(film[frames]) for film, frames in zip(films, valid, strict=True)])
-    judged = np.flatnonzero((valid.sum(axis=1) >= MINIMUM_FRAMES) & (noise > 0.0))
+    judged = np.flatnonzero((valid.sum(axis=1) >= MINIMUM_FRAMES) & (noise > 0.0)).tolist()
     time = counts["time"].values.astype(np.float64)
     longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
     # Runs of bad frames, rarer gains, then steps among the other frames.
@@ -129,7 +129,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     for band in judged:
         valid[band] &= _usual_gain(band, films[band], parts, valid)
     steps = ~valid & False
-    if judged.size:
+    if judged:
         steps[judged] = _steps([films[band] for band in judged], valid[judged], renewals[judged])
     return Findings(before & ~valid, shutter, steps)
 
@@ -166,8 +166,8 @@ def _leave_out(
                 # A shutter moves in the frames beside, in which a part of the image changes.
                 for side, far in ((start - 1, start - 2), (stop, stop + 1)):
                     if 0 <= far < frames.size:
-                        beside = film[frames[[far, side]]]
-                        valid[band, frames[side]] &= _changed(*beside, limit) <= _EDGE
+                        change = _changed(film[frames[far]], film[frames[side]], limit)
+                        valid[band, frames[side]] &= change <= _EDGE
                 closed = frames[max(start - 1, 0) : stop + 1]
                 closed = closed[~valid[band, closed]]
                 shutter[closed] = closed.size >= FEWEST_COPIES
@@ -277,7 +277,9 @@ def _usual_gain(band: int, film: Film, parts: list[Array], valid: Mask) -> Mask:
             continue
         gain = np.log(noises[1] / noises[0])
         contrast = np.log(scenes[1].std() / scenes[0].std())
-        alike = np.corrcoef(scenes)[0, 1] > _ALIKE and 0.5 * contrast**2 < gain * contrast
+        alike = (
+            np.asarray(np.corrcoef(scenes))[0, 1] > _ALIKE and 0.5 * contrast**2 < gain * contrast
+        )
         jump = float(np.median(np.abs(np.diff(film[place] - film[place - 1], axis=1))))
         alike &= min(abs(gain), abs(contrast)) > _GAIN and abs(gain) < 1.5 * abs(contrast)
         renewed = abs(gain) > _GAIN and jump > OUTLIER * max(noises)
@@ -295,7 +297,7 @@ def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
     scores = np.stack(list(map(_scores, details, valid, renewals)))
     steps, ahead = np.zeros(valid.shape, dtype=bool), scores.copy()
     while ahead.max() > _STEP:
-        band, frame = np.unravel_index(np.argmax(ahead), ahead.shape)
+        band, frame = map(int, np.unravel_index(np.argmax(ahead), ahead.shape))
         ahead[band, max(frame - _WINDOW, 0) : frame + _WINDOW] = 0.0
         change, shares, _ = _change(details[band], valid[band], frame)
         first = int(np.argmax(shares))
@@ -322,8 +324,8 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
         steps = total[2 * width :] - 2.0 * total[width:-width] + total[: -2 * width]
         ratio = (MAD * np.median(np.abs(steps), axis=1)) ** 2 / (2.0 * width * noise**2)
         scores[frames[width : 1 - width]] = ratio / max(1.0, float(np.median(ratio)))
-    for frame in np.flatnonzero(renewals):  # which has its segment
-        scores[max(frame - width, 0) : frame + width] = 0.0
+    for place in np.searchsorted(frames, np.flatnonzero(renewals)):  # which have segments
+        scores[frames[max(place - width, 0) : place + width]] = 0.0
     return scores
 
 

@@ -188,11 +188,9 @@ def repeated(raw: xr.Dataset, times: tuple[int, int], later: int = 0) -> xr.Data
     """Streams that show each frame so many times in each band, the second some frames later."""
     counts, frames = raw["counts"].values, 240 * min(times)
     places = [np.arange(frames) // times[0], (np.arange(frames) + later) // times[1]]
-    film = np.stack(
-        [band[np.minimum(place, 239)] for band, place in zip(counts, places, strict=True)]
-    )
-    film = xr.DataArray(film, {"band": BANDS, "time": np.arange(frames) / 30.0}, raw["counts"].dims)
-    return film.assign_attrs(raw["counts"].attrs).to_dataset(name="counts")
+    films = [band[np.minimum(place, 239)] for band, place in zip(counts, places, strict=True)]
+    coords = {"band": BANDS, "time": np.arange(frames) / 30.0}
+    return xr.Dataset({"counts": (raw["counts"].dims, np.stack(films))}, coords)
 
 
 @pytest.mark.parametrize(("times", "later"), [((3, 3), 0), ((3, 3), 1), ((3, 1), 0)])
