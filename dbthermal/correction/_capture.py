@@ -103,9 +103,16 @@ def correct_capture(
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
         measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]; `pattern_std`
-        (band) [count]. Attributes: those of the steps; ``shutter_events``
-        (renewals of the offsets), ``frames_taken_out`` (set to NaN, by band), and
-        ``shutter_closed_frames`` (recorded as closed, by band; -1 without `frame_flags`).
+        (band) [count]. Attributes: those of the steps; ``shutter_events`` (renewals of the
+        offsets), ``frames_taken_out`` (by band, by `mark_shutter`), ``bad_frames`` (by band, which
+        show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
+        `frame_flags`).
+
+    Warns
+    -----
+    UserWarning
+        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
+        changes or is not corrected.
 
     Examples
     --------
@@ -190,23 +197,21 @@ def _events(
     valid = ~repeats & ~shut.values & stamps.notnull().values
     # First frames after the events that are known.
     events = events_of(counts, repeats, closed)
-    renewals, names = (
-        np.zeros(valid.shape, dtype=bool),
-        [str(name) for name in counts["band"].values],
-    )
+    names = [str(name) for name in counts["band"].values]
+    renewals = np.zeros(valid.shape, dtype=bool)
     for event in np.flatnonzero(events["renewed"]):
         after = int(events["first_frame"][event] + events["frames"][event])
         renewals[names.index(str(events["band"].values[event])), after : after + 1] = True
     # What no camera reports, in some rows.
     rows = slice(None, None, row_step(counts))
-    found = unreported(
-        correct(capture.isel(y=rows), correction.isel(y=rows), maximum=maximum), valid, renewals
-    )
+    sample = correct(capture.isel(y=rows), correction.isel(y=rows), maximum=maximum)
+    found = unreported(sample, valid, renewals)
     if found.bad.any():
         # Copies of a bad frame are bad, too.
         last = np.maximum.accumulate(np.where(repeats, 0, np.arange(counts.sizes["time"])), axis=1)
         bad = np.take_along_axis(found.bad, last, axis=1)
         capture = capture.assign(exposure_time=stamps.where(~bad))
+    capture = capture.assign_attrs(bad_frames=found.bad.sum(axis=1).tolist())
     events = events_of(counts, repeats, shut | found.shutter, found.steps)
     return capture, events, found.notes(names)
 

@@ -43,6 +43,7 @@ _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
 _ALIKE: Final = 0.9  # and least correlation of the images before and after
 _NEAR: Final = 10  # frames before and after it whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
+_FEWEST: Final = 256  # pixels from which its variance is known within a sixth
 # Variance of a step of the pattern over that of noise, from which it is one.
 _STEP: Final = 2.5
 # Least share of a step that a single frame brings; this and variance in another band, and mean
@@ -119,6 +120,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
         films.append(np.where(usable, film, np.float32(0.0)))
     noise = np.array([_noise(film[frames]) for film, frames in zip(films, valid, strict=True)])
     judged = np.flatnonzero((valid.sum(axis=1) >= MINIMUM_FRAMES) & (noise > 0.0)).tolist()
+    judged = judged if counts.sizes["x"] > 2 else []  # detail needs neighbours
     time = counts["time"].values.astype(np.float64)
     longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
     # Runs of bad frames, rarer gains, then steps among the other frames.
@@ -319,7 +321,7 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
     width = min(_WINDOW, len(frames) // 3)
     flat = detail[frames].astype(np.float64)
     noise = MAD * float(np.median(np.abs(np.diff(flat, axis=0)))) / np.sqrt(2.0)
-    if noise > 0.0:
+    if noise > 0.0 and width >= _NEAR and flat.shape[1] >= _FEWEST:
         total = np.cumsum(np.pad(flat, ((1, 0), (0, 0))), axis=0)
         steps = total[2 * width :] - 2.0 * total[width:-width] + total[: -2 * width]
         ratio = (MAD * np.median(np.abs(steps), axis=1)) ** 2 / (2.0 * width * noise**2)
