@@ -10,7 +10,7 @@ from dbthermal import _rows, schema
 from dbthermal import _text as texts
 from dbthermal._arrays import Mask
 from dbthermal._warnings import warned
-from dbthermal.correction._frames import row_step, unreported
+from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import distinct, events_of, mark_shutter
@@ -202,9 +202,9 @@ def _events(
     for event in np.flatnonzero(events["renewed"]):
         after = int(events["first_frame"][event] + events["frames"][event])
         renewals[names.index(str(events["band"].values[event])), after : after + 1] = True
-    # What no camera reports, in some rows.
-    rows = slice(None, None, row_step(counts))
-    sample = correct(capture.isel(y=rows), correction.isel(y=rows), maximum=maximum)
+    # What no camera reports, in some pixels.
+    pixels = sampling(counts)
+    sample = correct(capture.isel(pixels), correction.isel(pixels), maximum=maximum)
     found = unreported(sample, valid, renewals)
     if found.bad.any():
         # Copies of a bad frame are bad, too.

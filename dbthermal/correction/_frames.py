@@ -23,7 +23,7 @@ from dbthermal.noise import MAD, MINIMUM_FRAMES
 Film = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.int64]
 
-_PIXELS: Final = 4096  # of a band that are looked at, about
+_PIXELS, _ROWS_AT_LEAST = 16384, 24  # of a band that are looked at, about
 _SAMPLES: Final = 2**24  # of a band, at most: of a long capture fewer pixels
 _PASSES: Final = 4  # bad frames beside bad frames, as of a shutter that moves, are found in turn
 # Share of the pixels that change where a run of bad frames begins and ends; of those that deviate
@@ -87,11 +87,20 @@ class Findings:
         return said
 
 
-def row_step(counts: xr.DataArray) -> int:
-    """Step between the rows of counts (band, time, y, x) that are looked at."""
-    height, width = counts.sizes["y"], counts.sizes["x"]
+def sampling(counts: xr.DataArray) -> dict[str, slice]:
+    """Rows and columns of counts (band, time, y, x) that are looked at.
+
+    Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
+    """
+    shape = counts.sizes["y"], counts.sizes["x"]
     wanted = min(_PIXELS, _SAMPLES // counts.sizes["time"])
-    return max(1, min(height // _BLOCKS[0], -(-height * width // wanted)))
+    step = stride(shape, wanted)
+    rows = -(-shape[0] * shape[1] // wanted)
+    whole = wanted >= _ROWS_AT_LEAST * shape[1] or step == 1
+    return {
+        "y": slice(None, None, rows if whole else step),
+        "x": slice(None, None, 1 if whole else step),
+    }
 
 
 def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
