@@ -270,8 +270,11 @@ def _is_sudden(part: Array, places: Frames, span: Frames, share: float) -> bool:
     if last < first:  # a step, unlike the changes before and after
         near = np.diff(part[max(first - 2, 0) : first + 2], axis=0) @ deviation
         return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
-    comes, goes = part[first] - part[places[1]], part[last] - part[places[2]]
-    return bool(min(comes @ deviation, goes @ deviation) > share * energy)
+    sides, across = part[places[1:]], part[places[2]] - part[places[1]]
+    comes, goes = part[first] - sides[0], part[last] - sides[1]
+    # Nor is it a drift, which an end of the capture would hide.
+    drifts = abs(across @ deviation) > _RETURN * energy
+    return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
 
 
 def _usual_gain(band: int, film: Film, parts: list[Array], valid: Mask) -> Mask:

@@ -169,47 +169,39 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     """Capture without the repetitions of a stream faster than its sensor, and its copies.
 
     A stream repeats if half of the frames are shown twice or more, r times in the median. Of each
-    frame shown m times, m / r are kept, rounded, and at least one: an image that the sensor itself
-    repeats, as behind a closed shutter, stays so (band, time). Frames keep their times; bands whose
-    copies are not simultaneous get an `exposure_time` each, NaN behind their last frame.
+    frame of the slowest sensor shown m times, m / r are kept, rounded, and at least one: an image
+    that the sensor itself repeats, as behind a closed shutter, stays so (band, time). Of the other
+    bands, the frames shown then; where these were exposed before, `exposure_time` says when.
     """
     counts = schema.check(capture, "capture")["counts"]
     repeats, frames = copies(counts), np.arange(counts.sizes["time"])
-    kept, shown = [], []
-    for band in repeats:
-        (starts,) = np.nonzero(~band)
-        number = np.diff(np.append(starts, frames.size))
-        shown.append(max(1, int(np.median(number))))
-        place = frames - np.repeat(starts, number)
-        least = np.repeat(np.maximum(1, np.rint(number / shown[-1])), number)
-        kept.append(np.flatnonzero((place % shown[-1] == 0) & (place < shown[-1] * least)))
-    if max(shown) == 1:
+    first = np.maximum.accumulate(np.where(repeats, 0, frames), axis=1)  # showing of each frame
+    numbers = [np.unique(row, return_counts=True)[1] for row in first]
+    shown = [int(np.median(number)) for number in numbers]
+    slowest = int(np.argmax(shown))
+    if shown[slowest] < 2:
         return capture, repeats
+    # Places within the showings of a frame, of which every r-th is kept.
+    place, least = (
+        frames - first[slowest],
+        np.maximum(1, np.rint(numbers[slowest] / shown[slowest])),
+    )
+    least = np.repeat(least, numbers[slowest]) * shown[slowest]
+    kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
+    first, result = first[:, kept], capture.isel(time=kept)
+    again = np.diff(first, axis=1, prepend=-1) == 0
+    if np.any((first != kept) & ~again):
+        even = capture["time"].astype(np.float64).expand_dims(band=counts["band"])
+        stamps = np.take_along_axis(capture.get("exposure_time", even).values, first, axis=1)
+        stamps = np.where(again, np.nan, stamps)
+        result = result.assign(exposure_time=(("band", "time"), stamps, schema.EXPOSURE_TIME.attrs))
     label = ", ".join(
         f"{number} times in band '{band}'"
         for band, number in zip(counts["band"].values, shown, strict=True)
         if number > 1
     )
     said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
-    longest = max(kept, key=len)
-    # Common copies: a shorter capture.
-    if all(np.array_equal(band, longest) for band in kept):
-        return warned(capture.isel(time=longest), said), repeats[:, longest]
-    # Copies of each band by itself: its distinct frames first, without a time behind the last.
-    if "exposure_time" not in capture:
-        stamps = np.tile(capture["time"].values.astype(np.float64), (len(kept), 1))
-        stamped = ("band", "time"), stamps, schema.EXPOSURE_TIME.attrs
-        capture = capture.assign(exposure_time=stamped)
-    bands, marked = [], np.zeros((len(kept), longest.size), dtype=bool)
-    for index, band in enumerate(kept):
-        place = np.pad(band, (0, longest.size - band.size), mode="edge")
-        part = capture.isel(band=[index], time=place).drop_vars("time")
-        valid = xr.DataArray(np.arange(longest.size) < band.size, dims="time")
-        bands.append(part.assign(exposure_time=part["exposure_time"].where(valid)))
-        marked[index, : band.size] = repeats[index, band]
-    rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
-    result = xr.concat(bands, "band", combine_attrs="override", **rule)
-    return warned(result.assign_coords(time=capture["time"][longest]), said), marked
+    return warned(result, said), again
 
 
 def copies(counts: xr.DataArray) -> Mask:
