@@ -272,8 +272,9 @@ def _is_sudden(part: Array, places: Frames, span: Frames, share: float) -> bool:
         return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
     sides, across = part[places[1:]], part[places[2]] - part[places[1]]
     comes, goes = part[first] - sides[0], part[last] - sides[1]
-    # Nor is it a drift, which an end of the capture would hide.
-    drifts = abs(across @ deviation) > _RETURN * energy
+    # At an end of the capture, with both sides on one: no drift.
+    ends = (places[1] > places[0]) == (places[2] > places[0])
+    drifts = ends and abs(across @ deviation) > _RETURN * energy
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
 
 
