@@ -8,10 +8,13 @@ import xarray as xr
 
 from dbthermal import _rows, schema
 from dbthermal import _text as texts
+from dbthermal._arrays import Mask
+from dbthermal._warnings import warned
+from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._reference import Reference, refer
-from dbthermal.correction._shutter import find_shutter, mark_shutter
+from dbthermal.correction._shutter import distinct, events_of, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
 
@@ -60,9 +63,13 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     """Correct a raw capture: gain, offset, shutter events, lag, bad pixels and drift, in order.
 
     1. `find_shutter` on raw counts, in which a repeated frame is an exact copy; frames recorded as
-       closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added.
+       closed (bit `schema.SHUTTER_CLOSED` of `frame_flags`) are added. Of a stream that repeats
+       each frame, as one faster than its sensor, the distinct frames are kept, with their times.
     2. `renew_offset` and `correct`, while the limits of the detector still hold for each sample.
-    3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN.
+    3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN,
+       and so do frames that neither those before nor those after predict: a shutter that is seen,
+       black, torn or random frames, the rarer of two gains. A segment begins, too, where the fixed
+       pattern of one band changes.
        Pixels whose raw counts heap on one level are saturated, those that repeat their counts for
        longer than noise does are frozen.
     4. `undo_lag`, after 3, because a repeated frame says nothing of the pixel's past.
@@ -82,7 +89,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     flat : DataArray, optional
         Mean raw frames (band, y, x) [count] of a uniform view before the capture, for new offsets.
     shutter : bool
-        False if no camera had a shutter, and no frame was lost.
+        False if no camera had a shutter, and no frame was lost or bad.
     time_constant : float or DataArray, optional
         Thermal time constant of the pixels [s], of all bands or (band); by default no correction.
     bad_pixels : float, optional
@@ -102,9 +109,16 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
         measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]; `pattern_std`
-        (band) [count]. Attributes: those of the steps; ``shutter_events``
-        (renewals of the offsets), ``frames_taken_out`` (set to NaN, by band), and
-        ``shutter_closed_frames`` (recorded as closed, by band; -1 without `frame_flags`).
+        (band) [count]. Attributes: those of the steps; ``shutter_events`` (renewals of the
+        offsets), ``frames_taken_out`` (by band, by `mark_shutter`), ``bad_frames`` (by band, which
+        show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
+        `frame_flags`).
+
+    Warns
+    -----
+    UserWarning
+        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
+        changes or is not corrected.
 
     Examples
     --------
@@ -133,15 +147,18 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     schema.check(correction, "correction")
     if not isinstance(shutter, bool | np.bool_):
         raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
-    closed = _closed(capture)
-    # Steps 1 and 2: shutter events, new offsets.
-    events = find_shutter(capture, closed=closed) if shutter else None
+    # Steps 1 and 2: distinct frames, shutter events, new offsets.
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
+    events, notes, stamped = None, list[str](), capture
+    if shutter:
+        capture, repeats = distinct(capture)
+        stamped, events, notes = _events(capture, repeats, before, maximum)
+    closed = _closed(capture)
 
     def measured(rows: slice) -> xr.Dataset:
         """Correct some rows, in the steps that need no other rows."""
-        corrected = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
+        corrected = correct(stamped.isel(y=rows), before.isel(y=rows), maximum=maximum)
         corrected = _without_damaged(
             corrected if events is None else mark_shutter(corrected, events)
         )
@@ -155,8 +172,10 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         result = undo_drift(result, drift_reference, lazy=lazy)
     if reference is not None:
         result = refer(result, reference, lazy=lazy)
+    if "exposure_time" not in capture:
+        result = result.drop_vars("exposure_time", errors="ignore")
     number = -1 if closed is None else closed.sum("time").values.tolist()
-    return result.assign_attrs(shutter_closed_frames=number)
+    return warned(result.assign_attrs(shutter_closed_frames=number), *notes)
 
 
 def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
@@ -173,6 +192,36 @@ def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.D
     counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
+
+
+def _events(
+    capture: xr.Dataset, repeats: Mask, correction: xr.Dataset, maximum: int
+) -> tuple[xr.Dataset, xr.Dataset, list[str]]:
+    """Capture with bad frames without exposure time, its events, and sentences on both."""
+    counts, closed = capture["counts"], _closed(capture)
+    even = counts["time"].astype(np.float64).expand_dims(band=counts["band"])
+    stamps = capture.get("exposure_time", even).assign_attrs(schema.EXPOSURE_TIME.attrs)
+    shut = xr.zeros_like(stamps, dtype=bool) if closed is None else closed
+    valid = ~repeats & ~shut.values & stamps.notnull().values
+    # First frames after the events that are known.
+    events = events_of(counts, repeats, closed)
+    names = [str(name) for name in counts["band"].values]
+    renewals = np.zeros(valid.shape, dtype=bool)
+    for event in np.flatnonzero(events["renewed"]):
+        after = int(events["first_frame"][event] + events["frames"][event])
+        renewals[names.index(str(events["band"].values[event])), after : after + 1] = True
+    # What no camera reports, in some pixels.
+    pixels = sampling(counts)
+    sample = correct(capture.isel(pixels), correction.isel(pixels), maximum=maximum)
+    found = unreported(sample, valid, renewals)
+    if found.bad.any():
+        # Copies of a bad frame are bad, too.
+        last = np.maximum.accumulate(np.where(repeats, 0, np.arange(counts.sizes["time"])), axis=1)
+        bad = np.take_along_axis(found.bad, last, axis=1)
+        capture = capture.assign(exposure_time=stamps.where(~bad))
+    capture = capture.assign_attrs(bad_frames=found.bad.sum(axis=1).tolist())
+    events = events_of(counts, repeats, shut | found.shutter, found.steps)
+    return capture, events, found.notes(names)
 
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:

@@ -36,7 +36,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
     successive frames, free of drift. Its median over pixels and temperatures is divided by that of
     a chi-square distribution of the degrees of freedom that n differences leave, :math:`2 n^2 /
-    (3 n - 1)`: a median of few frames is else too low (by 33 % for two frames, 5 % for ten).
+    (3 n - 1)`: a median of few frames is else too low (by 33 % for two frames, 5 % for ten). Exact
+    copies of the frame before, as of a stream faster than the sensor, do not count.
 
     Parameters
     ----------
@@ -48,8 +49,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     -------
     Dataset
         Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
-        [count], the standard deviation of one sample. TypeError or ValueError if the movies hold
-        NaN or do not vary.
+        [count], the standard deviation of one sample; attribute ``frames``, the fewest that are no
+        copies. TypeError or ValueError if the movies hold NaN or do not vary.
 
     Examples
     --------
@@ -73,7 +74,11 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     variance = np.empty((*counts.shape[:2], *counts.shape[3:]))
     for place in np.ndindex(*counts.shape[:2]):
         movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
-        variance[place] = 0.5 * np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
+        change = np.diff(movie, axis=0)
+        # The differences of a copy are 0 in every pixel.
+        number = max(1, int(change.any(axis=(1, 2)).sum()))
+        variance[place] = 0.5 * np.square(change).sum(axis=0, dtype=float) / number
+        frames = min(frames, number + 1)
     # Median over pixels and temperatures, over that of the chi-square distribution.
     variance = variance.reshape(len(variance), -1)
     freedom = 2 * (frames - 1) ** 2 / (3 * (frames - 1) - 1)
@@ -246,9 +251,10 @@ def correct(
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), with the
-        bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0) of
-        `schema.Status`, whose counts are kept; `pattern_std` (band) [count] where the correction
-        has its deviations, root mean square over the levels of the capture. Attributes:
+        bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0, in a
+        frame that has an exposure time) of `schema.Status`, whose counts are kept; `pattern_std`
+        (band) [count] where the correction has its deviations, root mean square over the levels of
+        the capture. Attributes:
         ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
         (``gain_offset_...``), and the numbers of marked pixels.
     """
@@ -268,7 +274,11 @@ def correct(
         gain, offset = maps["gain"].values[band], maps["offset"].values[band]
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
-        saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
+        if "exposure_time" in capture:  # a damaged frame saturates no pixel
+            stamped = capture["exposure_time"].values[band] == capture["exposure_time"].values[band]
+            raw = raw if stamped.all() else raw[stamped]
+        saturated |= raw.max(axis=0, initial=0) >= maximum
+        saturated |= raw.min(axis=0, initial=DETECTOR_MAXIMUM) <= 0
     # Flags, pattern and attributes.
     bad = maps["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)

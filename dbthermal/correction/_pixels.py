@@ -28,6 +28,7 @@ _LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
 # Least ratio of the pattern over one pixel to that over two, where detail of a blurred scene has
 # less; and pattern over the noise of a frame from which a warning is given [1].
 _WHITE, _PATTERN = 0.7, 5.0
+_SMOOTH: Final = 1.0 + 0.75**2  # variance of a new pattern with its smooth part, over that without
 _UNCORRECTED: Final = (
     "Fixed pattern of {} times the noise of a frame: the pixels differ from each other as without "
     "a correction of gain and offset, or with an old one. Must be below 5: correct the raw capture "
@@ -54,7 +55,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
 
     Pattern. What the mean picture has beside planes and edges is the fixed pattern p of gains and
     offsets (by the mask of [1]_); 0 where it is less than 0.7 of the same over two pixels, as of
-    detail behind a lens. More than 5 m in every segment give a UserWarning.
+    detail behind a lens. More than 5 m in every segment give a UserWarning. A pattern that came
+    since the calibration is seen so, beyond `pattern_std` and the noise of the mean, in the segment
+    with the least. It is added to `pattern_std`, with a smooth part of 0.75 times its size, as of a
+    lens or housing that warmed: no image tells that from the scene, it is a prior.
 
     TypeError or ValueError if the threshold is not positive, or a band has fewer frames that are
     not NaN than 16, or than 0.4 s and three frames more, or no pixel with 16 samples.
@@ -71,9 +75,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     -------
     Dataset
         The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), the counts unchanged;
-        and the attributes ``noisy_pixels`` and ``jumping_pixels``, their numbers,
-        ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a band, which get
-        no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
+        `pattern_std` (band) [count]; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
+        their numbers, ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a
+        band, which get no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
 
     References
     ----------
@@ -100,6 +104,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
     patterns: list[float] = []
+    stds = np.zeros(counts.sizes["band"])
+    if "pattern_std" in corrected:
+        stds = np.nan_to_num(corrected["pattern_std"].values)
     reach, time = _REACH_FRAMES, counts["time"].values.astype(np.float64)
     if time.size >= MINIMUM_FRAMES:
         reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
@@ -126,7 +133,12 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         usual = np.where(judged, level, np.median(level[judged]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
         noise = float(np.median(usual))  # 0 of counts without noise
-        patterns.append(min(map(_pattern, still)) / noise if noise > 0.0 else 0.0)
+        pattern = list(map(_pattern, still))
+        patterns.append(min(pattern) / noise if noise > 0.0 else 0.0)
+        # Of a mean of n frames, noise^2 / n is no pattern.
+        number = [np.count_nonzero(segment_numbers == segment) for segment in segments]
+        excess = min(np.square(pattern) - noise**2 / np.array(number)) - stds[band] ** 2
+        stds[band] = np.sqrt(stds[band] ** 2 + _SMOOTH * max(excess, 0.0))
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
@@ -137,7 +149,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         if pattern > _PATTERN
     ]
     return warned(
-        corrected.assign(status=(("y", "x"), status, schema.status_attrs())),
+        corrected.assign(
+            status=(("y", "x"), status, schema.status_attrs()),
+            pattern_std=("band", stds, schema.PATTERN_STD.attrs),
+        ),
         *([_UNCORRECTED.format(", ".join(strong))] if strong else []),
     ).assign_attrs(
         noisy_pixels=int(noisy.sum()),

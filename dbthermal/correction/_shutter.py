@@ -14,6 +14,7 @@ import xarray as xr
 from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
+from dbthermal._warnings import warned
 
 Integers = npt.NDArray[np.int64]
 
@@ -68,10 +69,25 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     [21, 5, 2.1, 2.5, True]
     """
     counts = schema.check(corrected, "corrected")["counts"]
+    return events_of(counts, copies(counts), closed)
+
+
+def events_of(
+    counts: xr.DataArray,
+    repeats: Mask,
+    closed: xr.DataArray | None,
+    steps: Mask | None = None,
+) -> xr.Dataset:
+    """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`.
+
+    First frames (band, time) of `steps` of the pattern are events of two frames: the place of a
+    step is uncertain by one.
+    """
     shut = _closed_frames(counts, closed)
-    runs = []
+    places = () if steps is None else np.argwhere(steps)
+    runs = [(str(counts["band"].values[band]), frame - 1, 2, True) for band, frame in places]
     for index, name in enumerate(counts["band"].values):
-        marked = shut[index] | _copies(counts.isel(band=index))
+        marked = shut[index] | repeats[index]
         edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
             renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
@@ -149,6 +165,50 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
     return np.broadcast_to(closed.values, shape)
 
 
+def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
+    """Capture without the repetitions of a stream faster than its sensor, and its copies.
+
+    A stream repeats if half of the frames are shown twice or more, r times in the median. Of each
+    frame of the slowest sensor shown m times, m / r are kept, rounded, and at least one: an image
+    that the sensor itself repeats, as behind a closed shutter, stays so (band, time). Of the other
+    bands, the frames shown then; where these were exposed before, `exposure_time` says when.
+    """
+    counts = schema.check(capture, "capture")["counts"]
+    repeats, frames = copies(counts), np.arange(counts.sizes["time"])
+    first = np.maximum.accumulate(np.where(repeats, 0, frames), axis=1)  # showing of each frame
+    numbers = [np.unique(row, return_counts=True)[1] for row in first]
+    shown = [int(np.median(number)) for number in numbers]
+    slowest = int(np.argmax(shown))
+    if shown[slowest] < 2:
+        return capture, repeats
+    # Places within the showings of a frame, of which every r-th is kept.
+    place, least = (
+        frames - first[slowest],
+        np.maximum(1, np.rint(numbers[slowest] / shown[slowest])),
+    )
+    least = np.repeat(least, numbers[slowest]) * shown[slowest]
+    kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
+    first, result = first[:, kept], capture.isel(time=kept)
+    again = np.diff(first, axis=1, prepend=-1) == 0
+    if np.any((first != kept) & ~again):
+        even = capture["time"].astype(np.float64).expand_dims(band=counts["band"])
+        stamps = np.take_along_axis(capture.get("exposure_time", even).values, first, axis=1)
+        stamps = np.where(again, np.nan, stamps)
+        result = result.assign(exposure_time=(("band", "time"), stamps, schema.EXPOSURE_TIME.attrs))
+    label = ", ".join(
+        f"{number} times in band '{band}'"
+        for band, number in zip(counts["band"].values, shown, strict=True)
+        if number > 1
+    )
+    said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
+    return warned(result, said), again
+
+
+def copies(counts: xr.DataArray) -> Mask:
+    """Frames (band, time) of counts (band, time, y, x) that repeat the frame before."""
+    return np.stack([_copies(band) for band in counts])
+
+
 def _copies(counts: xr.DataArray) -> Mask:
     """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
     step = stride((counts.sizes["y"], counts.sizes["x"]), _SAMPLE)
@@ -160,17 +220,17 @@ def _copies(counts: xr.DataArray) -> Mask:
             f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the "
             f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
         )
-    copies = np.zeros(counts.sizes["time"], dtype=bool)
+    repeats = np.zeros(counts.sizes["time"], dtype=bool)
     # Compare the whole image where the sample of pixels repeats.
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
     if candidates.size:
-        copies[candidates] = True
+        repeats[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
         after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
         for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
             block = counts.isel(time=needed, y=rows).values
-            copies[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
-    return copies
+            repeats[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
+    return repeats
 
 
 def _changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> tuple[Mask, Mask]:
