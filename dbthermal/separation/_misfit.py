@@ -197,7 +197,8 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
         deviations = result["object_temperature_std"].values[:, rows].reshape(len(frames), -1)
         held[divided] = np.nanmean(np.square(deviations[:, divided]), axis=0)
     held = np.bincount(place[pixels], held[pixels], number.size) / filled
-    if np.any(inputs.capture.get("noise_factor", np.ones(1)) < 1.0):  # neighbours share noise
+    factor = inputs.capture.get("noise_factor", np.ones(1))
+    if inputs.displacement is not None or np.any(factor < 1.0):  # neighbours share noise
         jumps = np.diff(rest, 2, axis=0)
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]

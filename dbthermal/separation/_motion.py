@@ -25,6 +25,7 @@ _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the band
 # none has a mean over 250 of more than 1.5.
 _SURE: Final = 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
+_LEAST: Final = 0.06  # motion that matters, root mean square [pixel]; feigned by two depths: 0.05
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
 
 
@@ -72,6 +73,8 @@ def stabilise(
     steps = np.linalg.solve(form + precision, forces[..., np.newaxis]).reshape(-1, count, 2)
     steps = np.swapaxes(steps, 0, 1)[np.argsort(inputs.bands)]
     motion = np.asarray(steps if before is None else steps + before)
+    if np.sqrt(np.mean(motion**2)) < _LEAST:
+        return None
     counts = empty(corrected["counts"].shape, np.float32)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
         for frame, image, step in zip(film, moved, path, strict=True):

@@ -44,6 +44,7 @@ _UNEXPLAINED: Final = (
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
 _ROUNDS, _BETTER = 3, 0.8
+_KEPT: Final = 0.9  # share of the pixels without a flag that bands of one blur must keep
 _NOT_COMPLETED: Final = (
     "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
     f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
@@ -180,15 +181,20 @@ def _mended(
             break
         capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
         outcome = parts, misfit = retry
-    alike = equalise(capture, parts.inputs, parts.result, misfit)
-    if alike is not None:
-        parts, less = once(alike.capture)
-        if less.size < _BETTER * misfit.size:
-            # Noise that is not white is told before: a blur takes rapid noise alone.
-            less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
-            capture, outcome = alike.capture, (parts, less)
-            sentences.append(alike.sentence)
+    alike = equalise(capture, parts.inputs, parts.result)
+    retry = None if alike is None else once(alike.capture)
+    if alike is not None and retry is not None and _measured(retry[0]) > _KEPT * _measured(parts):
+        parts, less = retry
+        # Noise that is not white is told before: a blur takes rapid noise alone.
+        less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
+        capture, outcome = alike.capture, (parts, less)
+        sentences.append(alike.sentence)
     return capture, outcome, sentences
+
+
+def _measured(parts: "_Parts") -> int:
+    """Number of pixels without a flag."""
+    return int(np.count_nonzero(parts.result["status"].values == 0))
 
 
 @dataclass(frozen=True)
