@@ -25,7 +25,7 @@ _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the band
 # none has a mean over 250 of more than 1.5.
 _SURE: Final = 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
-_LEAST: Final = 0.06  # motion that matters, root mean square [pixel]; feigned by two depths: 0.05
+_LEAST: Final = 0.1  # motion that matters, root mean square [pixel]; two depths feign 0.06
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
 
 

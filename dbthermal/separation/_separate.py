@@ -44,6 +44,7 @@ _UNEXPLAINED: Final = (
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
 _ROUNDS, _BETTER = 3, 0.8
+_SMALL: Final = 1.0  # shift that motion of 0.3 pixel feigns, at most [pixel]
 _KEPT: Final = 0.9  # share of the pixels without a flag that bands of one blur must keep
 _NOT_COMPLETED: Final = (
     "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
@@ -173,7 +174,8 @@ def _mended(
     outcome = parts, misfit = once(capture, per_pixel)
     for _ in range(_ROUNDS):
         steady = stabilise(original, parts.inputs, parts.result, misfit, motion)
-        if steady is None and parts.reflection_shift is not None:  # that motion may feign
+        shift = parts.reflection_shift
+        if steady is None and shift is not None and _feigned(shift):
             scope = replace(parts.inputs, displacement=None)
             steady = stabilise(original, scope, parts.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
@@ -190,6 +192,11 @@ def _mended(
         capture, outcome = alike.capture, (parts, less)
         sentences.append(alike.sentence)
     return capture, outcome, sentences
+
+
+def _feigned(shift: xr.Dataset) -> bool:
+    """A shift of the reflections is so small that motion of the cameras may show it."""
+    return bool(np.nanmedian(np.hypot(*shift["shift"].values)) < _SMALL)
 
 
 def _measured(parts: "_Parts") -> int:
