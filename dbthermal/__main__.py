@@ -151,8 +151,8 @@ _VALUES: Final = {
 """Option, or its kind -> names of its values in the help."""
 
 _METHODS: Final = (
-    "subspace (what the default call begins with), calibrated (emissivities as stated), dbvt (the "
-    "paper's optimisation), apparent (temperature as of a black body)"
+    "subspace (what the default call begins with), calibrated (emissivities as stated), "
+    "apparent (temperature as of a black body)"
 )
 _OUTPUTS: Final = {
     "export": "file *.csv, *.tif, *.nc, *.png, *.pdf or *.svg",

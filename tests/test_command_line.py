@@ -555,7 +555,7 @@ calibrate --maker a --gain-std 0.01 0.02 -o x -> gain-std --maker
 calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
-separate aligned.zarr response.zarr --method dbvt --workers 2 -o x -> workers --met
+separate aligned.zarr response.zarr --method apparent --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method calibrated
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc

@@ -33,6 +33,7 @@ from dbthermal import emissivity as emissivities
 from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
 from reproduction import figures as drawings
+from reproduction.methods.dbvt import DbvtSettings
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -123,9 +124,9 @@ SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
     (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
     (separation.CalibratedSettings, {"smooth": "false"}, "smooth 'false' of method"),
-    (separation.DbvtSettings, {"steps": True}, "steps True of method"),
-    (separation.DbvtSettings, {"batch": 2.5}, "whole number"),
-    (separation.DbvtSettings, {"start": None}, "start None of method"),
+    (DbvtSettings, {"steps": True}, "steps True of method"),
+    (DbvtSettings, {"batch": 2.5}, "whole number"),
+    (DbvtSettings, {"start": None}, "start None of method"),
 ]
 CASES: list[tuple[Call, str]] = [
     (lambda: calibration.Bias(air_temperature=22.0), r"air_temperature \[K\] 22.0.*in kelvin"),

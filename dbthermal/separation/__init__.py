@@ -19,14 +19,12 @@ from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
     from dbthermal.separation._calibrated import CalibratedSettings
-    from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._streaming.stream import Stream
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
     "METHODS",
     "CalibratedSettings",
-    "DbvtSettings",
     "Method",
     "Stream",
     "SubspaceSettings",
@@ -44,7 +42,6 @@ __dir__ = __all__.copy
 # These are imported when they are first used: some compile.
 _LATER: Final = {
     "CalibratedSettings": "_calibrated",
-    "DbvtSettings": "_dbvt",
     "Stream": "_streaming.stream",
     "SubspaceSettings": "_subspace.method",
 }

@@ -57,9 +57,8 @@ class Method:
     knows_emissivity, any_bands, pools : bool
         It needs known emissivities, and estimates none; takes more than two bands; its estimates
         hold a `Survey`, and a covariance of the emissivities.
-    whole_image, every_frame, even_times : bool
-        A tile is the whole image; a pixel that lacks a frame of the others is not solved; uneven
-        times are refused.
+    whole_image, every_frame : bool
+        A tile is the whole image; a pixel that lacks a frame of the others is not solved.
     check_clock : callable, optional
         Refuses times that are not of exposure.
     compiled : bool
@@ -75,7 +74,6 @@ class Method:
     knows_emissivity: bool = False
     whole_image: bool = False
     every_frame: bool = False
-    even_times: bool = False
     pools: bool = False
     check_clock: Callable[..., None] | None = None
     any_bands: bool = False

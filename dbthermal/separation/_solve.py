@@ -26,14 +26,13 @@ from dbthermal.separation._tiles import Estimate, Mask, Material, Survey, Whole
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance  # settings of a method from outside
 
-    from dbthermal.separation import CalibratedSettings, DbvtSettings, SubspaceSettings
+    from dbthermal.separation import CalibratedSettings, SubspaceSettings
 
-    Settings: TypeAlias = SubspaceSettings | CalibratedSettings | DbvtSettings | DataclassInstance
+    Settings: TypeAlias = SubspaceSettings | CalibratedSettings | DataclassInstance
 
 _MODULES: Final = {
     "subspace": "_subspace.method",
     "calibrated": "_calibrated",
-    "dbvt": "_dbvt.method",
     "apparent": "_apparent",
 }
 _COVARIANCE: Final = "emissivity_covariance"
@@ -83,9 +82,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         the `noise_factor` (band) of the capture, unless the capture proves 1.4 times as much: then
         the capture's, with a warning. Without `noise` it is estimated from the capture. Attribute
         `noise_source` says which.
-    method : {"subspace", "calibrated", "dbvt", "apparent"} or Method
-        This project's separator; known emissivities; the paper's optimiser; the camera's reading;
-        or the record of an outside method.
+    method : {"subspace", "calibrated", "apparent"} or Method
+        This project's separator; known emissivities; the camera's reading; or the record of an
+        outside method.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
         "apparent" has none.
@@ -105,7 +104,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         From `alignment.reflection_shift`, for two cameras side by side: the reflection that all
         other bands, of the second camera, show at a pixel p is the one that the quietest band shows
         at :math:`p + d(p)`, `shift` (axis, y, x) [pixel]. The result is on the quietest band's
-        grid. For "subspace", "calibrated", "dbvt", and a `Method` that works pixel by pixel.
+        grid. For "subspace", "calibrated", and a `Method` that works pixel by pixel.
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int

@@ -16,9 +16,10 @@ from dbthermal import calibration, separation
 from dbthermal.response import EXACT
 from reproduction import methods
 from reproduction.methods.bcp import BcpSettings
+from reproduction.methods.dbvt import DbvtSettings
 
 _FAST: Final[Mapping[str, Any]] = {
-    "dbvt": separation.DbvtSettings(stages=2, stage_steps=2, steps=4),
+    "dbvt": DbvtSettings(stages=2, stage_steps=2, steps=4),
     "bcp": BcpSettings(patch=3, window=5),
 }
 """Settings of the methods that take long, or whose windows are larger than the images here."""

@@ -34,7 +34,7 @@ def test_the_table_says_what_was_measured() -> None:
     text = benchmark.table("the default call", times(), disk, 0.5)
     assert verify.enclosed(text, benchmark.MARKS, "the default call", "the page") == text
     for line in (
-        "| `dbvt` over `subspace`, a pixel, 2048 over 2048 pixels | 4 |",
+        "| `dbvt` over `subspace`, a pixel, 2048 over 2048 pixels | 8 |",
         "2 processes, over reading and writing alone | 2.0 |",
         "from disk to disk over a camera's 60 a second | 1.00 |",
         "in memory, 2 threads, over a camera's 60 a second | 0.50 |",

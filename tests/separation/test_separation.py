@@ -15,6 +15,7 @@ from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 from reproduction import experiments, methods
+from reproduction.methods.dbvt import DbvtSettings
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0
@@ -619,7 +620,7 @@ def test_order_of_bands_and_tiles_does_not_matter(glass: Case) -> None:
 def test_random_starts_depend_on_the_seed_alone(glass: Case, method: str) -> None:
     """Random starts depend on the seed: the same one repeats the result, another changes it."""
     capture, response = glass[1].isel(time=slice(0, 60)), glass[2]
-    few = separation.DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
+    few = DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
     record = methods.get_method(method)
     first, again, other = (
         separation.solve(capture, response, record, settings=few, seed=seed)["emissivity"]

@@ -17,10 +17,9 @@ import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import simulation
-from dbthermal.separation import DbvtSettings
-from dbthermal.separation._dbvt import objective
-from dbthermal.separation._dbvt.method import Search
 from dbthermal.separation._tiles import Array, Tile
+from reproduction.methods import dbvt_objective as objective
+from reproduction.methods.dbvt import DbvtSettings, Search
 
 INTERVAL: Final = 0.1
 """Interval of the frames [s]."""

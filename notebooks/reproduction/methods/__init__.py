@@ -1,4 +1,4 @@
-"""Methods of separation to compare with: least squares, ratio pyrometry, blackbody channel prior.
+"""Methods to compare with: the paper's optimiser, least squares, pyrometry, channel prior.
 
 `get_method` names these and the methods of `dbthermal.separation` alike; the record that it returns
 is the `method` of `separation.solve`.
@@ -8,9 +8,9 @@ from typing import Final
 
 from dbthermal import separation
 from dbthermal.separation import Method
-from reproduction.methods import bcp, naive, ratio
+from reproduction.methods import bcp, dbvt, naive, ratio
 
-OUTSIDE: Final = {method.name: method for method in (naive.METHOD, ratio.METHOD, bcp.METHOD)}
+OUTSIDE: Final = {module.METHOD.name: module.METHOD for module in (dbvt, naive, ratio, bcp)}
 """Records of the methods here, by name."""
 
 METHODS: Final = (*separation.METHODS, *OUTSIDE)

@@ -7,11 +7,11 @@ from numpy.testing import assert_allclose
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
-from dbthermal.separation import DbvtSettings
-from dbthermal.separation._dbvt import objective
-from dbthermal.separation._dbvt.objective import Scale, Weights
 from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Background, Rig
+from reproduction.methods import dbvt_objective as objective
+from reproduction.methods.dbvt import METHOD, DbvtSettings
+from reproduction.methods.dbvt_objective import Scale, Weights
 
 TIME = np.arange(350) / 10.0
 GLASS = (0.86, 0.72)
@@ -160,7 +160,7 @@ def test_slopes_match_finite_differences(name: str, along: str) -> None:
 def test_random_starts_find_the_emissivities(noise: tuple[float, float], pixels: int) -> None:
     """From random emissivities the median error at low noise is below 0.02, the object's 0.3 K."""
     scene, capture, response = glass(noise, pixels)
-    result = separation.solve(capture, response, "dbvt", seed=3)
+    result = separation.solve(capture, response, METHOD, seed=3)
     of_emissivity, of_object = errors(scene, result)
     print(f"{noise}: emissivity {of_emissivity:.4f}, object {of_object:.3f} K")
     assert of_emissivity < 0.02
@@ -172,9 +172,9 @@ def test_random_starts_find_the_emissivities(noise: tuple[float, float], pixels:
 def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     """Started at the subspace separator it ends no higher, and everywhere with a result."""
     scene, capture, response = glass((0.03, 0.35), 40)
-    random = separation.solve(capture, response, "dbvt", seed=3)
+    random = separation.solve(capture, response, METHOD, seed=3)
     start = DbvtSettings(start="subspace")
-    started = separation.solve(capture, response, "dbvt", settings=start, seed=3)
+    started = separation.solve(capture, response, METHOD, settings=start, seed=3)
     of_random, of_started = errors(scene, random), errors(scene, started)
     print(f"random {of_random}, started {of_started}")
     assert np.all(np.array(of_started) <= 1.1 * np.array(of_random))
@@ -185,7 +185,7 @@ def test_exact_response_is_taken_out() -> None:
     """Taking out the bend of the exact response at least halves the emissivity's error."""
     scene, capture, response = glass(QUIET, 15)
     bent, straight = (
-        errors(scene, separation.solve(capture, response, "dbvt", settings=settings))
+        errors(scene, separation.solve(capture, response, METHOD, settings=settings))
         for settings in (DbvtSettings(bend_updates=0), None)
     )
     assert straight[0] < 0.5 * bent[0]
@@ -194,7 +194,7 @@ def test_exact_response_is_taken_out() -> None:
 def test_too_few_steps_are_flagged() -> None:
     """A pixel that still improves at its last step is flagged as not converged."""
     _, capture, response = glass(QUIET, 8)
-    result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
+    result = separation.solve(capture, response, METHOD, settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
 
 
