@@ -193,7 +193,8 @@ def foreseen(
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
     if sized and (stage := _OUTPUTS.get(options.command)):
-        lengths = {"axis": 2, "other_band": sized[0]["band"], **sized[0]}
+        lengths = {"axis": 2, "cause": len(schema.CAUSES), "other_band": sized[0]["band"]}
+        lengths |= sized[0]
         summary["would_write_bytes_at_most"] = sum(
             math.prod(lengths[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
             for variable in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values()
