@@ -133,12 +133,12 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     time = counts["time"].values.astype(np.float64)
     longest = min(int(_LONGEST / np.median(np.diff(time))), time.size // 4)
     # Runs of bad frames, rarer gains, then steps among the other frames.
-    parts, valid, shutter = [_coarse(film) for film in films], valid.copy(), ~valid & False
+    sections, valid, shutter = [_coarse(film) for film in films], valid.copy(), ~valid & False
     before = valid.copy()
     for band in judged:
-        _leave_out(band, films[band], parts, valid, shutter[band], noise[band], longest)
+        _leave_out(band, films[band], sections, valid, shutter[band], noise[band], longest)
     for band in judged:
-        valid[band] &= _usual_gain(band, films[band], parts, valid)
+        valid[band] &= _usual_gain(band, films[band], sections, valid)
     steps = ~valid & False
     if judged:
         steps[judged] = _steps([films[band] for band in judged], valid[judged], renewals[judged])
@@ -148,7 +148,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
 def _leave_out(
     band: int,
     film: Film,
-    parts: list[Array],
+    sections: list[Array],
     valid: Mask,
     shutter: Mask,
     noise: float,
@@ -157,9 +157,9 @@ def _leave_out(
     """Make bad frames of a band not valid (band, time), and mark those of a shutter (time)."""
     limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
     # Frames without a scene: far less contrast than nearly all have, or random from pixel to pixel.
-    contrast = parts[band].std(axis=1)
+    contrast = sections[band].std(axis=1)
     scene = float(np.quantile(contrast[valid[band]], _FEW))
-    grain = noise * np.sqrt(parts[band].shape[1] / film[0].size)
+    grain = noise * np.sqrt(sections[band].shape[1] / film[0].size)
     uniform = (contrast < _UNIFORM * scene) & (scene > OUTLIER * grain)
     rough = np.abs(np.diff(film, axis=2)).mean(axis=(1, 2))
     random = rough > _RANDOM * np.median(rough[valid[band]])
@@ -170,7 +170,7 @@ def _leave_out(
             alone = any(kind[trio[0]] > kind[trio[1:]].max() for kind in (uniform, random))
             if not valid[band, frames[start:stop]].all():
                 continue
-            if alone or not _is_shared(parts, valid, band, trio, span):
+            if alone or not _is_shared(sections, valid, band, trio, span):
                 valid[band, frames[start:stop]] = False
                 if not uniform[trio[0]]:
                     continue
@@ -225,8 +225,8 @@ def _deviates(film: Film, limit: np.float32) -> bool:
 def _coarse(film: Film) -> Array:
     """Means (time, part) over parts of the image of a film (time, y, x)."""
     rows, columns = (
-        np.unique(np.linspace(0, size, parts, endpoint=False).astype(int))
-        for size, parts in zip(film.shape[1:], _BLOCKS, strict=True)
+        np.unique(np.linspace(0, size, sections, endpoint=False).astype(int))
+        for size, sections in zip(film.shape[1:], _BLOCKS, strict=True)
     )
     sums, area = (
         np.add.reduceat(np.add.reduceat(values, rows, axis=-2), columns, axis=-1)
@@ -240,48 +240,48 @@ def _changed(before: Film, after: Film, limit: np.float32) -> float:
     return float(np.mean(np.abs(after - before) > limit))
 
 
-def _is_shared(parts: list[Array], valid: Mask, band: int, places: Frames, span: Frames) -> bool:
+def _is_shared(sections: list[Array], valid: Mask, band: int, places: Frames, span: Frames) -> bool:
     """Return whether another band deviates alike, a few frames earlier or later, and as suddenly.
 
     Of the means of parts of the image (time, part); `places` are a frame and those that it deviates
     from, `span` the first and last that do, of a step its frame and the one before.
     """
-    if not _is_sudden(parts[band], places, span, _COMES):
+    if not _is_sudden(sections[band], places, span, _COMES):
         return True  # the object, or people, who come and go
-    deviation = parts[band][places[0]] - parts[band][places[1:]].mean(axis=0)
-    for other, part in enumerate(parts):
-        for lag in range(-_LAGS, _LAGS + 1) if other != band else ():
+    deviation = sections[band][places[0]] - sections[band][places[1:]].mean(axis=0)
+    for second, section in enumerate(sections):
+        for lag in range(-_LAGS, _LAGS + 1) if second != band else ():
             moved = np.append(places, span) + lag
-            if moved.min() < 0 or moved.max() >= len(part) or not valid[other, moved].all():
+            if moved.min() < 0 or moved.max() >= len(section) or not valid[second, moved].all():
                 continue
-            partner = part[moved[0]] - part[moved[1:-2]].mean(axis=0)
+            partner = section[moved[0]] - section[moved[1:-2]].mean(axis=0)
             energy = np.linalg.norm(deviation) * np.linalg.norm(partner)
             alike = deviation @ partner > _SHARED * energy
-            if alike and _is_sudden(part, moved[:-2], moved[-2:], 0.5 * _COMES):
+            if alike and _is_sudden(section, moved[:-2], moved[-2:], 0.5 * _COMES):
                 return True
     return False
 
 
-def _is_sudden(part: Array, places: Frames, span: Frames, share: float) -> bool:
+def _is_sudden(section: Array, places: Frames, span: Frames, share: float) -> bool:
     """Return whether a deviation comes with the first frame and goes with the last one."""
     first, last = span
-    deviation = part[places[0]] - part[places[1:]].mean(axis=0)
+    deviation = section[places[0]] - section[places[1:]].mean(axis=0)
     energy = deviation @ deviation
     if last < first:  # a step, unlike the changes before and after
-        near = np.diff(part[max(first - 2, 0) : first + 2], axis=0) @ deviation
+        near = np.diff(section[max(first - 2, 0) : first + 2], axis=0) @ deviation
         return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
-    sides, across = part[places[1:]], part[places[2]] - part[places[1]]
-    comes, goes = part[first] - sides[0], part[last] - sides[1]
+    sides, across = section[places[1:]], section[places[2]] - section[places[1]]
+    comes, goes = section[first] - sides[0], section[last] - sides[1]
     # At an end of the capture, with both sides on one: no drift.
     ends = (places[1] > places[0]) == (places[2] > places[0])
     drifts = ends and abs(across @ deviation) > _RETURN * energy
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
 
 
-def _usual_gain(band: int, film: Film, parts: list[Array], valid: Mask) -> Mask:
+def _usual_gain(band: int, film: Film, sections: list[Array], valid: Mask) -> Mask:
     """Frames (time) of the gain that most have, by noise with contrast, or with the pattern."""
     (frames,) = np.nonzero(valid[band])
-    film, means, level = film[frames], parts[band][frames], np.zeros(valid.shape[1])
+    film, means, level = film[frames], sections[band][frames], np.zeros(valid.shape[1])
     change = np.abs(np.diff(means, axis=0)).mean(axis=1)
     large = 1 + np.flatnonzero(change > OUTLIER * np.median(change))
     for place in large[(large >= FEWEST_COPIES) & (large <= len(film) - FEWEST_COPIES)]:
@@ -298,7 +298,7 @@ def _usual_gain(band: int, film: Film, parts: list[Array], valid: Mask) -> Mask:
         jump = float(np.median(np.abs(np.diff(film[place] - film[place - 1], axis=1))))
         alike &= min(abs(gain), abs(contrast)) > _GAIN and abs(gain) < 1.5 * abs(contrast)
         renewed = abs(gain) > _GAIN and jump > OUTLIER * max(noises)
-        if (alike or renewed) and not _is_shared(parts, valid, band, pair, pair):
+        if (alike or renewed) and not _is_shared(sections, valid, band, pair, pair):
             level[pair[0] :] += gain
     near = np.abs(level[:, np.newaxis] - np.unique(level[valid[band]])) < 0.5 * _GAIN
     return np.asarray(near[:, np.argmax(near[valid[band]].sum(axis=0))])
@@ -319,11 +319,11 @@ def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
         change, _, stays = _change(details[band], valid[band], first)
         # A step of the scene: of the same pixels in another band, or at once in its detail, too.
         scene = shares[first] < _AT_ONCE or stays < _AT_ONCE
-        for other in np.flatnonzero(scores.any(axis=1) & (np.arange(len(scores)) != band)):
-            partner, shared, _ = _change(details[other], valid[other], first)
+        for second in np.flatnonzero(scores.any(axis=1) & (np.arange(len(scores)) != band)):
+            partner, shared, _ = _change(details[second], valid[second], first)
             at_once = shared[max(first - 1, 0) : first + 2].max() > _ALSO
             scene |= abs(np.mean(np.sign(change) * np.sign(partner))) > _SIGNS
-            scene |= at_once and scores[other, first] > _BOTH
+            scene |= at_once and scores[second, first] > _BOTH
         steps[band, first] = not scene
     return steps
 
@@ -354,9 +354,9 @@ def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
     if min(before.size, after.size) == 0:
         return np.zeros(detail.shape[1], dtype=np.float32), np.zeros(len(detail)), 0.0
     near, far = (
-        detail[after[part] if after[part].size else after].mean(axis=0)
-        - detail[before[part] if before[part].size else before].mean(axis=0)
-        for part in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
+        detail[after[section] if after[section].size else after].mean(axis=0)
+        - detail[before[section] if before[section].size else before].mean(axis=0)
+        for section in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
     )
     strong = np.abs(near) > np.median(np.abs(near))
     frames = np.sort(np.concatenate([before[:_WINDOW], after[:_WINDOW]]))

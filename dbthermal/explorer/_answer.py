@@ -46,13 +46,13 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     # Temperatures of measured pixels, or of all where none is.
     limits = ((height, _ROWS), (result.sizes["time"], _TIMES))
     rows, times = (slice(0, None, -(-size // most)) for size, most in limits)
-    part = result.isel(time=times, y=rows)
-    film = part["object_temperature"].values
+    section = result.isel(time=times, y=rows)
+    film = section["object_temperature"].values
     valid = np.isfinite(film) & (measured[rows] if measured[rows].any() else True)
     sentences = list[str]()
     if valid.any():
         low, high = np.percentile(film[valid], _RANGE) - zero_Celsius
-        deviations = _deviations(part, valid)
+        deviations = _deviations(section, valid)
         numbers |= {"object_temperature_degC": [float(low), float(high)]}
         numbers |= {"object_temperature_std_K": deviations}
         bars = " and ".join(f"+- {value:.2g} K ({cause})" for cause, value in deviations.items())
@@ -62,8 +62,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     else:
         sentences.append("No object temperature at any pixel.")
     # Shares of the pixels.
-    rest = f"completed from what else is known: {completed.mean():.0%}"
-    sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {rest}.")
+    remainder = f"completed from what else is known: {completed.mean():.0%}"
+    sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:
@@ -81,13 +81,13 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     return sentences + [f"Watch out: {doubt}" for doubt in dict.fromkeys(doubts)], numbers
 
 
-def _deviations(part: xr.Dataset, valid: Mask) -> dict[str, float]:
+def _deviations(section: xr.Dataset, valid: Mask) -> dict[str, float]:
     """Typical deviation of the object temperature [K]: noise, and calibration if it is known."""
-    if "object_temperature_std" not in part:
+    if "object_temperature_std" not in section:
         return {}
-    squares = {"noise": part["object_temperature_std"] ** 2}
-    if "uncertainty" in part:  # by cause, of each pixel
-        causes = part["uncertainty"] ** 2
+    squares = {"noise": section["object_temperature_std"] ** 2}
+    if "uncertainty" in section:  # by cause, of each pixel
+        causes = section["uncertainty"] ** 2
         by_noise = causes["cause"].isin(_NOISE)
         squares = {"noise": causes.where(by_noise).sum("cause", min_count=1)}
         squares["calibration"] = causes.where(~by_noise).sum("cause", min_count=1)

@@ -35,6 +35,7 @@ _BORDER, _ALIKE, _MOSTLY = 7, 1.05, 0.2
 # Blur of both bands [pixel^2], against noise: it leaves their difference as it is.
 _COMMON: Final = 2.0
 _BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
+_FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
 _NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
 _MOVING: Final = 1.0  # variance of the changes over that of noise
@@ -131,6 +132,8 @@ def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
 def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
     excess, every = 0.0, inputs.blocks
+    if result.sizes["x"] < _FEWEST or every[0].stop < _FEWEST:
+        return 0.0
     hint = _equations(inputs, result, place, excess, every[len(every) // 2])
     if hint[0] ** 2 < _HINT**2 * hint[2]:
         return 0.0
@@ -177,7 +180,7 @@ def _equations(
         np.stack([_details(image, blur) for image in films[order].reshape(-1, *shape)])
         for order, blur in zip((0, place), blurs, strict=True)
     )
-    rest, reflection = rapid(second / ratio - first), rapid(first)
+    remainder, reflection = rapid(second / ratio - first), rapid(first)
     curvature = rapid(laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
     rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
@@ -186,24 +189,24 @@ def _equations(
     )
     bent = laplace(noise, axes=(1, 2))
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
-    own, mixed, bending = (
+    level, mixed, bending = (
         free * levels[0] * np.mean((a * b)[:, inner])
         for a, b in ((noise, noise), (noise, bent), (bent, bent))
     )
     products = (
-        np.sum(rest * reflection, axis=0) + own,
-        np.sum(rest * curvature, axis=0) + mixed,
-        np.sum(reflection**2, axis=0) - own,
+        np.sum(remainder * reflection, axis=0) + level,
+        np.sum(remainder * curvature, axis=0) + mixed,
+        np.sum(reflection**2, axis=0) - level,
         np.sum(reflection * curvature, axis=0) - mixed,
         np.sum(curvature**2, axis=0) - bending,
     )
     # The error of the ratio, of a neighbourhood, is eliminated.
-    around = [
+    local = [
         uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
-        for values in (*products, np.full(shape, _MOVING * own))
+        for values in (*products, np.full(shape, _MOVING * level))
     ]
-    used &= around[2] > around[5]
-    share = quotient(around[3], around[2], 0.0)
+    used &= local[2] > local[5]
+    share = quotient(local[3], local[2], 0.0)
     forces, form = products[1] - share * products[0], products[4] - share * products[3]
     noisy = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
     variance = (noisy + levels[0]) * (form + bending)

@@ -74,8 +74,8 @@ def without_calibration(result: xr.Dataset) -> xr.Dataset:
     """
     alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
     for name in (name for name, budget in BUDGETS.items() if budget in result):
-        parts = result[BUDGETS[name]].sel(cause=[*CALIBRATION]).values
-        variance, std = (parts.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
+        deviations = result[BUDGETS[name]].sel(cause=[*CALIBRATION]).values
+        variance, std = (deviations.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
         values = empty(std.shape, std.dtype)
         for place, image in enumerate(std.values):
             less = variance if variance.ndim == 2 else variance[place]
@@ -106,7 +106,7 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     colour[reference] = 0.0
     by_colour = contrast * _combined(weights, colour)
     for place, (name, film) in enumerate(zip(_FILMS, films, strict=True)):
-        parts = {
+        deviations = {
             "ratio": by_ratio[place],
             "pattern": _combined(weights, accuracy.pattern)[place],
             "offset": _combined(weights, accuracy.offset)[place],
@@ -116,21 +116,22 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
             "colour": by_colour[place],
         }
         std = cut[f"{name}_std"].values
-        _enter(cut[BUDGETS[name]].values, parts, std, _rms(std))
+        _enter(cut[BUDGETS[name]].values, deviations, std, _rms(std))
     slope = np.where(single, 0.0, _combined(weights[1] - weights[0], accuracy.gain))
     stds = cut["emissivity_std"].values
-    parts = {"gain": np.abs(value * (1.0 - value)) * slope}
-    _enter(cut[BUDGETS["emissivity"]].values, parts, stds[np.newaxis], stds.astype(np.float64))
+    deviations = {"gain": np.abs(value * (1.0 - value)) * slope}
+    _enter(cut[BUDGETS["emissivity"]].values, deviations, stds[np.newaxis], stds.astype(np.float64))
 
 
-def _enter(budget: Array, parts: dict[str, Array], stds: Array, total: Array) -> None:
+def _enter(budget: Array, deviations: dict[str, Array], stds: Array, total: Array) -> None:
     """Enter parts into a budget (cause, ...), and the calibration's into the deviations, in place.
 
     Of the statistical deviation, whose root mean square is `total`, what no ratio explains is
     noise. A part without a value, as where there is no temperature, is left out.
     """
     values = dict.fromkeys(CAUSES, np.zeros(total.shape)) | {
-        name: np.where(np.isfinite(part), part, 0.0) for name, part in parts.items()
+        name: np.where(np.isfinite(deviation), deviation, 0.0)
+        for name, deviation in deviations.items()
     }
     values["ratio"] = np.minimum(values["ratio"], np.where(np.isfinite(total), total, 0.0))
     values["noise"] = np.sqrt(total**2 - values["ratio"] ** 2)
@@ -151,11 +152,11 @@ def _weights(value: Array, noise: Array, single: Any, reference: int) -> Array:
     xx, xy, yy = ((inverse * a * b).sum(axis=0) for a, b in pairs)
     single = single | ~(xx * yy - xy**2 > _SINGULAR * xx * yy)
     divisor = np.where(single, 1.0, xx * yy - xy**2)
-    both = np.stack([value * yy - cold * xy, cold * xx - value * xy]) * inverse / divisor
-    alone = np.zeros_like(both)
+    solution = np.stack([value * yy - cold * xy, cold * xx - value * xy]) * inverse / divisor
+    alone = np.zeros_like(solution)
     alone[0, reference] = 1.0 / np.where(value[reference] > 0.0, value[reference], 1.0)
     alone[1, reference] = 1.0
-    return np.where(single, alone, both)
+    return np.where(single, alone, solution)
 
 
 def _combined(weights: Array, stds: Array) -> Array:

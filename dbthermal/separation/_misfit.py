@@ -79,9 +79,12 @@ _NAMES: Final = tuple(field.name for field in fields(_Blocks))
 def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
     """What a result leaves in the bands of its pixels without a flag, in one reading."""
     with ThreadPoolExecutor(workers) as threads:
-        parts = list(threads.map(partial(_of_rows, inputs, result), inputs.blocks))
+        sections = list(threads.map(partial(_of_rows, inputs, result), inputs.blocks))
     blocks = _Blocks(
-        *(np.concatenate([getattr(part, name) for part in parts], axis=-2) for name in _NAMES)
+        *(
+            np.concatenate([getattr(section, name) for section in sections], axis=-2)
+            for name in _NAMES
+        )
     )
     # Place of each pixel's block.
     sizes = np.array([rows.stop - rows.start for rows in inputs.blocks])
@@ -93,7 +96,7 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
     return Misfit(_leak(blocks)[place], _change(blocks)[place], _single(blocks)[place])
 
 
-def _around(blocks: _Blocks, values: Array) -> Array:
+def _local_mean(blocks: _Blocks, values: Array) -> Array:
     """Mean (..., row, column) over the pixels of the blocks around each."""
     size = (1,) * (values.ndim - 2) + (_AROUND, _AROUND)
     weight = uniform_filter(blocks.pixels, _AROUND, mode="constant")
@@ -103,14 +106,14 @@ def _around(blocks: _Blocks, values: Array) -> Array:
 
 def _number(blocks: _Blocks) -> Array:
     """Blocks (row, column) around each that tell something."""
-    told = (blocks.pixels > 0).astype(np.float64)
-    around: Array = uniform_filter(told, _AROUND, mode="constant") * _AROUND**2
-    return np.maximum(around, 1.0)
+    counted = (blocks.pixels > 0).astype(np.float64)
+    number: Array = uniform_filter(counted, _AROUND, mode="constant") * _AROUND**2
+    return np.maximum(number, 1.0)
 
 
 def _change(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by changes that no reflection explains."""
-    variance, noise = _around(blocks, blocks.rough)
+    variance, noise = _local_mean(blocks, blocks.rough)
     freedom = _number(blocks) * HIGHEST_ORDER
     more = variance - noise
     return np.sqrt(np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0))
@@ -118,7 +121,7 @@ def _change(blocks: _Blocks) -> Array:
 
 def _single(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by noise of single pixels, as 1/f noise, alike in all octaves."""
-    variance, noise = _around(blocks, blocks.single)
+    variance, noise = _local_mean(blocks, blocks.single)
     more = variance - noise
     return np.sqrt(np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0))
 
@@ -126,9 +129,9 @@ def _single(blocks: _Blocks) -> Array:
 def _leak(blocks: _Blocks) -> Array:
     """Deviation (row, column) of the share of the reflection that is left, over the events."""
     (cross, energy), (remainder, reflection, _) = (
-        _around(blocks, values) for values in (blocks.products, blocks.noise)
+        _local_mean(blocks, values) for values in (blocks.products, blocks.noise)
     )
-    freedom = _around(blocks, blocks.freedom)
+    freedom = _local_mean(blocks, blocks.freedom)
     strong = energy > _MOVING * freedom * reflection
     energy = np.where(strong, energy, 0.0)
     share = quotient(cross, energy, 0.0)
@@ -168,8 +171,8 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     )
     center, half, curve = _object_signal(inputs, film, weights * emissivity, pixels)
     span, event = _spans(frames)
-    rest, reflection = np.zeros((2, len(film), number.size))
-    _average(signals, film, weights, center, half, curve, place, rest, reflection)
+    remainder, reflection = np.zeros((2, len(film), number.size))
+    _average(signals, film, weights, center, half, curve, place, remainder, reflection)
     # Noise of single pixels: neighbours have the object's rapid changes in common.
     middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
@@ -178,16 +181,18 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     if "segment" in inputs.capture:
         segment = inputs.capture["segment"].values[frames].astype(np.intp)
     squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
-    single: Array = np.stack([np.bincount(place[middle], part, number.size) for part in squares])
+    single: Array = np.stack(
+        [np.bincount(place[middle], section, number.size) for section in squares]
+    )
     single = single / np.maximum(np.bincount(place[middle], minlength=number.size), 1.0)
     release()
     filled = np.maximum(number, 1.0)
-    summed = [np.bincount(place[pixels], part[pixels], number.size) for part in noise]
+    summed = [np.bincount(place[pixels], section[pixels], number.size) for section in noise]
     noise = np.stack(summed) / filled**2
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    rest, reflection = (
-        film - basis @ (basis.T @ film) for film in (rest / filled, reflection / filled)
+    remainder, reflection = (
+        film - basis @ (basis.T @ film) for film in (remainder / filled, reflection / filled)
     )
     # Pieces of time leave changes that the deviations of their pixels hold.
     held = np.zeros(place.size)
@@ -199,7 +204,7 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     held = np.bincount(place[pixels], held[pixels], number.size) / filled
     factor = inputs.capture.get("noise_factor", np.ones(1))
     if inputs.displacement is not None or np.any(factor < 1.0):  # neighbours share noise
-        jumps = np.diff(rest, 2, axis=0)
+        jumps = np.diff(remainder, 2, axis=0)
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
@@ -208,9 +213,9 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     averages: tuple[Array, ...] = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
         noise,
-        np.stack([np.mean((means @ rest) ** 2, axis=0), leverage * noise[0] + held]),
+        np.stack([np.mean((means @ remainder) ** 2, axis=0), leverage * noise[0] + held]),
         single,
-        np.stack([events @ (rest * reflection), events @ reflection**2])
+        np.stack([events @ (remainder * reflection), events @ reflection**2])
         - freedom * noise[2:0:-1, np.newaxis],
         freedom,
     )
@@ -252,12 +257,12 @@ def reflected(
     signals, frames, pixels, gain = read(inputs, result, rows)
     film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
     pixels &= (result["status"].values[rows].ravel() == 0) & np.isfinite(film).all(axis=0)
-    beside = signals.copy()
+    reflections = signals.copy()
     for order, band in enumerate(inputs.bands):
         curve, emissivity = inputs.curves[band], result["emissivity"].values[band, rows].ravel()
         emitted = emissivity[pixels] * (curve.signal(film[:, pixels]) - curve.reference)
-        beside[order][:, pixels] -= emitted
-    return signals, beside, frames, pixels, gain
+        reflections[order][:, pixels] -= emitted
+    return signals, reflections, frames, pixels, gain
 
 
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
@@ -331,7 +336,7 @@ def _average(  # noqa: PLR0913, PLR0917 - a loop over arrays
     half: Array,
     curve: Array,
     place: Whole,
-    rest: Array,
+    remainder: Array,
     reflection: Array,
 ) -> None:
     """Add up what is left beside the object, and the reflection, by block, in place."""
@@ -343,7 +348,7 @@ def _average(  # noqa: PLR0913, PLR0917 - a loop over arrays
                 value = -(curve[0, p] + x * (curve[1, p] + x * (curve[2, p] + x * curve[3, p])))
                 for m in range(len(signals)):
                     value += weights[m, p] * signals[m, t, p]
-                rest[t, b] += value
+                remainder[t, b] += value
                 reflection[t, b] += signals[0, t, p]
 
 

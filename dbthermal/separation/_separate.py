@@ -135,28 +135,28 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
     def once(capture: xr.Dataset, per_pixel: xr.Dataset | None = None) -> tuple[_Parts, Misfit]:
         scope = check(capture, response, inputs.method, settings=settings)
-        parts = _separated(
+        measured = _separated(
             capture, scope, reflection_shift, materials, per_pixel, workers, progress
         )
-        return parts, misfits.measure(parts.inputs, parts.result, workers)
+        return measured, misfits.measure(measured.inputs, measured.result, workers)
 
     # Separate, and widen the bars by what is left.
-    corrected, (parts, misfit), mended = _mended(corrected, once, alone)
-    result, materials = parts.result, parts.materials
+    corrected, (measured, misfit), mended = _mended(corrected, once, alone)
+    result, materials = measured.result, measured.materials
     if result is alone:  # which is the caller's
         result = result.copy(deep=True)
-    misfits.widen(parts.inputs, result, misfit)
+    misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
-    context = replace(context, materials=materials, reflection_shift=parts.reflection_shift)
-    doubts = parts.doubts + mended
+    context = replace(context, materials=materials, reflection_shift=measured.reflection_shift)
+    doubts = measured.doubts + mended
     if completable:
         result = filled(result, corrected, response, context, workers)
     else:
         doubts.append(_NOT_COMPLETED.format(names))
-        result = budget.added(result, parts.inputs)
+        result = budget.added(result, measured.inputs)
     if materials is not None:
         result["material"] = materials
-    source = "none" if parts.reflection_shift is None else "found"
+    source = "none" if measured.reflection_shift is None else "found"
     source = source if reflection_shift is None else "given"
     return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
 
@@ -171,25 +171,29 @@ def _mended(
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
     capture, motion, sentences = original, None, []
-    outcome = parts, misfit = once(capture, per_pixel)
+    outcome = measured, misfit = once(capture, per_pixel)
     for _ in range(_ROUNDS):
-        steady = stabilise(original, parts.inputs, parts.result, misfit, motion)
-        shift = parts.reflection_shift
+        steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
+        shift = measured.reflection_shift
         if steady is None and shift is not None and _feigned(shift):
-            scope = replace(parts.inputs, displacement=None)
-            steady = stabilise(original, scope, parts.result, misfit, motion)
+            scope = replace(measured.inputs, displacement=None)
+            steady = stabilise(original, scope, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
         if steady is None or retry is None or retry[1].size > _BETTER * misfit.size:
             break
         capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
-        outcome = parts, misfit = retry
-    alike = equalise(capture, parts.inputs, parts.result)
+        outcome = measured, misfit = retry
+    alike = equalise(capture, measured.inputs, measured.result)
     retry = None if alike is None else once(alike.capture)
-    if alike is not None and retry is not None and _measured(retry[0]) > _KEPT * _measured(parts):
-        parts, less = retry
+    if (
+        alike is not None
+        and retry is not None
+        and _measured(retry[0]) > _KEPT * _measured(measured)
+    ):
+        measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
         less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
-        capture, outcome = alike.capture, (parts, less)
+        capture, outcome = alike.capture, (measured, less)
         sentences.append(alike.sentence)
     return capture, outcome, sentences
 
@@ -199,9 +203,9 @@ def _feigned(shift: xr.Dataset) -> bool:
     return bool(np.nanmedian(np.hypot(*shift["shift"].values)) < _SMALL)
 
 
-def _measured(parts: "_Parts") -> int:
+def _measured(measured: "_Parts") -> int:
     """Number of pixels without a flag."""
-    return int(np.count_nonzero(parts.result["status"].values == 0))
+    return int(np.count_nonzero(measured.result["status"].values == 0))
 
 
 @dataclass(frozen=True)
