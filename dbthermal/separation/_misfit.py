@@ -115,14 +115,14 @@ def _change(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by changes that no reflection explains."""
     variance, noise = _local_mean(blocks, blocks.rough)
     freedom = _number(blocks) * HIGHEST_ORDER
-    more = variance - noise
+    more = np.maximum(variance - noise, 0.0)
     return np.sqrt(np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0))
 
 
 def _single(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by noise of single pixels, as 1/f noise, alike in all octaves."""
     variance, noise = _local_mean(blocks, blocks.single)
-    more = variance - noise
+    more = np.maximum(variance - noise, 0.0)
     return np.sqrt(np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0))
 
 

@@ -73,7 +73,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     Each pixel alone (`solve`); where the bands show rapid changes displaced all over the image,
     with the shift between the cameras' reflections (`alignment.reflection_shift`); then with the
     pixels of each material pooled (`materials`), held to what they tell alone; last, what is still
-    unknown is completed (`complete`).
+    unknown is completed (`complete`). Before that, what the model leaves in the bands widens the
+    deviations; if the cameras shake, or the bands are not equally sharp, that is mended first.
 
     Parameters
     ----------
