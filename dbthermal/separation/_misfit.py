@@ -412,7 +412,9 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
         leak, change, share = (
             values[row, columns] for values in (misfit.leak, everything, emissivity)
         )
-        slope = curve.slope(chosen[0].mean(axis=0))
+        counted = np.isfinite(chosen[0]).sum(axis=0)
+        mean = quotient(np.nansum(chosen[0], axis=0), counted, curve.reference)
+        slope = curve.slope(mean)
         contrast = (1.0 - share) * (chosen[0] - chosen[2])
         added = np.hypot(leak * contrast, change / slope)
         films[1][:, row, columns] = np.hypot(chosen[1], added)

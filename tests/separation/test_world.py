@@ -58,3 +58,14 @@ def test_intervals_hold(name: str, seed: int) -> None:
     assert any(sentence in line for line in said) or not sentence
     if without:
         assert rmse <= MOST_RMSE * outcome(without, seed)[2]
+
+
+def test_frames_without_data_leave_deviations() -> None:
+    """Bars that are widened are finite wherever there is a value, also beside lost frames."""
+    capture, _ = seen(WORLDS["fabrics"][0], 1)
+    capture["counts"][1, [0, 40, 41, 42]] = np.nan
+    result = separation.separate(capture, RESPONSE)
+    for name in ("object_temperature", "background_temperature"):
+        lacking = result[name].isnull().values
+        assert lacking[[0, 40, 41, 42]].all()
+        np.testing.assert_array_equal(result[f"{name}_std"].isnull().values, lacking)
