@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (730, 4),
     "readers": (2530, 10),
     "reporting": (710, 4),
-    "separation": (12930, 55),
+    "separation": (12960, 55),
     "simulation": (640, 3),
     "store": (1500, 7),
 }

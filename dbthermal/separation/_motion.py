@@ -17,6 +17,7 @@ import xarray as xr
 from scipy.ndimage import shift as shifted
 
 from dbthermal._arrays import Array, empty, quotient, release
+from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
 
@@ -75,10 +76,12 @@ def stabilise(
     motion = np.asarray(steps if before is None else steps + before)
     if np.sqrt(np.mean(motion**2)) < _LEAST:
         return None
-    counts = empty(corrected["counts"].shape, np.float32)
+    counts, good = empty(corrected["counts"].shape, np.float32), good_pixels(inputs)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
         for frame, image, step in zip(film, moved, path, strict=True):
-            frame[:] = shifted(image, step, order=3, mode="nearest")
+            valid = good & np.isfinite(image)
+            whole = shifted(without_gaps(image, valid), step, order=3, mode="nearest")
+            frame[:] = np.where(valid, whole, image)
         release()
     return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion)
 
@@ -92,8 +95,11 @@ def _add_equations(
     used = pixels & (weights[0] != 0.0)
     basis = smooth_functions(inputs, frames)
     # Gradients of the image, which changes slowly.
-    shape = (_SLOW, *films.shape[:1], -1, result.sizes["x"])
+    shape = (_SLOW, len(films), rows.stop - rows.start, result.sizes["x"])
     images = np.einsum("tj,btp->jbp", basis[:, :_SLOW], signals).reshape(shape)
+    whole = pixels.reshape(shape[2:])
+    for image in images.reshape(-1, *images.shape[2:]):
+        image[:] = without_gaps(image, whole)
     slopes = np.stack(np.gradient(images, axis=(2, 3)), axis=2)
     slopes = slopes.reshape(_SLOW, len(signals), 2, -1) * weights[:, np.newaxis]
     slopes = slopes[..., used].reshape(_SLOW * 2 * len(signals), -1)
