@@ -146,8 +146,9 @@ def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
 
 def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
-    excess, every = 0.0, inputs.blocks
-    if result.sizes["x"] < _FEWEST or every[0].stop < _FEWEST:
+    excess = 0.0
+    every = [rows for rows in inputs.blocks if rows.stop - rows.start >= _FEWEST]
+    if result.sizes["x"] < _FEWEST or not every:
         return 0.0
     hint = _equations(inputs, result, place, excess, every[len(every) // 2])
     if hint[0] ** 2 < _HINT**2 * hint[2]:
