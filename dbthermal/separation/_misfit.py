@@ -53,7 +53,7 @@ class Misfit:
     @property
     def size(self) -> float:
         """Typical deviation of the object's signal beside a contrast of a kelvin [K]."""
-        return float(np.sqrt(np.mean(self.leak**2) + np.mean(self.change**2)))
+        return float(np.mean(self.leak) + np.mean(self.change))
 
     def common(self, sound: Mask) -> bool:
         """Many pixels (y, x) without a flag have a remainder: a cause that they share."""

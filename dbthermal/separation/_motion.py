@@ -22,9 +22,9 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
 
 _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
-# Mean square of a motion over its variance, from which it is undone: of 10^5 frames without motion
-# none has a mean over 250 of more than 1.5.
-_SURE: Final = 1.5
+# Mean square of a motion over its variance, from which it is undone, and undone further: of 10^5
+# frames without motion none has a mean over 250 of more than 1.5; rapid heat feigns 1.6.
+_SURE, _FURTHER = 3.0, 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion that matters, root mean square [pixel]; two depths feign 0.06
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
@@ -67,7 +67,7 @@ def stabilise(
     pull = np.einsum("tba,tb->ta", axes, forces)
     seen = level > _SEEN * level[:, -1:]
     square = np.sum(quotient(pull**2, level * seen, 0.0), axis=0) / np.maximum(seen.sum(axis=0), 1)
-    if not np.any(square > _SURE):
+    if not np.any(square > (_SURE if before is None else _FURTHER)):
         return None
     prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
     precision = np.kron(np.linalg.inv(prior), np.eye(2))

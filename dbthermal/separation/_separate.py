@@ -44,7 +44,6 @@ _UNEXPLAINED: Final = (
 )
 # Rounds in which motion is undone, and what must be left at most, of what was left before.
 _ROUNDS, _BETTER = 3, 0.8
-_SMALL: Final = 1.0  # shift that motion of 0.3 pixel feigns, at most [pixel]
 _KEPT: Final = 0.9  # share of the pixels without a flag that bands of one blur must keep
 _NOT_COMPLETED: Final = (
     "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
@@ -175,10 +174,6 @@ def _mended(
     outcome = measured, misfit = once(capture, per_pixel)
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
-        shift = measured.reflection_shift
-        if steady is None and shift is not None and _feigned(shift):
-            scope = replace(measured.inputs, displacement=None)
-            steady = stabilise(original, scope, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
         if steady is None or retry is None or retry[1].size > _BETTER * misfit.size:
             break
@@ -197,11 +192,6 @@ def _mended(
         capture, outcome = alike.capture, (measured, less)
         sentences.append(alike.sentence)
     return capture, outcome, sentences
-
-
-def _feigned(shift: xr.Dataset) -> bool:
-    """A shift of the reflections is so small that motion of the cameras may show it."""
-    return bool(np.nanmedian(np.hypot(*shift["shift"].values)) < _SMALL)
 
 
 def _measured(measured: "_Parts") -> int:
