@@ -31,6 +31,7 @@ _TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _CHUNKS: Final = 2**16  # of less than 1 kB in an array of HDF5
+_CHECKSUMS: Final = ("fletcher32", "crc32", "crc32c", "adler32")
 _DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
@@ -269,7 +270,9 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
 def _check_unpacked(values: zarr.Array[Any], keys: list[Path], path: Path) -> None:
     """Refuse files of chunks that unpack to another size than that of a chunk."""
     pieces = values.shards or values.chunks
-    size = values.dtype.itemsize * math.prod(values.chunks)
+    # A filter that checks adds its sum to a chunk before it is packed.
+    sums = [getattr(code, "codec_id", "") in _CHECKSUMS for code in values.filters]
+    size = values.dtype.itemsize * math.prod(values.chunks) + 4 * sum(sums)
     if math.prod(pieces) * values.dtype.itemsize > max(recordings.SMALL, values.nbytes):
         raise ValueError(f"Invalid chunk {pieces} of '{path.name}'. Must be its size at most.")
     codecs = [getattr(codec, "codec_id", type(codec).__name__) for codec in values.compressors]
