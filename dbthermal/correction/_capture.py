@@ -213,15 +213,15 @@ def _events(
     # What no camera reports, in some pixels.
     pixels = sampling(counts)
     sample = correct(capture.isel(pixels), correction.isel(pixels), maximum=maximum)
-    found = unreported(sample, valid, renewals)
-    if found.bad.any():
+    findings = unreported(sample, valid, renewals)
+    if findings.bad.any():
         # Copies of a bad frame are bad, too.
         last = np.maximum.accumulate(np.where(repeats, 0, np.arange(counts.sizes["time"])), axis=1)
-        bad = np.take_along_axis(found.bad, last, axis=1)
+        bad = np.take_along_axis(findings.bad, last, axis=1)
         capture = capture.assign(exposure_time=stamps.where(~bad))
-    capture = capture.assign_attrs(bad_frames=found.bad.sum(axis=1).tolist())
-    events = events_of(counts, repeats, shut | found.shutter, found.steps)
-    return capture, events, found.notes(names)
+    capture = capture.assign_attrs(bad_frames=findings.bad.sum(axis=1).tolist())
+    events = events_of(counts, repeats, shut | findings.shutter, findings.steps)
+    return capture, events, findings.notes(names)
 
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:

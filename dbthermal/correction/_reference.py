@@ -66,17 +66,17 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
         stds.append(pixels.std("pixel", ddof=1).values / np.sqrt(rows.size))
     # Line from the measured to the expected counts of each band.
     temperatures = np.asarray(reference.temperatures, dtype=np.float64)
-    left, lines = {}, np.empty((2, len(names), 1, 1, 1))
+    remaining, lines = {}, np.empty((2, len(names), 1, 1, 1))
     for band, curve in enumerate(responses.curves(reference.response, names)):
         seen = np.array([mean[band] for mean in means])
         wanted = curve.counts(temperatures)
         gain = np.polyfit(seen, wanted, 1)[0] if len(seen) > 1 else 1.0
         lines[:, band, 0, 0, 0] = gain, np.mean(wanted - gain * seen)
         errors = np.array([std[band] for std in stds]) / curve.count_slope(temperatures)
-        left[names[band]] = {"offset_std": float(np.sqrt(np.mean(errors**2) / len(errors)))}
+        remaining[names[band]] = {"offset_std": float(np.sqrt(np.mean(errors**2) / len(errors)))}
         if len(errors) > 1:
             scatter = np.sum((temperatures - temperatures.mean()) ** 2)
-            left[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
+            remaining[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
 
     def referred(window: slice) -> npt.NDArray[np.floating]:
         """Counts of some rows on the line."""
@@ -84,5 +84,7 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
         return np.asarray(lines[0] * values + lines[1], dtype=values.dtype)
 
     result = _rows.lazy(referred, counts) if lazy else counts.copy(data=referred(slice(None)))
-    known = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
-    return corrected.assign(counts=result).assign_attrs(level_reference={**known, "bands": left})
+    level = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
+    return corrected.assign(counts=result).assign_attrs(
+        level_reference={**level, "bands": remaining}
+    )

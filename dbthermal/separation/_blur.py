@@ -57,7 +57,7 @@ class Equalised:
 
     @property
     def sentence(self) -> str:
-        """What was done, for the user."""
+        """Sentence on how much the reflections in each band were blurred."""
         blurs = ", ".join(
             f"'{band}' {deviation:.2f}"
             for band, deviation in zip(

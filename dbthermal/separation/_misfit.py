@@ -11,9 +11,9 @@ that the model misses, pixels that drift).
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +44,7 @@ _NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the obje
 
 @dataclass(frozen=True)
 class Misfit:
-    """What the model leaves, zero where that may be noise."""
+    """Maps of how far the model fails the measured signals; zero where noise may explain it."""
 
     leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
@@ -61,8 +61,7 @@ class Misfit:
         return bool(np.count_nonzero(several) > _MUCH * np.count_nonzero(sound))
 
 
-@dataclass(frozen=True)
-class _Blocks:
+class _Blocks(NamedTuple):
     """Of each block of some rows (..., row, column): averages of its pixels without a flag."""
 
     pixels: Array  # their number
@@ -73,26 +72,19 @@ class _Blocks:
     freedom: Array  # degrees of freedom of each event (event, ...)
 
 
-_NAMES: Final = tuple(field.name for field in fields(_Blocks))
-
-
 def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
-    """What a result leaves in the bands of its pixels without a flag, in one reading."""
+    """Measure how far the signals of pixels without a flag deviate from a separation's model."""
     with ThreadPoolExecutor(workers) as threads:
         sections = list(threads.map(partial(_of_rows, inputs, result), inputs.blocks))
-    blocks = _Blocks(
-        *(
-            np.concatenate([getattr(section, name) for section in sections], axis=-2)
-            for name in _NAMES
-        )
-    )
-    # Place of each pixel's block.
-    sizes = np.array([rows.stop - rows.start for rows in inputs.blocks])
-    first = np.cumsum(-(-sizes // _BLOCK)) - -(-sizes // _BLOCK)
-    rows = np.concatenate(
-        [start + np.arange(size) // _BLOCK for start, size in zip(first, sizes, strict=True)]
-    )
-    place = np.ix_(rows, np.arange(result.sizes["x"]) // _BLOCK)
+    blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
+    # Give each pixel the values of its block.
+    heights = [
+        min(_BLOCK, rows.stop - top)
+        for rows in inputs.blocks
+        for top in range(rows.start, rows.stop, _BLOCK)
+    ]
+    row = np.repeat(np.arange(len(heights)), heights)
+    place = np.ix_(row, np.arange(result.sizes["x"]) // _BLOCK)
     return Misfit(_leak(blocks)[place], _change(blocks)[place], _single(blocks)[place])
 
 
@@ -173,18 +165,7 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     span, event = _spans(frames)
     remainder, reflection = np.zeros((2, len(film), number.size))
     _average(signals, film, weights, center, half, curve, place, remainder, reflection)
-    # Noise of single pixels: neighbours have the object's rapid changes in common.
-    middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
-    alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
-    middle = middle[alike & (place[middle] >= 0)]
-    segment = np.zeros(len(film), dtype=np.intp)
-    if "segment" in inputs.capture:
-        segment = inputs.capture["segment"].values[frames].astype(np.intp)
-    squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
-    single: Array = np.stack(
-        [np.bincount(place[middle], section, number.size) for section in squares]
-    )
-    single = single / np.maximum(np.bincount(place[middle], minlength=number.size), 1.0)
+    single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
     release()
     filled = np.maximum(number, 1.0)
     summed = [np.bincount(place[pixels], section[pixels], number.size) for section in noise]
@@ -194,14 +175,8 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     remainder, reflection = (
         film - basis @ (basis.T @ film) for film in (remainder / filled, reflection / filled)
     )
-    # Pieces of time leave changes that the deviations of their pixels hold.
-    held = np.zeros(place.size)
-    start = rows.start * width
-    divided = pixels & inputs.division[:, start : start + place.size].any(axis=0)
-    if divided.any():
-        deviations = result["object_temperature_std"].values[:, rows].reshape(len(frames), -1)
-        held[divided] = np.nanmean(np.square(deviations[:, divided]), axis=0)
-    held = np.bincount(place[pixels], held[pixels], number.size) / filled
+    stated = _stated(inputs, result, rows, pixels)
+    stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
     factor = inputs.capture.get("noise_factor", np.ones(1))
     if inputs.displacement is not None or np.any(factor < 1.0):  # neighbours share noise
         jumps = np.diff(remainder, 2, axis=0)
@@ -213,13 +188,47 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
     averages: tuple[Array, ...] = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
         noise,
-        np.stack([np.mean((means @ remainder) ** 2, axis=0), leverage * noise[0] + held]),
+        np.stack([np.mean((means @ remainder) ** 2, axis=0), leverage * noise[0] + stated]),
         single,
         np.stack([events @ (remainder * reflection), events @ reflection**2])
         - freedom * noise[2:0:-1, np.newaxis],
         freedom,
     )
     return _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+
+
+def _single_pixels(
+    inputs: Inputs,
+    signals: Array,
+    weights: Array,
+    frames: Mask,
+    place: Whole,
+    column: Whole,
+    blocks: int,
+) -> Array:
+    """Variances (2, block) of single pixels' means in time: as they are, and of white noise [K^2].
+
+    By differences of neighbours, which have the object's rapid changes in common.
+    """
+    middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
+    alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
+    middle = middle[alike & (place[middle] >= 0)]
+    segment = np.zeros(signals.shape[1], dtype=np.intp)
+    if "segment" in inputs.capture:
+        segment = inputs.capture["segment"].values[frames].astype(np.intp)
+    squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
+    sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
+    return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
+
+
+def _stated(inputs: Inputs, result: xr.Dataset, rows: slice, pixels: Mask) -> Array:
+    """Variance (pixel) that the deviations of objects in pieces of time hold already [K^2]."""
+    variance, start = np.zeros(pixels.size), rows.start * result.sizes["x"]
+    divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
+    if divided.any():
+        film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
+        variance[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
+    return variance
 
 
 def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, Mask, Array]:

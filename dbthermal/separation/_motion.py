@@ -39,7 +39,7 @@ class Stabilised:
 
     @property
     def sentence(self) -> str:
-        """What was done, for the user."""
+        """Sentence on how far the image of each band moved."""
         sizes = ", ".join(
             f"'{band}' {np.sqrt(np.mean(path**2)):.2f}"
             for band, path in zip(self.capture["band"].values, self.motion, strict=True)
@@ -54,14 +54,15 @@ def stabilise(
     misfit: Misfit,
     before: Array | None = None,
 ) -> Stabilised | None:
-    """Undo the motion that explains what a result leaves, and one before; None if there is none."""
+    """Move each frame back by the cameras' motion, beside one found before; None without motion."""
     if not misfit.common(result["status"].values == 0):
         return None
     count = len(inputs.bands)
     size, frames = 2 * count, corrected.sizes["time"]
     form, forces = np.zeros((frames, size, size)), np.zeros((frames, size))
+    weights = object_weights(inputs, result)[inputs.bands]
     for rows in inputs.blocks:
-        _add_equations(inputs, result, rows, form, forces)
+        _add_equations(inputs, result, weights[:, rows], rows, form, forces)
     # Is there any?
     level, axes = np.linalg.eigh(form)
     pull = np.einsum("tba,tb->ta", axes, forces)
@@ -87,11 +88,11 @@ def stabilise(
 
 
 def _add_equations(
-    inputs: Inputs, result: xr.Dataset, rows: slice, form: Array, forces: Array
+    inputs: Inputs, result: xr.Dataset, weights: Array, rows: slice, form: Array, forces: Array
 ) -> None:
     """Add the normal equations of all bands' motion over some rows, by frame, in place."""
     signals, films, frames, pixels, gain = reflected(inputs, result, rows)
-    weights = object_weights(inputs, result)[inputs.bands][:, rows].reshape(len(signals), -1)
+    weights = weights.reshape(len(signals), -1)
     used = pixels & (weights[0] != 0.0)
     basis = smooth_functions(inputs, frames)
     # Gradients of the image, which changes slowly.
@@ -105,8 +106,8 @@ def _add_equations(
     slopes = slopes[..., used].reshape(_SLOW * 2 * len(signals), -1)
     noise = inputs.noise[inputs.bands, np.newaxis] * gain
     weighted = slopes / np.sum((weights * noise)[:, used] ** 2, axis=0)
-    rest = np.einsum("bp,btp->tp", weights[:, used], films[..., used])
-    pull = weighted @ rest.T
+    remainder = np.einsum("bp,btp->tp", weights[:, used], films[..., used])
+    pull = weighted @ remainder.T
     pull -= pull @ basis @ basis.T
     # In each frame the gradients are sums over these functions of time.
     course = basis[:, :_SLOW]

@@ -1,7 +1,9 @@
 """In situations that the paper does not assume, intervals hold, or pixels have a flag."""
 
 import warnings
+from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,8 +30,12 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
 QUICK = list(WORLDS)[:7]
-# A camera's motion that is left makes bars somewhat too small.
-LEAST, LEAST_SHAKEN, MOST_RMSE = 0.9, 0.85, 1.5
+LEAST, MOST_RMSE = 0.9, 1.3
+# By situation and seed: what is not reached.
+MISSED = {
+    ("cameras shake", 1): "0.85 hold, RMSE 1.4 times: motion that is left thins the ratio by 1 %",
+    ("lenses blur unlike", 1): "RMSE 1.4 times: details of the object stay unlike",
+}
 
 
 @cache
@@ -47,18 +53,29 @@ def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]
     return *figures, tuple(result.attrs.get("warnings", []))
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in [*WORLDS][7:])]
-)
+def cases() -> Iterator[Any]:
+    """Yield each situation with two seeds; most are slow, and some are known to miss."""
+    for name in WORLDS:
+        for seed in (1, 2):
+            slow = [] if name in QUICK and seed == 1 else [pytest.mark.slow]
+            reason = MISSED.get((name, seed))
+            missed = [pytest.mark.xfail(reason=reason, strict=True)] if reason else []
+            yield pytest.param(name, seed, marks=[*slow, *missed])
+
+
+@pytest.mark.parametrize(("name", "seed"), [*cases()])
 def test_intervals_hold(name: str, seed: int) -> None:
-    """In 9 of 10 samples without a flag; what was mended is said, and nearly as good as without."""
-    holds, _, rmse, said = outcome(name, seed)
-    _, sentence, without = WORLDS[name]
-    assert holds >= (LEAST_SHAKEN if "shake" in name else LEAST)
-    assert any(sentence in line for line in said) or not sentence
-    if without:
-        assert rmse <= MOST_RMSE * outcome(without, seed)[2]
+    """In 9 of 10 samples without a flag; what is mended is nearly as good as without."""
+    holds, _, rmse, _ = outcome(name, seed)
+    without = WORLDS[name][2]
+    assert holds >= LEAST
+    assert not without or rmse <= MOST_RMSE * outcome(without, seed)[2]
+
+
+@pytest.mark.parametrize("name", [name for name in QUICK if WORLDS[name][1]])
+def test_what_is_mended_is_said(name: str) -> None:
+    """The warning names the cause."""
+    assert any(WORLDS[name][1] in line for line in outcome(name, 1)[3])
 
 
 @pytest.mark.parametrize("name", ["fabrics", "cameras shake", "lenses blur unlike"])
