@@ -109,6 +109,7 @@ CAUSES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "noise": "a frame of a pixel",
         "ratio": "all frames of a pixel, or of a material",
+        "drift": "all pixels before the same surroundings",
         "pattern": "all frames of a pixel",
         "offset": "the image",
         "gain": "the image",
@@ -117,9 +118,9 @@ CAUSES: Final[Mapping[str, str]] = MappingProxyType(
         "colour": "the image",
     }
 )
-"""Causes of a deviation, and what shares an error by each; all but two are the calibration's."""
+"""Causes of a deviation, and what shares an error by each; all but three are the calibration's."""
 
-CALIBRATION: Final = tuple(CAUSES)[2:]
+CALIBRATION: Final = tuple(CAUSES)[3:]
 """Causes that two bands cannot show: a calibration states them, see `response.accuracy`."""
 
 SHARED: Final = tuple(cause for cause, of in CAUSES.items() if of == "the image")
@@ -211,6 +212,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
+            "drift_std": _of("y x", "1", "reference emissivity's part by drift", "float32"),
             "noise": _of("band", "count", "noise, as used"),
             "bridged": _of("time y x", "1", "sample bridged in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),

@@ -16,8 +16,9 @@ _ALIKE: Final = 3.0  # standard deviations up to which a material of the table i
 _VAGUE: Final = 0.15  # deviation from which most is alike: the demonstration's tape has 0.18
 _RANGE: Final = (1.0, 99.0)  # percentiles of the temperatures that are said
 _ROWS, _TIMES = 64, 60  # of the image and the film that are looked at, at most
-_NOISE: Final = ("noise", "ratio")  # causes that both bands show; all else is the calibration's
 _COMMON: Final = 0.02  # share of the pixels from which a material is listed
+# Of a material by band: with its deviation, and with that before surroundings that do not drift.
+_EMISSIVITIES: Final = ("emissivity", "emissivity_std", "emissivity_steady_std")
 _DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
 
 
@@ -67,8 +68,13 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:
-        pairs = zip(entry["emissivity"].items(), entry["emissivity_std"].values(), strict=True)
-        values = ", ".join(f"{value:.3f} +- {std:.3f} ({band})" for (band, value), std in pairs)
+        rows = zip(
+            entry["emissivity"], *(entry[key].values() for key in _EMISSIVITIES), strict=True
+        )
+        values = ", ".join(
+            f"{value:.3f} +- {std:.2g} ({band}; +- {steady:.2g} if no surroundings drift)"
+            for band, value, std, steady in rows
+        )
         name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
         sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
@@ -88,9 +94,9 @@ def _deviations(section: xr.Dataset, valid: Mask) -> dict[str, float]:
     squares = {"noise": section["object_temperature_std"] ** 2}
     if "uncertainty" in section:  # by cause, of each pixel
         causes = section["uncertainty"] ** 2
-        by_noise = causes["cause"].isin(_NOISE)
-        squares = {"noise": causes.where(by_noise).sum("cause", min_count=1)}
-        squares["calibration"] = causes.where(~by_noise).sum("cause", min_count=1)
+        stated = causes["cause"].isin([*schema.CALIBRATION])
+        squares = {"noise": causes.where(~stated).sum("cause", min_count=1)}
+        squares["calibration"] = causes.where(stated).sum("cause", min_count=1)
     typical = dict[str, float]()
     for name, square in squares.items():
         values = np.broadcast_to(square.values, valid.shape)[valid]
@@ -108,12 +114,15 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     if not {"emissivity", "emissivity_std"} <= {*result.data_vars}:
         return []
     bands = [str(band) for band in result["band"].values]
-    values, stds = (
-        result[name].transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
-        for name in ("emissivity", "emissivity_std")
+    budget = result.get(schema.BUDGETS["emissivity"])
+    drift = 0.0 * result["emissivity_std"] if budget is None else budget.sel(cause="drift")
+    values, stds, drift_stds = (
+        variable.transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
+        for variable in (result["emissivity"], result["emissivity_std"], drift)
     )
     finite = np.isfinite(values + stds).all(axis=1)
-    values, stds = values[finite], stds[finite]
+    values, stds, drift_stds = values[finite], stds[finite], drift_stds[finite]
+    steady_stds = np.sqrt(np.maximum(stds**2 - drift_stds**2, 0.0))
     vague = stds.max(axis=1, initial=0.0) >= _VAGUE
     # Medians of each label, which tell materials apart that single pixels do not.
     judged, deviations = values.copy(), stds.copy()
@@ -135,10 +144,12 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     # Medians of each, and the materials within a deviation.
     listed = []
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
-        middle, std = (np.median(array[pixels], axis=0) for array in (values, stds))
+        middle, std, steady = (
+            np.median(array[pixels], axis=0) for array in (values, stds, steady_stds)
+        )
         entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
-        entry |= {"emissivity": dict(zip(bands, middle.tolist(), strict=True))}
-        entry |= {"emissivity_std": dict(zip(bands, std.tolist(), strict=True))}
+        for key, numbers in zip(_EMISSIVITIES, (middle, std, steady), strict=True):
+            entry[key] = dict(zip(bands, numbers.tolist(), strict=True))
         if pixels is not groups[0]:
             near = nearest(bands, middle, std, table)
             entry["nearest"] = [place for place in near if place["distance"] < 1]

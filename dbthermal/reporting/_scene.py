@@ -326,13 +326,16 @@ def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> Iterator[Markup
     for name, of in places.items():
         pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
         cells = [f"{_text(value, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for value, std in pairs]
+        steady = of.get("emissivity_steady_std", {}).values()
+        cells = [f"{cell} ({std:.4f})" for cell, std in zip(cells, steady, strict=False)] or cells
         near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
         rows.append([name, ", ".join(near) or "many", *cells])
     head = ["measured pixels", "nearest materials of the table (distance)"]
     bands = next(iter(places.values()))["emissivity"]
     yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
     yield (
-        "Medians of pixels that are alike, and means of regions. The distance is the root mean "
+        "Medians of pixels that are alike, and means of regions; in brackets the deviation if the "
+        "surroundings do not drift. The distance is the root mean "
         "square over the bands, in standard deviations, to which "
         f"{SPREAD} is added for what samples of a material differ. "
         "A near material is no identification: many share two emissivities."

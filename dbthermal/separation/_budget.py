@@ -1,9 +1,13 @@
 r"""Budget of a result by cause [1]_, with what its calibration is taken for.
 
-The bands show noise, and how certain the ratios are, but no wrong offset, gain or blackbody: these
-the response states (`response.accuracy`). Errors :math:`\delta_b` of the bands [K] move object and
-background by a least-squares solution of the first equation; relative errors :math:`g_b` of gains
-about :math:`T_0` keep the image formation if, with the emissivities that are found with them,
+The bands show noise, and how certain the ratios are. A background that drifts along with the object
+they do not show: it is a prior's (`SubspaceSettings.background_drift`), and moves the emissivities
+of given ratios, :math:`\delta e_b = \kappa_b \, \delta e_1`, and with them the background,
+:math:`\delta y = (y - x) \, \delta e_1 / (1 - e_1)`, but no object. Nor do they show wrong offsets,
+gains or blackbodies: these the response states (`response.accuracy`). Errors :math:`\delta_b` of
+the bands [K] move object and background by a least-squares solution of the first equation; relative
+errors :math:`g_b` of gains about :math:`T_0` keep the image formation if, with the emissivities
+that are found with them,
 
 .. math::
     e_b\,\delta x + (1 - e_b)\,\delta y &= \delta_b, \qquad
@@ -59,13 +63,15 @@ def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
     return result
 
 
-def without_calibration(result: xr.Dataset) -> xr.Dataset:
-    """Result whose deviations hold what its bands tell alone: noise and ratios, no calibration.
+def without_calibration(result: xr.Dataset, *, drift: bool = True) -> xr.Dataset:
+    """Result whose deviations hold noise, ratio and drift alone, not what its calibration states.
 
     Parameters
     ----------
     result : Dataset
         From `solve`, `separate` or `complete`; it is not changed.
+    drift : bool
+        Keep the part by a background that may have drifted along with the object.
 
     Returns
     -------
@@ -73,17 +79,32 @@ def without_calibration(result: xr.Dataset) -> xr.Dataset:
         The same values, without the variables of `schema.BUDGETS`.
     """
     alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
+    causes, by_drift = [*CALIBRATION], np.zeros(1) if drift else _drift(result)
     for name in (name for name, budget in BUDGETS.items() if budget in result):
-        deviations = result[BUDGETS[name]].sel(cause=[*CALIBRATION]).values
+        # Of the background the drift's part goes with the contrast of each frame, see below.
+        parts = [*causes, "drift"] if not drift and name == "emissivity" else causes
+        deviations = result[BUDGETS[name]].sel(cause=parts).values
         variance, std = (deviations.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
         values = empty(std.shape, std.dtype)
         for place, image in enumerate(std.values):
             less = variance if variance.ndim == 2 else variance[place]
+            if by_drift.any() and name == "background_temperature":
+                warm, cold = (result[film].values[place] for film in _FILMS)
+                less = less + (by_drift * (warm - cold)) ** 2
             square = image.astype(np.float64) ** 2
             values[place] = np.sqrt(np.maximum(square - less, 0.0)) if less.any() else image
             release()
         alone[f"{name}_std"] = std.copy(data=values)
     return alone
+
+
+def _drift(result: xr.Dataset) -> Array:
+    """Deviation (y, x) of the background by its drift, for a contrast of 1 K to the object."""
+    if "drift_std" not in result:
+        return np.zeros(result["status"].shape)
+    reflectivity = 1.0 - result["emissivity"].sel(band=result.attrs["reference_band"]).values
+    drift = result["drift_std"].values / np.where(reflectivity > 0.0, reflectivity, np.nan)
+    return np.asarray(np.nan_to_num(drift), dtype=np.float64)
 
 
 def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> None:
@@ -105,9 +126,12 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     colour = np.nan_to_num(ratio) * np.where(cold & (accuracy.colour > 0.0), _SKY, accuracy.colour)
     colour[reference] = 0.0
     by_colour = contrast * _combined(weights, colour)
+    drift = np.where(single, 0.0, _drift(cut))
+    by_drift = np.zeros_like(drift), drift * _rms(films[0], films[1])
     for place, (name, film) in enumerate(zip(_FILMS, films, strict=True)):
         deviations = {
             "ratio": by_ratio[place],
+            "drift": by_drift[place],
             "pattern": _combined(weights, accuracy.pattern)[place],
             "offset": _combined(weights, accuracy.offset)[place],
             "gain": _combined(weights, accuracy.gain)[place] * _rms(film, accuracy.centre),
@@ -119,22 +143,26 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
         _enter(cut[BUDGETS[name]].values, deviations, std, _rms(std))
     slope = np.where(single, 0.0, _combined(weights[1] - weights[0], accuracy.gain))
     stds = cut["emissivity_std"].values
-    deviations = {"gain": np.abs(value * (1.0 - value)) * slope}
+    deviations = {"drift": np.abs(1.0 - value) * drift}
+    deviations |= {"gain": np.abs(value * (1.0 - value)) * slope}
     _enter(cut[BUDGETS["emissivity"]].values, deviations, stds[np.newaxis], stds.astype(np.float64))
 
 
 def _enter(budget: Array, deviations: dict[str, Array], stds: Array, total: Array) -> None:
     """Enter parts into a budget (cause, ...), and the calibration's into the deviations, in place.
 
-    Of the statistical deviation, whose root mean square is `total`, what no ratio explains is
-    noise. A part without a value, as where there is no temperature, is left out.
+    Of the statistical deviation, whose root mean square is `total`, what neither the ratio nor a
+    drift explains is noise. A part without a value, as where there is no temperature, is left out.
     """
     values = dict.fromkeys(CAUSES, np.zeros(total.shape)) | {
         name: np.where(np.isfinite(deviation), deviation, 0.0)
         for name, deviation in deviations.items()
     }
-    values["ratio"] = np.minimum(values["ratio"], np.where(np.isfinite(total), total, 0.0))
-    values["noise"] = np.sqrt(total**2 - values["ratio"] ** 2)
+    square = total**2
+    for name in ("drift", "ratio"):
+        values[name] = np.sqrt(np.fmin(values[name] ** 2, np.nan_to_num(square)))
+        square = np.maximum(square - values[name] ** 2, 0.0)
+    values["noise"] = np.sqrt(square)
     budget[:] = np.stack([values[name] for name in CAUSES])
     variance = np.sum([values[name] ** 2 for name in CALIBRATION], axis=0, dtype=np.float32)
     with np.errstate(over="ignore"):  # a deviation beyond single precision is infinite

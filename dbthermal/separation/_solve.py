@@ -219,7 +219,7 @@ def separated(
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
-    names += [_COVARIANCE] if inputs.method.pools else []
+    names += [_COVARIANCE, "drift_std"] if inputs.method.pools else []
     result = separated_dataset(capture, dict.fromkeys(names))
     # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
@@ -421,7 +421,7 @@ def _write(
                 target[..., places] = np.nan
             elif name == "status":
                 target[places] |= values
-            elif "band" in dims:
+            elif "time" not in dims:
                 target[..., places] = values[np.ix_(*[order] * (values.ndim - 1))]
             elif np.all(frames) and np.all(pixels) and np.all(cut.valid):
                 target[...] = values.reshape(target.shape)

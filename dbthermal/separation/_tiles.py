@@ -200,6 +200,7 @@ class Estimate(Pixels):
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
     emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
+    drift_std: Array | None = None  # of the first band's emissivity by the background (pixel) [1]
     survey: Survey | None = None  # for the material, of a method that pools
     division: Mask | None = None  # frames with which pieces of time begin (time, pixel)
 

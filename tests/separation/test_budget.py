@@ -268,3 +268,36 @@ def test_impossible_reference_is_refused() -> None:
     reference = correction.Reference(response(), masks, (300.0, 310.0))
     with pytest.raises(ValueError, match="Invalid patch 0"):
         correction.correct_capture(raw, correction.corrected_by_camera(raw), reference=reference)
+
+
+def test_without_a_drift_the_bars_are_as_long_as_the_errors() -> None:
+    """The part by a drift of the background is the prior's; without it bars are those of noise."""
+    errors, stds = [], []
+    for seed in range(1, 7):
+        truth, capture = glass(seed)
+        result = separation.separate(capture, response(**EXACT))
+        steady = separation.without_calibration(result, drift=False)
+        good = result["status"] == 0
+        name = "background_temperature"
+        std, error = (values.where(good) for values in (steady[f"{name}_std"], result - truth))
+        ratio = float(std.median() / (error[name] ** 2).mean() ** 0.5)
+        print(f"background {seed}: bar {ratio:.2f} errors, {holds(steady, truth, name):.3f} hold")
+        assert ratio < 2.0
+        assert 0.92 < holds(steady, truth, name) < 0.99
+        # An emissivity's error is that of its material.
+        for value in (LEFT[0], RIGHT[0]):
+            pane = good & (truth["emissivity"][0] == value)
+            errors.append(error["emissivity"].where(pane).median(("y", "x")))
+            stds.append(steady["emissivity_std"].where(pane).median(("y", "x")))
+        # With the prior's part the deviation is what the result states.
+        drift = result[BUDGETS["emissivity"]].sel(cause="drift")
+        whole = ((steady["emissivity_std"] ** 2 + drift**2) ** 0.5).where(good)
+        np.testing.assert_allclose(whole, result["emissivity_std"].where(good), rtol=1e-3)
+        name = "object_temperature_std"
+        np.testing.assert_array_equal(steady[name], result[name])
+    score = float((np.divide(errors, stds) ** 2).mean() ** 0.5)
+    ratio = float(np.median(stds) / np.mean(np.square(errors)) ** 0.5)
+    print(f"emissivity: error {score:.2f} deviations (root mean square), bar {ratio:.2f} errors")
+    assert score < 1.5
+    assert ratio < 2.0
+    assert float((drift / steady["emissivity_std"]).where(good).median()) > 5.0

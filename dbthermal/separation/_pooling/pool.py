@@ -46,6 +46,7 @@ _MORE_AROUND: Final = 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _AROUND: Final = 1.5
 _SOME: Final = 1e-3
+_SQUARE: Final = 8  # side [pixel] of what mirrors the same people at the same time
 _FRAMES: Final = 64  # that tell how much an object differs, about
 
 
@@ -200,6 +201,15 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     scatter = total(where, weight**2 * residual, count) / whole**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
     expected = total(where, weight**2 * noise, count) / whole**2
+    # Neighbours mirror the same people: var(mean) = sum_s (sum_i w (e - mean))^2 n / (n - 1) of n
+    # squares s (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13).
+    squares = image.squares(_SQUARE)
+    groups = np.where(valid, where + count * squares, -1)
+    sums = total(groups, weight * (value - mean[where]), count * (1 + int(squares.max())))
+    sums = sums.reshape(-1, count)
+    number = (sums != 0).sum(axis=0)
+    clustered = (sums**2).sum(axis=0) / whole**2 * number / np.maximum(number - 1, 1)
+    scatter = np.maximum(scatter, clustered)
     result = Material(
         ratio=common.ratio,
         inverse_energy=common.variance,

@@ -187,6 +187,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
         emissivity=np.where(unidentified, np.nan, solution.emissivity),
         emissivity_std=np.sqrt(np.einsum("bbp->bp", covariance)),
         emissivity_covariance=covariance,
+        drift_std=np.where(unidentified, np.nan, np.sqrt(solution.drift_variance)),
         reflection_ratio=np.where(still, np.nan, solution.ratio),
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(solution.ratio_variance)),
         status=status,
