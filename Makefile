@@ -63,7 +63,7 @@ export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install format check types pytest smoke chain interop test test-slow test-long reproduce full verify record report data docs lab bench attack lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow test-long reproduce full verify record data docs lab bench attack lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -127,9 +127,6 @@ record: .venv/installed ## keep the numbers of results/full as the reference, an
 
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 	$(python) -m reproduction.manifest
-
-report: .venv/installed ## one page on everything in results/full: results/report.html
-	$(python) -m reproduction.report
 
 docs: .venv/documenting ## build the documentation site into results/docs/html, with the notebooks that are in results/full
 	$(python) -m sphinx --fail-on-warning --keep-going --fresh-env --quiet docs results/docs/html

@@ -1,9 +1,9 @@
 """Time and memory on this machine: a table and a figure in results/bench.
 
-First those of the default call, see `default_call`, then those of every method. Times of one thread
-are its processor's, the better of two; those of processes and of the disk are the clock's. What a
-series would not end within `LONGEST` is left out of it. All captures are simulated plate glass
-before which people walk, at `RATE`.
+First those of the default call, see `default_call`, then those of every method, and those of a run
+from disk to disk. Times of one thread are its processor's, the better of two; those of processes
+and of the disk are the clock's. What a series would not end within `LONGEST` is left out of it. All
+captures are simulated plate glass before which people walk, at `RATE`.
 """
 
 import argparse
@@ -47,8 +47,6 @@ FEW: Final = 128
 BANDS: Final = ("8-14", "9.5", "10.6", "12.1")
 NOISE: Final = (0.03, 0.35, 0.15, 0.4)  # [K]
 EMISSIVITY: Final = (0.86, 0.72, 0.88, 0.95)
-DAY: Final = 24 * 3600 * 60  # frames of a day at 60 Hz
-ARCHIVE: Final = 10_000  # captures of a full frame, USUAL["frames"] each
 
 Times = dict[tuple[str, str], dict[int, float]]
 """By method and size that is varied: seconds of one thread at each size."""
@@ -60,13 +58,9 @@ class Disk:
 
     samples: int  # pixels times frames
     read_write: float  # reading the capture and writing its result, by one process [s]
-    in_memory: float  # separating it in memory, by two threads of one process [s]
     seconds: dict[int, float]  # of so many processes [s]
-    weak: dict[int, float]  # of so many processes on rows in proportion, all rows by the most [s]
     peak: float  # memory of a process, of `allowed` [byte]
     allowed: float
-    source_bytes: int  # as stored
-    result_bytes: int
 
 
 @lru_cache
@@ -165,11 +159,6 @@ def _peak(source: Path, target: Path, memory: float) -> float:
     return default_call.peak_memory()
 
 
-def size_on_disk(folder: Path) -> int:
-    """Bytes of the files in a folder."""
-    return sum(one.stat().st_size for one in folder.rglob("*") if one.is_file())
-
-
 def full_frame() -> xr.Dataset:
     """Simulated capture of 640x512 pixels, in which a small one is repeated."""
     movie = capture(FRAME, USUAL["frames"], 2)
@@ -180,13 +169,11 @@ def full_frame() -> xr.Dataset:
 
 def from_disk(folder: Path) -> Disk:
     """Measure runs from disk to disk: against the disk alone, by processes, and their memory."""
-    counts = [n for n in (1, 2, 4, 8, 16) if n <= (os.cpu_count() or 1)]
     movie, source = full_frame(), folder / "all.zarr"
     store.save(movie, source, {})
-    target, seconds, weak = folder / "result.zarr", {}, {}
-    for number in counts:
+    target, seconds = folder / "result.zarr", {}
+    for number in sorted({1, os.cpu_count() or 1}):
         seconds[number] = _run(source, target, number)
-        result_bytes = size_on_disk(target)
         result = store.open_dataset(target).load()
         shutil.rmtree(target)
         print("processes", number, seconds[number], flush=True)
@@ -195,22 +182,10 @@ def from_disk(folder: Path) -> Disk:
     store.save(result, folder / "again.zarr", {})
     read_write = time.perf_counter() - start
     del result
-    taken = []
-    for _ in range(2):  # the second in memory that is in use already
-        start = time.perf_counter()
-        separation.solve(movie, response(BANDS[:2]), workers=2)
-        taken.append(time.perf_counter() - start)
-    for number in counts[:-1]:
-        some = folder / f"{number}.zarr"
-        store.save(movie.isel(y=slice(512 * number // counts[-1])), some, {})
-        weak[number] = _run(some, target, number)
-        shutil.rmtree(target)
-        print("weak", number, weak[number], flush=True)
     allowed, samples = 1e9, movie["counts"][0].size
     with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
         peak = fresh.submit(_peak, source, target, allowed).result()
-    times = read_write, min(taken), seconds, weak | {counts[-1]: seconds[counts[-1]]}
-    return Disk(samples, *times, peak, allowed, size_on_disk(source), result_bytes)
+    return Disk(samples, read_write, seconds, peak, allowed)
 
 
 def machine() -> str:
@@ -262,11 +237,6 @@ over frames have {few} pixels, series over bands {pixels}.
 {methods}
 
 `subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
-
-Estimates from the rate of {processes} processes, without any loss between computers that share only
-a disk.
-
-{costs}
 """
 
 
@@ -286,18 +256,15 @@ def default_figures(calls: default_call.Calls, busy: float) -> str:
 
 def table(default: str, times: Times, disk: Disk, busy: float) -> str:
     """All that was measured, in Markdown: the default call's figures, then ratios first."""
-    most = max(disk.seconds)
     frames = times["subspace", "frames"]
     return HEAD.format(
         machine=machine(),
         busy=busy,
         default_call=f"{MARKS[0]}\n\n{default}\n{MARKS[1]}",
         few=FEW,
-        processes=most,
         ratios=rows(("ratio", ""), *ratios(times, disk)),
         methods=methods(times),
         samples=", ".join(f"{n}: {1e9 * s / FEW / n:.0f}" for n, s in frames.items()),
-        costs=costs(disk, disk.samples / disk.seconds[most]),
         **USUAL,
     )
 
@@ -312,13 +279,8 @@ def ratios(times: Times, disk: Disk) -> Iterator[tuple[str, str]]:
     disk_to_disk = f"`subspace` from disk to disk, {most} processes, over reading and writing alone"
     yield disk_to_disk, f"{disk.seconds[most] / disk.read_write:.1f}"
     yield "frames of 640x512 from disk to disk over a camera's 60 a second", f"{speed:.2f}"
-    speed = disk.samples / disk.in_memory / FRAME / 60
-    yield "frames of 640x512 in memory, 2 threads, over a camera's 60 a second", f"{speed:.2f}"
     yield f"peak memory over `memory={disk.allowed:g}`", f"{disk.peak / disk.allowed:.2f}"
-    for number in sorted(disk.weak)[1:]:
-        gain, weak = one / disk.seconds[number], number * disk.weak[1] / disk.weak[number]
-        yield f"rate of {number} processes over one, the same capture", f"{gain:.2f}"
-        yield f"rate of {number} processes over one, {number} times the rows", f"{weak:.2f}"
+    yield f"rate of {most} processes over one", f"{one / disk.seconds[most]:.2f}"
 
 
 def methods(times: Times) -> str:
@@ -333,23 +295,6 @@ def methods(times: Times) -> str:
         more = ", ".join(f"{bands[n] / bands[2]:.1f}" for n in sorted(bands) if n > 2) or "none"
         cost, ratio = f"{1e6 * seconds:.0f}", f"{seconds / usual['subspace']:.2g}"
         lines.append((f"`{method}`", cost, ratio, pixels, frames, more))
-    return rows(*lines)
-
-
-def costs(disk: Disk, rate: float) -> str:
-    """Table of what large tasks cost, on paper, at a rate [samples/s]."""
-    tasks = {
-        "a day at 60 Hz": DAY * FRAME,
-        f"{ARCHIVE} captures of {USUAL['frames']} frames": ARCHIVE * USUAL["frames"] * FRAME,
-    }
-    lines: list[tuple[str, ...]] = [
-        ("`subspace`, two bands of 640x512", "one machine", "ten", "capture", "result")
-    ]
-    for name, samples in tasks.items():
-        hours = samples / rate / 3600
-        stored = [samples / disk.samples * b / 1e12 for b in (disk.source_bytes, disk.result_bytes)]
-        sizes = [f"{one:.1f} TB" for one in stored]
-        lines.append((name, f"{hours:.0f} h", f"{hours / 10:.0f} h", *sizes))
     return rows(*lines)
 
 

@@ -19,6 +19,7 @@ import xarray as xr
 
 from dbthermal import alignment, separation, simulation, store
 from reproduction.experiments.pictures import Picture, smooth_shift
+from reproduction.experiments.scores import held, rmse
 
 T = TypeVar("T")
 
@@ -97,9 +98,8 @@ def judged(truth: xr.Dataset, seconds: float, result: xr.Dataset) -> Call:
     """Time and accuracy of a result."""
     name = "object_temperature"
     error = (result[name] - truth[name]).where(result["status"] == 0)
-    held = (abs(error) < 1.96 * result[f"{name}_std"]).where(error.notnull())
-    rmse = float(((error**2).mean("time") ** 0.5).median())
-    return Call(seconds / result["status"].size, rmse, float(held.mean()))
+    cover = held(error, result[f"{name}_std"])
+    return Call(seconds / result["status"].size, float(rmse(error)), float(cover))
 
 
 def measured(

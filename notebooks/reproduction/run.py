@@ -9,6 +9,7 @@ In a notebook with the parameter `results`, the name of the run::
     run.finish(numbers)
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +90,15 @@ class Run:
         store.save(dataset, self._path(f"{ending}.zarr"), self.provenance)
 
     def figure(self, figure: "Figure", ending: str) -> "Figure":
-        """Save a figure as ``<stem><ending>.png``, and hand it back for display."""
+        """Save a figure as ``<stem><ending>.png``, and hand it back for display.
+
+        ValueError if the label of an axis with ticks has no unit.
+        """
+        for axis in figure.axes:
+            for axle in (axis.xaxis, axis.yaxis):
+                label = axle.get_label_text()
+                if label and len(axle.get_ticklocs()) and not re.search(r"\[.+\]", label):
+                    raise ValueError(f"Invalid label '{label}' of a figure. Must have a unit: [K].")
         store.save_figure(figure, self._path(f"{ending}.png"), self.provenance)
         return figure
 

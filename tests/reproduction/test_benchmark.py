@@ -23,13 +23,9 @@ def test_the_table_says_what_was_measured() -> None:
     disk = Disk(
         samples=600 * FRAME,
         read_write=5.0,
-        in_memory=20.0,
         seconds={1: 18.0, 2: 10.0},
-        weak={1: 9.0, 2: 10.0},
         peak=8e8,
         allowed=1e9,
-        source_bytes=8 * 600 * FRAME,
-        result_bytes=16 * 600 * FRAME,
     )
     text = benchmark.table("the default call", times(), disk, 0.5)
     assert verify.enclosed(text, benchmark.MARKS, "the default call", "the page") == text
@@ -37,12 +33,9 @@ def test_the_table_says_what_was_measured() -> None:
         "| `dbvt` over `subspace`, a pixel, 2048 over 2048 pixels | 8 |",
         "2 processes, over reading and writing alone | 2.0 |",
         "from disk to disk over a camera's 60 a second | 1.00 |",
-        "in memory, 2 threads, over a camera's 60 a second | 0.50 |",
         "| peak memory over `memory=1e+09` | 0.80 |",
-        "| rate of 2 processes over one, the same capture | 1.80 |",
-        "| rate of 2 processes over one, 2 times the rows | 1.80 |",
+        "| rate of 2 processes over one | 1.80 |",
         "| 2000000 | 2 | 1.00 (512 to 2048), 1.00 (128 to 2048) | 2.00 (100 to 1000) | 1.5 |",
-        "| a day at 60 Hz | 24 h | 2 h | 13.6 TB | 27.2 TB |",
     ):
         assert line in text, text
 
@@ -81,5 +74,5 @@ def test_a_small_capture_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert benchmark.seconds_of("apparent", {"pixels": 32, "frames": 40, "bands": 2}) > 0
     disk = benchmark.from_disk(tmp_path)
     assert list(disk.seconds) == [1]
-    assert min(disk.read_write, disk.seconds[1], disk.source_bytes, disk.result_bytes) > 0
+    assert min(disk.read_write, disk.seconds[1]) > 0
     assert not disk.peak > disk.allowed

@@ -1,33 +1,9 @@
 """Comparisons: every method on the same pixels."""
 
-from typing import Any
-
 import numpy as np
-import pytest
 import xarray as xr
 
 from reproduction import experiments
-
-VARIANTS = {"calibrated": "calibrated", "prior": "bcp"}
-CELL: dict[str, Any] = {
-    "emissivity": [0.86, 0.72],
-    "noise": [0.03, 0.35],
-    "variants": {name: {"method": method} for name, method in VARIANTS.items()},
-    "plate": {"frames": 120, "shape": [10, 24], "crossings": 6},
-    "pixels": 20,
-    "seed": 2,
-}
-
-
-def test_all_methods_see_the_same_pixels() -> None:
-    """Every method has its errors at each pixel that has a reflection; others take no part."""
-    compared = experiments.compare(**CELL)
-    assert compared.attrs["origin"] == "simulated"
-    assert dict(compared.sizes) == {"variant": 2, "pixel": 20, "band": 2}
-    assert float(compared["emissivity_error"].sel(variant="calibrated").max()) < 1e-6
-    assert np.all(compared["object_temperature_rmse"].sel(variant="prior") > 0)
-    with pytest.raises(ValueError, match=r"Invalid number of pixels 240\. Must be at most"):
-        experiments.compare(**{**CELL, "pixels": 240})
 
 
 def test_medians_count_what_the_default_solves() -> None:

@@ -8,54 +8,12 @@ import pytest
 import xarray as xr
 
 from dbthermal import response as responses
-from dbthermal import simulation
-from dbthermal.simulation import Background, Rig
-from reproduction import experiments
+from dbthermal.simulation import Rig
 from reproduction.experiments.cases import simulate
 
 TIME = np.arange(350) / 10.0  # s
 GLASS: dict[str, Any] = {"case": "glass", "emissivity": [0.86, 0.72], "start": 20, "stop": 60}
 OBJECT, BACKGROUND = "object_temperature", "background_temperature"
-
-
-def test_scores_of_known_errors() -> None:
-    """Offsets of 0.2 K and 0.02 are the errors; pixels without a value count in the shares only."""
-    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
-    times, rng = TIME[:50], np.random.default_rng(0)
-    truth = simulation.independent_pixels(
-        times, emissivity, Background(), 40, rng, start=300.0, stop=320.0
-    )
-    perfect = truth.assign(
-        object_temperature_std=xr.full_like(truth[OBJECT], 0.1),
-        emissivity_std=xr.full_like(truth["emissivity"], 0.01),
-        status=(("y", "x"), np.zeros((1, 40), dtype=np.uint16)),
-    )
-    here = truth["x"] >= 10
-    some = {OBJECT: truth[OBJECT].where(here), "status": perfect["status"].where(here, 1)}
-    off = xr.DataArray([0.02, -0.005], dims="band")
-    wrong = {OBJECT: truth[OBJECT] - 0.2, "emissivity": truth["emissivity"] + off}
-    # Error of the object [K]; errors, coverage of the emissivities, coverage and shares [1].
-    table: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
-        ({}, (0.0, [0.0, 0.0], [1.0, 1.0], 1.0, 1.0, 1.0)),
-        (some, (0.0, [0.0, 0.0], [1.0, 1.0], 1.0, 0.75, 0.75)),
-        (wrong, (0.2, [0.02, 0.005], [0.0, 1.0], 0.0, 1.0, 1.0)),
-    ]
-    for changes, expected in table:
-        scores = experiments.score(truth, perfect.assign(changes))
-        names = (f"{OBJECT}_rmse", "emissivity_error", "emissivity_coverage", "object_coverage")
-        for name, value in zip((*names, "good", "with_temperature"), expected, strict=True):
-            np.testing.assert_allclose(scores[name], value, rtol=0, atol=1e-9, err_msg=name)
-
-
-def test_sweep_names_its_cases() -> None:
-    """Each case is a row under its name, whose numbers are those of a run of its own."""
-    other = {"case": "quiet", "emissivity": (0.6, 0.45), "start": 20, "stop": 45}
-    other |= {"background": {"amplitude": 6.0}, "noise_known": False, "response_kind": "linear"}
-    swept = experiments.sweep([GLASS, other], Rig(), TIME[:120], 30, seed=3)
-    assert swept["case"].values.tolist() == ["glass", "quiet"]
-    assert swept.attrs == {"origin": "simulated", "pixels": 30, "seed": 3}
-    alone = experiments.score(*experiments.run_case(other, Rig(), TIME[:120], 30, 3))
-    xr.testing.assert_equal(swept.sel(case="quiet", drop=True)[list(alone)], alone)
 
 
 def drawn(**changes: Any) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:

@@ -6,56 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import simulation
-from dbthermal._smooth import polynomial_basis
-from dbthermal.simulation import Rig
-from reproduction.closed_form import ratio_variance_bound
-from reproduction.experiments import cases, limits, nuisances
+from reproduction.experiments import limits, nuisances
 
 GLASS, PAIR = [0.86, 0.72], ["8-14", "9.5"]
 COMMON = {"ends": [20.0, 45.0], "clock": [350, 10.0]}
 VIEWS: dict[str, Any] = {"shape": [24, 32], "clock": [50, 10.0], "seed": 1}
-
-
-def test_summary_of_known_errors() -> None:
-    """Errors 1.2 times their bound are so in the summary, over the pixels with a value."""
-    draws = np.random.default_rng(1).standard_normal(1000)
-    known = xr.DataArray(np.arange(1000) % 10 > 0, dims="pixel")
-    bound = (("knowing", "pixel"), np.full((1, 1000), 0.1))
-    parts = {
-        "reflection_ratio_error": ("pixel", 0.12 * draws),
-        "object_temperature_error": ("pixel", np.full(1000, 0.12)),
-        "reflection_ratio_bound": bound,
-        "object_temperature_bound": bound,
-    }
-    masked = xr.Dataset(parts, {"knowing": ["rest"]}).where(known)
-    measured = masked.assign(status=("pixel", np.where(known, 0, 4)))
-    summary = limits.summary(measured).isel(knowing=0)
-    assert float(summary["scatter"]) == pytest.approx(1.2, rel=0.05)
-    assert float(summary["excess"]) == pytest.approx(1.2, rel=1e-12)
-    assert float(summary["solved"]) == pytest.approx(0.9, abs=1e-12)
-    assert float(summary["flagged"]) == pytest.approx(0.1, abs=1e-12)
-
-
-def test_slope_is_the_closed_form() -> None:
-    """The bound that knows the slopes is `ratio_variance_bound` at the noise in kelvin."""
-    noise, size = (0.03, 0.35), 30
-    measured = limits.near_bound(GLASS, noise, bands=PAIR, pixels=size, seed=4, **COMMON)
-    case = {"emissivity": GLASS, "start": 20.0, "stop": 45.0}
-    time = np.arange(350) / 10.0
-    truth, _, _ = cases.simulate(case, Rig(noise=noise), time, size, 4)
-    cold = truth["background_temperature"].values[:, 0]
-    smooth = [polynomial_basis(time, order) for order in range(3, 13)]
-    orders = [np.sqrt(ratio_variance_bound((0.86, 0.72), noise, cold, f)) for f in smooth]
-    apart = np.abs(np.array(orders) / measured["reflection_ratio_bound"].values[1] - 1)
-    np.testing.assert_allclose(apart.min(axis=0), 0, rtol=0, atol=1e-6)
-
-
-def test_truth_on_another_clock() -> None:
-    """Truth is interpolated between its times, and NaN past its end."""
-    ramp = xr.Dataset({"x": ("time", [0.0, 1.0, 2.0])}, {"time": [0.0, 0.1, 0.2]})
-    wanted = xr.DataArray([0.05, 0.25], dims="time")
-    np.testing.assert_allclose(limits.on_clock(ramp, wanted)["x"], [0.5, np.nan], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -100,19 +55,3 @@ def test_experiments_that_cannot_be_made(call: object, message: str) -> None:
     """Groups that are not whole, panels, delays, nuisances and views are refused by their rule."""
     with pytest.raises(ValueError, match=message):
         call()  # type: ignore[operator]
-
-
-def test_cost_of_the_truth() -> None:
-    """A constant error of 0.1 K costs as much; flagged pixels do not count in the coverage."""
-    emissivity = xr.DataArray(GLASS, dims="band", coords={"band": PAIR})
-    rng, times, still = np.random.default_rng(0), np.arange(20) / 10.0, simulation.Background()
-    truth = simulation.independent_pixels(times, emissivity, still, 8, rng, start=300.0, stop=320.0)
-    result = truth.assign(
-        object_temperature=truth["object_temperature"] + 0.1,
-        object_temperature_std=xr.full_like(truth["object_temperature"], 0.06),
-        status=(("y", "x"), np.array([[0] * 6 + [4] * 2])),
-    )
-    cost = nuisances.cost(truth, result)
-    assert float(cost["object_temperature_rmse"]) == pytest.approx(0.1, abs=1e-9)  # [K]
-    assert float(cost["flagged"]) == pytest.approx(0.25)
-    assert float(cost["covered"]) == 1.0

@@ -14,6 +14,7 @@ from dbthermal import response as responses
 from dbthermal.simulation import Background, Rig
 from reproduction import methods
 from reproduction.methods.bcp import BcpSettings
+from reproduction.methods.dbvt import DbvtSettings
 from reproduction.methods.naive import NaiveSettings
 from reproduction.methods.ratio import RatioSettings
 
@@ -102,6 +103,15 @@ def test_naive_says_when_it_stopped_early(glass: xr.Dataset) -> None:
         (NaiveSettings, {"shift_std": -1.0}, r"Invalid shift_std \[K\] of method 'naive' -1.0"),
         (NaiveSettings, {"tolerance": 0.0}, "Invalid tolerance of method 'naive' 0.0"),
         (RatioSettings, {"kind": "wien"}, "Unknown kind 'wien' of method 'ratio'. Must be one of"),
+        (DbvtSettings, {"huber": -1.0}, "Invalid huber -1.0 of method 'dbvt'. Must be at least 0."),
+        (DbvtSettings, {"curvature": 0.0}, "curvature of method 'dbvt'"),
+        (DbvtSettings, {"starts": 0}, "Invalid starts 0 of method 'dbvt'. Must be at least 1."),
+        (
+            DbvtSettings,
+            {"margin": 0.5},
+            r"Invalid margin 0.5 of method 'dbvt'. Must lie in \(0, 0.5",
+        ),
+        (DbvtSettings, {"start": "truth"}, "Unknown start 'truth' of method 'dbvt'. Must be one"),
         (BcpSettings, {"patch": 4}, "Invalid patch 4 of method 'bcp'. Must be odd."),
         (BcpSettings, {"percentile": 101.0}, "Invalid percentile 101.0 of method 'bcp'"),
         (BcpSettings, {"least_transmission": 0.0}, "Invalid least_transmission 0.0 of method"),

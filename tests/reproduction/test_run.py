@@ -52,6 +52,14 @@ def test_results_lie_under_the_stem(run: Run, tmp_path: Path) -> None:
     assert saved["provenance"] == run.provenance
 
 
+def test_a_figure_without_units_is_refused(run: Run) -> None:
+    """Each label of an axis with ticks says its unit."""
+    figure, axes = figures.drawing.canvas(1, 1, (2.0, 2.0))
+    axes[0, 0].set(xlabel="time [s]", ylabel="error")
+    with pytest.raises(ValueError, match=r"Invalid label 'error' of a figure\. Must have a unit"):
+        run.figure(figure, "_scene")
+
+
 def test_inputs_are_noted(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A result of another notebook by its checksum; a collection that is not available is none."""
     path = tmp_path / "results" / "smoke" / "01_calibration_response.zarr"

@@ -13,6 +13,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
 from dbthermal.simulation import Background, Rig
 from reproduction import closed_form, disturbances
+from reproduction.experiments.scores import held, rmse
 
 Array = npt.NDArray[np.float64]
 Case = Mapping[str, Any]
@@ -62,16 +63,15 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
     error = result["object_temperature"] - truth["object_temperature"]
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
-    known, covered = error.notnull(), abs(error) < result["object_temperature_std"]
     within = (of_emissivity < result["emissivity_std"]).where(of_emissivity.notnull())
     pixels = ("y", "x")
     scores = {
-        "object_temperature_rmse": ((error**2).mean("time") ** 0.5).median(pixels),
+        "object_temperature_rmse": rmse(error),
         "emissivity_error": of_emissivity.median(pixels),
-        "object_coverage": covered.where(known).mean(),
+        "object_coverage": held(error, result["object_temperature_std"], 1.0),
         "emissivity_coverage": within.mean(pixels),
         "good": (result["status"] == 0).mean(),
-        "with_temperature": known.any("time").mean(),
+        "with_temperature": error.notnull().any("time").mean(),
     }
     units = {"object_temperature_rmse": "K"}
     return xr.Dataset(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +13,7 @@ from dbthermal.simulation import Background, Rig
 from reproduction import disturbances
 from reproduction.experiments.cases import STEPS
 from reproduction.experiments.limits import on_clock
-from reproduction.experiments.stress import INTERVAL
+from reproduction.experiments.scores import held, rmse
 
 TREATMENTS: Final = ("as recorded", "undone", "without")
 """A capture with the nuisance as it is; with the nuisance undone; and one that never had it."""
@@ -33,8 +32,6 @@ COLUMNS: Final = 4
 
 # Pixels around the scene of `parallax`.
 _MARGIN: Final = 12
-_KELVIN: Final = MappingProxyType({"units": "K"})
-_SHARE: Final = MappingProxyType({"units": "1"})
 
 
 @dataclass(frozen=True)
@@ -168,19 +165,14 @@ def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
     error = result["object_temperature"] - truth["object_temperature"]
     solved, good = error.notnull().any("time"), result["status"] == 0
-    inside = abs(error) < INTERVAL * result["object_temperature_std"]
+    values = {
+        "object_temperature_rmse": (rmse(error), "K"),
+        "flagged": ((~good).where(solved).mean(), "1"),
+        "covered": (held(error.where(good), result["object_temperature_std"]), "1"),
+    }
     return xr.Dataset(
-        {
-            "object_temperature_rmse": _with(((error**2).mean("time") ** 0.5).median(), _KELVIN),
-            "flagged": _with((~good).where(solved).mean(), _SHARE),
-            "covered": _with(inside.where(error.notnull() & good).mean(), _SHARE),
-        }
+        {name: ((), float(it), {"units": unit}) for name, (it, unit) in values.items()}
     )
-
-
-def _with(value: xr.DataArray, attrs: Mapping[str, str]) -> xr.DataArray:
-    """Number as a DataArray with its unit."""
-    return value.reset_coords(drop=True).drop_attrs().assign_attrs(attrs)
 
 
 def _compare(

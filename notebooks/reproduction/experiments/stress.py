@@ -8,13 +8,10 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.special import ndtri
 
 from dbthermal import schema
 from reproduction.experiments.cases import score
-
-INTERVAL: Final = float(ndtri(0.975))
-"""Half-width of a 95 % interval, in standard deviations [1]."""
+from reproduction.experiments.scores import INTERVAL
 
 FAR: Final = 4.0
 """Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""

@@ -13,7 +13,7 @@ from dbthermal.schema import COMPLETED
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
-from reproduction.experiments.stress import INTERVAL
+from reproduction.experiments.scores import held, rmse
 from reproduction.twins.views import Registration
 
 BEAD: Final = 3
@@ -167,11 +167,10 @@ def over_the_image(
     moving, status = _moving(scene), separated["status"]
     good = moving & ((status & int(COMPLETED)) != 0 if completed else status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
-    inside = abs(error) < INTERVAL * separated["object_temperature_std"]
     values = {
         "good": (good.sum() / moving.sum(), "1"),
-        "object_temperature_rmse": (((error**2).mean("time") ** 0.5).median(), "K"),
-        "covered": (inside.where(good).mean(), "1"),
+        "object_temperature_rmse": (rmse(error), "K"),
+        "covered": (held(error, separated["object_temperature_std"]), "1"),
     }
     return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
 

@@ -15,7 +15,7 @@ from dbthermal.simulation import Rig
 from reproduction import disturbances
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
-from reproduction.experiments.stress import INTERVAL
+from reproduction.experiments.scores import held, rmse
 
 # Heating that differs from place to place, by so much [1], over so many pixels: the detail.
 _UNEVEN, _DETAIL = 0.05, 3.0
@@ -122,14 +122,26 @@ def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
     times = {"time": result["time"].values}
     truth = scene["object_temperature"].interp(times, kwargs={"fill_value": "extrapolate"})
     error = result["object_temperature"] - truth.assign_coords(time=result["time"])
-    inside = (abs(error) < INTERVAL * result["object_temperature_std"]).where(error.notnull())
-    rmse = (error**2).mean("time") ** 0.5
-    measured = result["status"] == 0
+    measured, std = result["status"] == 0, result["object_temperature_std"]
     return {
-        "object RMSE, measured [K]": float(rmse.where(measured).median()),
-        "object RMSE, all [K]": float(rmse.median()),
-        "95 % intervals hold, measured [1]": float(inside.where(measured).mean()),
-        "95 % intervals hold, all [1]": float(inside.mean()),
+        "object RMSE, measured [K]": float(rmse(error.where(measured))),
+        "object RMSE, all [K]": float(rmse(error)),
+        "95 % intervals hold, measured [1]": float(held(error.where(measured), std)),
+        "95 % intervals hold, all [1]": float(held(error, std)),
         "pixels measured [1]": float(measured.mean()),
         "pixels with a value [1]": float(error.notnull().any("time").mean()),
     }
+
+
+def findings(scene: xr.Dataset, result: xr.Dataset, rate: float, late: int) -> dict[str, float]:
+    """Errors of the clocks' offset and of the shift of the reflections, by name with unit.
+
+    The second camera is exposed `late` halves of a frame later, at a frame rate [Hz].
+    """
+    off = result["reflection_shift"] - scene["shift"]
+    shifts = {
+        f"shift of the reflections, median error along {axis} [pixel]": off.sel(axis=axis).median()
+        for axis in ("x", "y")
+    }
+    offset = result.attrs["time_offset"][1] * rate - late / 2
+    return {"time offset, error [frame]": offset} | {key: float(it) for key, it in shifts.items()}

@@ -19,11 +19,19 @@ from reproduction.figures.limits import (
     pooling,
 )
 from reproduction.figures.nuisances import disturbances, offsets, parallax
-from reproduction.figures.scenes import separated_film, truth_and_estimate
+from reproduction.figures.scenes import (
+    camera_readings,
+    compared_pictures,
+    raw_pictures,
+    separated_film,
+    truth_and_estimate,
+)
 from reproduction.figures.twins import error_maps, thermocouples
 
 __all__ = [
     "accuracy",
+    "camera_readings",
+    "compared_pictures",
     "compared_reflections",
     "condition_matrix",
     "descents",
@@ -41,6 +49,7 @@ __all__ = [
     "parallax",
     "pooled_materials",
     "pooling",
+    "raw_pictures",
     "reductions",
     "sensitivity",
     "separated_film",

@@ -196,7 +196,7 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
         ):
             image, title = movie.isel(time=index), f"{name}, {moment}"
             scale = limits_of(image)
-            draw_image(figure, axis, image, title, "own unit", cmap="magma", limits=scale)
+            draw_image(figure, axis, image, title, "own unit [1]", cmap="magma", limits=scale)
     grid = axes[2, 0].get_gridspec()
     for axis in axes[2]:
         axis.remove()

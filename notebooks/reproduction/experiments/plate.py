@@ -1,0 +1,172 @@
+"""Heated plate of two materials, simulated or recorded by notebook 00, and how it is judged."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy.constants import zero_Celsius
+
+from dbthermal import alignment, correction, emissivity, schema, separation, simulation
+from dbthermal.instruments.recording import open_capture
+from reproduction import paths
+from reproduction.experiments import emulated_rig
+from reproduction.experiments.scores import held, rmse
+from reproduction.run import Run
+
+_WIDTH = 1.96  # half-width of the 95 % intervals, in standard deviations [1]
+
+
+@dataclass(frozen=True)
+class Plate:
+    """Counts of two bands, corrected, with the response of the bands; and the truth, if known."""
+
+    corrected: xr.Dataset
+    response: xr.Dataset
+    truth: xr.Dataset | None = None
+    reflection_shift: xr.Dataset | None = None  # of cameras side by side
+
+    @property
+    def name(self) -> str:
+        """Name of the scene, for a title."""
+        return "Recorded scene" if self.truth is None else "Twin, a plate of glass and concrete"
+
+
+def simulated(
+    run: Run,
+    materials: Sequence[str],
+    shape: Sequence[int],
+    clock: Sequence[float],
+    seed: int,
+    **warmth: Any,
+) -> Plate:
+    """Simulate people who walk by a heated plate, and the raw counts of it, and correct these.
+
+    The materials are side by side; the clock is the number of frames and their rate [Hz]. Warmth
+    are arguments of `simulation.walkers`. Detector, correction and response are those of notebook
+    01.
+    """
+    rig, size, rng = simulation.Rig(), (shape[0], shape[1]), np.random.default_rng(seed)
+    table = emissivity.embedded_table()["emissivity"].sel(material=materials, band=list(rig.bands))
+    # The scene: object, background and emissivities of every pixel.
+    time, share = np.arange(clock[0]) / clock[1], simulation.side_by_side(table, size)
+    truth = simulation.walkers(time, size, share, rng, **warmth)
+    # What the cameras record of it: mixed signals, noise, fixed pattern, whole numbers.
+    detector = run.open("01_calibration", "_detector").sel(band=list(rig.bands))
+    capture = simulation.capture(simulation.observe(truth, rig.response(), rng), detector)
+    calibration, response = _calibration(run)
+    return Plate(correction.correct_capture(capture, calibration), response, truth)
+
+
+def recorded(
+    run: Run,
+    folder: str,
+    taken: Mapping[str, Any],
+    time_constant: float | None,
+    patch: Sequence[int],
+) -> Plate:
+    """Open what notebook 00 recorded, correct it, and bring both bands onto one grid and clock.
+
+    Of the recording `name` every n-th frame is taken; `views` is the transform from the second view
+    to the first, "translation", "affine" or "homography", none if empty; cameras that stand `apart`
+    see the reflections shifted, which looks like an offset in time, so that their stamps are
+    trusted. The time constant of the pixels [s] undoes their lag, a patch of constant temperature
+    (first row and row after, first column and column after) the cameras' drift.
+    """
+    path = run.input("recorded", paths.root() / folder / f"{taken['name']}.zarr")
+    capture = run.read(open_capture, path).isel(time=slice(None, None, taken["every"]))
+    calibration, response = _calibration(run)
+    reference = None
+    if patch:
+        reference = xr.zeros_like(calibration["bad"].isel(band=0, drop=True))
+        reference[slice(*patch[:2]), slice(*patch[2:])] = True
+    options = {"time_constant": time_constant, "drift_reference": reference}
+    corrected = correction.correct_capture(capture, calibration, **options)
+    model, offset = taken["views"], 0.0 if taken["apart"] else None
+    transform = alignment.register(corrected, model=model) if model else None
+    corrected = alignment.align(corrected, offset=offset, transform=transform)
+    shift = alignment.reflection_shift(corrected, response) if taken["apart"] else None
+    scene = emulated_rig.truth(path.parent).get("scene")  # none of hardware
+    truth = None if scene is None else emulated_rig.shown(scene, corrected)
+    return Plate(corrected, response, truth, shift)
+
+
+def _calibration(run: Run) -> tuple[xr.Dataset, xr.Dataset]:
+    """Correction and response of notebook 01, in the bands of the rig."""
+    bands = list(simulation.Rig().bands)
+    stem = "01_calibration"
+    return run.open(stem, "_correction").sel(band=bands), run.open(stem, "_response").sel(
+        band=bands
+    )
+
+
+def disagreement(apparent: xr.DataArray, status: xr.DataArray) -> tuple[int, int]:
+    """Row and column of the pixel without a flag in which two bands disagree most, in the mean."""
+    difference = abs(apparent.isel(band=0) - apparent.isel(band=1)).mean("time")
+    place = difference.where(status == 0).argmax(("y", "x"))
+    return int(place["y"]), int(place["x"])
+
+
+def readings(
+    films: Mapping[str, xr.DataArray | None], pixel: tuple[int, int], times: Sequence[float]
+) -> pd.DataFrame:
+    """Temperatures [degC] of films (time, y, x) [K] at a pixel and some times [s]; none of None."""
+    place = {"y": pixel[0], "x": pixel[1]}
+    curves = {name: film.isel(place) for name, film in films.items() if film is not None}
+    shown = {name: part.sel(time=times, method="nearest") for name, part in curves.items()}
+    columns = {name: part.values.astype(np.float64) - zero_Celsius for name, part in shown.items()}
+    return pd.DataFrame(columns, pd.Index(times, name="time [s]")).round(2)
+
+
+def known_emissivity(scene: Plate) -> xr.Dataset | None:
+    """Separate frame by frame with the true emissivities; None where these are not known."""
+    if scene.truth is None:
+        return None
+    return separation.solve(
+        scene.corrected,
+        scene.response,
+        "calibrated",
+        emissivity=scene.truth["emissivity"],
+        reflection_shift=scene.reflection_shift,
+        settings=separation.CalibratedSettings(False),
+    )
+
+
+def scores(
+    scene: Plate, alone: xr.Dataset, whole: xr.Dataset, known: xr.Dataset | None
+) -> dict[str, float]:
+    """Headline numbers: shares of pixels, and errors and intervals against the truth, if known.
+
+    Of each pixel by itself, in those without a flag; with known emissivities, in the same pixels;
+    and of the whole scene, in all that have samples.
+    """
+    good, name = alone["status"] == 0, "object_temperature"
+    usable = ~schema.has_flag(whole["status"], "dead_pixel", "invalid_samples")
+    value = whole[name].where(usable)
+    sampled = np.isfinite(scene.corrected["counts"]).all("band") & usable  # that both cameras have
+    shares = {
+        "good_pixels": good.mean(),
+        "whole_finite": value.where(sampled).notnull().sum() / sampled.sum(),
+    }
+    if scene.truth is None or known is None:
+        return {name: float(share) for name, share in shares.items()}
+    noise, noise_of_whole = (separation.without_calibration(part) for part in (alone, whole))
+    error = (alone[name] - scene.truth[name]).where(good)
+    of_known = (known[name] - scene.truth[name]).where(good)
+    of_whole = value - scene.truth[name]
+    values = shares | {
+        "twin_rmse_subspace_K": rmse(error),
+        "twin_rmse_calibrated_K": rmse(of_known),
+        "twin_rmse_whole_K": rmse(of_whole),
+        "twin_coverage": held(error, noise[f"{name}_std"], 1.0),
+        "twin_coverage_95": held(error, noise[f"{name}_std"], _WIDTH),
+        "twin_coverage_95_whole": held(of_whole, noise_of_whole[f"{name}_std"], _WIDTH),
+    }
+    off = abs(alone["emissivity"] - scene.truth["emissivity"]).where(good)
+    within = (off <= noise["emissivity_std"]).where(good).mean(("y", "x"))
+    for band in off["band"].values:
+        values[f"twin_emissivity_error_{band}"] = off.sel(band=band).median()
+        values[f"twin_emissivity_coverage_{band}"] = within.sel(band=band)
+    return {name: float(value) for name, value in values.items()}
