@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
@@ -139,19 +139,6 @@ def test_bad_arguments(change: dict[str, object], message: str) -> None:
     arguments: dict[str, object] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
     with pytest.raises((ValueError, KeyError, TypeError), match=re.escape(message)):
         emissivity.band_table(**(arguments | change))  # type: ignore[arg-type]
-
-
-@given(*[st.floats(0.0, 1.0)] * 2)
-def test_condition_number_closed_form(first: float, second: float) -> None:
-    """The ratio of singular values follows from the Frobenius norm and the determinant."""
-    assume(abs(first - second) > 1e-4)
-    # Norm^2 / (2 det) less 1, without a difference of like numbers.
-    low, high = sorted((first, second))
-    excess = ((1 - high) ** 2 + low**2) / (high - low)
-    expected = 1 + excess + np.sqrt(excess * (excess + 2))
-    (result,) = emissivity.condition_numbers(table(m=[first, second])).values
-    assert result[0, 1] == pytest.approx(expected, rel=1e-9)
-    assert result.diagonal().tolist() == [np.inf, np.inf]
 
 
 def test_pair_summary_leaves_gray_out_of_the_mean() -> None:

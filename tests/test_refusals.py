@@ -116,6 +116,7 @@ def units(array: xr.DataArray, unit: str) -> xr.DataArray:
 ONE, NOTHING = np.ones((60, 3)), cast(Any, None)
 COUNTS, KELVIN = CAPTURE["counts"], units(CAPTURE["counts"], "K")
 EMPTY = CAPTURE.isel(y=slice(0, 0))  # so that what is refused is refused before the work
+LABELS = xr.zeros_like(COUNTS[0, 0], dtype=int)
 STILL = recorded().isel(time=[0])
 FLAGGED = recorded().assign(frame_flags=("time", np.full(60, 65536)))
 FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
@@ -184,6 +185,22 @@ CASES: list[tuple[Call, str]] = [
         r"emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",
     ),
     (lambda: calibrated(emissivity=emissivity_of(0.8, 0.8)), "same in both bands. Must differ"),
+    *(
+        (lambda drift=drift: separation.SubspaceSettings(drift), f"background_drift {drift} K")
+        for drift in (-1.0, np.nan, np.inf)
+    ),
+    (lambda: solve(pool=np.zeros(SHAPE, int)), "Invalid pool of type ndarray"),
+    (lambda: solve(pool=xr.zeros_like(COUNTS[0, 0])), "Invalid dtype float32 of the pool"),
+    (lambda: solve(pool=LABELS[:, :-1]), "Invalid size 7 of 'x' of the pool"),
+    (lambda: solve(pool=LABELS.transpose("x", "y")), r"Invalid dims \('x', 'y'\) of the pool"),
+    (lambda: solve(mask=xr.DataArray(np.ones(60), dims="time")), "dtype float64 of the mask"),
+    (lambda: solve(mask=[True] * 60), "Invalid mask of type list"),
+    (lambda: solve(mask=xr.DataArray(np.ones(9, bool), dims="time")), "of the mask"),
+    (lambda: solve(mask=xr.DataArray([True, True], dims="band")), "of the mask"),
+    (captured(segment=("time", np.ones(60))), "dtype float64 of"),
+    (captured(segment=("time", np.arange(60)[::-1])), "do not fall"),
+    (captured(segment=("x", np.arange(8))), "Must be .'time',"),
+    (captured(segment=("time", np.arange(60))), "59 shutter events in 60 frames"),
     (captured(counts=KELVIN), "units 'K' of 'counts' of the corrected. Must be 'count'"),
     (captured(status=(("x", "y"), np.zeros((8, 6), np.uint16))), "dims .'x', 'y'. of 'status'"),
     (captured(status=(("y", "x"), np.full(SHAPE, 2**21, np.uint32))), "Unknown bits 2097152"),

@@ -2,9 +2,9 @@
 
 ``data_manifest.yaml`` lists the files of every collection with their checksums. If the variable
 DBTHERMAL_DATA names a folder, they are read from there, as ``<collection>/<name>``, and nothing is
-downloaded. Otherwise they lie in the project's ``data/``, and `fetch`, `fetch_collection` and
-``make data``, which runs this module, download the missing ones: no more bytes than are listed, in
-limited time, and from no other scheme. Every path from this module is of a file whose SHA-256 has
+downloaded. Otherwise they lie in the project's ``data/``, and `fetch_collection` and ``make data``,
+which runs this module, download the missing ones: no more bytes than are listed, in limited time,
+and from no other scheme. Every path from this module is of a file whose SHA-256 has
 just been compared.
 """
 
@@ -90,13 +90,7 @@ class Collection(BaseModel):
 
     def url(self, name: str) -> str:
         """Address of a file, with spaces and the like quoted."""
-        return quote((self[name].origin or self.origin) + name, safe=":/")
-
-    def __getitem__(self, name: str) -> File:
-        """File by name; ValueError if it is not listed."""
-        if name not in self.files:
-            raise ValueError(f"Unknown file '{name}'. Must be listed under '{self.title}'.")
-        return self.files[name]
+        return quote((self.files[name].origin or self.origin) + name, safe=":/")
 
 
 class Manifest(BaseModel):
@@ -151,19 +145,14 @@ def local(collection: str) -> dict[str, Path]:
     return {name: _verified(folder / name, file) for name, file in files.items()}
 
 
-def fetch(name: str, collection: str) -> Path:
-    """Verified file, downloaded if it is not in ``data/`` and DBTHERMAL_DATA is not set.
-
-    A download with another checksum is thrown away: ValueError. OSError if the origin cannot be
-    reached, sends more bytes than are listed or sends them too slowly, or leads to another scheme;
-    FileNotFoundError if the mirror lacks the file.
-    """
-    listed, folder = load()[collection], _folder(collection)
-    return _fetch(listed, listed[name], folder)
-
-
 def fetch_collection(collection: str) -> dict[str, Path]:
-    """Verified files of a collection, name to path, several downloads at a time; see `fetch`."""
+    """Verified files of a collection, name to path, several downloads at a time.
+
+    Downloaded are those that are not in ``data/`` if DBTHERMAL_DATA is not set. A download with
+    another checksum is thrown away: ValueError. OSError if the origin cannot be reached, sends more
+    bytes than are listed or sends them too slowly, or leads to another scheme; FileNotFoundError if
+    the mirror lacks a file.
+    """
     listed, folder = load()[collection], _folder(collection)
     with ThreadPoolExecutor(_CONNECTIONS) as pool:
         paths = pool.map(lambda file: _fetch(listed, file, folder), listed.files.values())

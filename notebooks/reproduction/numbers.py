@@ -12,7 +12,7 @@ import numpy as np
 
 from dbthermal import _text as texts
 from dbthermal import store
-from dbthermal.store._integrity import AS_WRITTEN, warn_unchecked
+from dbthermal.store._integrity import AS_WRITTEN
 from dbthermal.store._results import as_json
 
 Number = float | int | str | bool
@@ -51,8 +51,6 @@ def save(
 def read(path: str | Path) -> dict[str, Number]:
     """Read a file of `save`: name to value.
 
-    A file without a checksum, of dbthermal 0.1.0, is read with a warning.
-
     Parameters
     ----------
     path : str or Path
@@ -67,16 +65,8 @@ def read(path: str | Path) -> dict[str, Number]:
     content = _parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that numbers.save wrote.")
-    if content.keys() <= {"numbers", "provenance"}:
-        warn_unchecked(path, stacklevel=2)
-    elif content.pop("sha256", None) != _digest(content):
+    if content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
-    for name, value in content["numbers"].items():
-        if not isinstance(value, bool | int | float | str):
-            raise ValueError(
-                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
-                "number, a string or a boolean."
-            )
     return dict(content["numbers"])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.fft import next_fast_len
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import shift
 
 from dbthermal import alignment
 
@@ -24,19 +24,15 @@ REACH: Final = (6, 48)
 """Largest displacement that is searched for, rows and columns [pixel]."""
 
 _SHARED: Final = 0.4  # share of the object's pixels that still show it when they are displaced
-_WINDOW: Final = 3.0  # standard deviation of a neighbourhood that is displaced as one [pixel]
-_NEAR: Final = 3  # from the scene's displacement, in which a neighbourhood's is searched [pixel]
-_STRONG: Final = 0.8  # quantile of the common change, above which a neighbourhood counts
 _ORDER: Final = 9  # smooth functions that are left out
 _PARTS: Final = 5  # of a capture, in which the still edges are registered
 
 
-def edges_shift(movie: xr.DataArray) -> xr.Dataset:
+def edges_shift(movie: xr.DataArray) -> xr.DataArray:
     """Displacement (axis) [pixel] of the still edges: the second band shows at p the first's p + d.
 
-    From `alignment.register` of the mean pictures of five parts of the capture: `shift` is their
-    median, `low` and `high` their extremes. Parts without edges, as before anything is warm, are
-    left out; NaN if all are.
+    Median of those of five parts of the capture, from `alignment.register` of their mean pictures.
+    Parts without edges, as before anything is warm, are left out; NaN if all are.
     """
     parts: list[Array] = []
     for frames in np.array_split(np.arange(movie.sizes["time"]), _PARTS):
@@ -45,17 +41,15 @@ def edges_shift(movie: xr.DataArray) -> xr.Dataset:
         with contextlib.suppress(ValueError):
             found = alignment.register(capture, model="translation").isel(band=1)
             parts.append(-found.values[[1, 0], 2])
-    known = np.array(parts or [np.full(2, np.nan)])
-    return _spread(np.median(known, axis=0), known.min(axis=0), known.max(axis=0))
+    return _displacement(np.median(parts or [np.full(2, np.nan)], axis=0))
 
 
-def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.Dataset:
+def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArray:
     """Displacement (axis) [pixel] of the reflections: the second band shows at p the first's p + d.
 
     That of the largest correlation of the bands' rapid changes over the object, between whole
-    pixels by a parabola. `low` and `high` are the 10 and 90 % quantiles of the neighbourhoods with
-    the strongest common change, in whole pixels near it. Attributes: `correlation` there, and
-    `correlation_at_0`. NaN if it lies at the end of the search, `REACH`.
+    pixels by a parabola. Attributes: `correlation` there, and `correlation_at_0`. NaN if it lies at
+    the end of the search, `REACH`.
     """
     first, second = _rapid(movie, outline.values)
     scores = _correlations(first, second, outline.values)
@@ -63,17 +57,13 @@ def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.Dataset:
     largest = {"correlation": scores.max(), "correlation_at_0": scores[REACH]}
     attrs = {name: float(value) for name, value in largest.items()}
     if np.any(place == 0) or np.any(place == np.array(scores.shape) - 1):
-        unknown = np.full(2, np.nan)
-        return _spread(unknown, unknown, unknown).assign_attrs(attrs)
+        return _displacement(np.full(2, np.nan)).assign_attrs(attrs)
     peak = place - REACH + np.array([_parabola(scores, place, axis) for axis in (0, 1)])
-    low, high = _neighbourhoods(first, second, outline.values, np.rint(peak).astype(int))
-    return _spread(peak, low, high).assign_attrs(attrs)
+    return _displacement(peak).assign_attrs(attrs)
 
 
-def _spread(value: Array, low: Array, high: Array) -> xr.Dataset:
-    parts = {"shift": value, "low": low, "high": high}
-    variables = {name: ("axis", part, {"units": "1"}) for name, part in parts.items()}
-    return xr.Dataset(variables, {"axis": ["y", "x"]})
+def _displacement(value: Array) -> xr.DataArray:
+    return xr.DataArray(value, {"axis": ["y", "x"]}, "axis", attrs={"units": "pixel"})
 
 
 def _rapid(movie: xr.DataArray, inside: Mask) -> list[Movie]:
@@ -116,41 +106,21 @@ def _parabola(scores: Array, place: npt.NDArray[np.intp], axis: int) -> float:
     return float(0.5 * (below - above) / (below - 2 * here + above))
 
 
-def _neighbourhoods(
-    first: Movie, second: Movie, inside: Mask, near: npt.NDArray[np.intp]
-) -> tuple[Array, Array]:
-    """Quantiles of the displacement of the neighbourhoods with the strongest common change."""
-    steps = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
-    scores, common = [], []
-    for step in steps:
-        moved = np.roll(first, tuple(-(near + step)), axis=(1, 2))
-        cross, auto = (
-            gaussian_filter(np.einsum("tyx,tyx->yx", moved, b), _WINDOW) for b in (second, moved)
-        )
-        common.append(cross)
-        scores.append(cross / np.sqrt(np.maximum(auto, np.finfo(np.float32).tiny)))
-    strength = np.max(common, axis=0)[inside]
-    strong = strength >= np.quantile(strength, _STRONG)
-    best = np.argmax([score[inside][strong] for score in scores], axis=0)
-    found = near + np.array(steps)[best]
-    return np.quantile(found, 0.1, axis=0), np.quantile(found, 0.9, axis=0)
-
-
-def moved(movie: xr.DataArray, displacement: xr.Dataset) -> xr.DataArray:
+def moved(movie: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
     """Movie with the first band taken at p + d, so that both show a reflection at one pixel.
 
     Raises a ValueError if the displacement is not known.
     """
-    if not np.all(np.isfinite(displacement["shift"])):
+    if not np.all(np.isfinite(displacement)):
         raise ValueError("Unknown displacement of the reflections. Must be within the search.")
-    result, back = movie.copy(), -displacement["shift"].values
+    result, back = movie.copy(), -displacement.values
     for frame in result.values[0]:
         frame[...] = shift(frame, back, order=3, mode="nearest")
     return result
 
 
-def shared_outline(outline: xr.DataArray, displacement: xr.Dataset) -> xr.DataArray:
+def shared_outline(outline: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
     """Pixels (y, x) that show the object in both bands, the first displaced if that is known."""
-    back = -np.nan_to_num(displacement["shift"].values)
+    back = -np.nan_to_num(displacement.values)
     there = shift(outline.values.astype(float), back, order=1)
     return outline.copy(data=outline.values & (there > 0.99))

@@ -16,10 +16,14 @@ from dbthermal._coordinates import laid_on
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+CORRELATED: Final = 0.5
+"""Correlation of the bands from which a pixel enters the pooled ratio [1]."""
+
 _FEWEST_STILL: Final = 200  # still pixels
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
 _UNCORRELATED: Final = 0.1
 _FEWEST: Final = 100
+_ORDER: Final = 9  # smooth functions of time
 # Share of the variance of still surroundings over time that their scale must explain.
 _EXPLAINED: Final = 0.9
 _ROUNDS: Final = 20
@@ -69,7 +73,10 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     True
     """
     _check_signal(signal)
-    chosen = _pixels(still, signal, "the still pixels")
+    if still.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {still.dims} of the still pixels. Must be ('y', 'x').")
+    aligned = laid_on(still, signal, "the still pixels", "the signal")
+    chosen = aligned.values.astype(bool).ravel()
     if chosen.sum() < _FEWEST_STILL:
         raise ValueError(
             f"Invalid still pixels: {chosen.sum()} of them. Must be at least {_FEWEST_STILL}."
@@ -87,13 +94,7 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     return result.assign_attrs(scale_undone=bands, scale_explained=shares)
 
 
-def uncalibrated_reflection(
-    signal: xr.DataArray,
-    *,
-    mask: xr.DataArray | None = None,
-    order: int = 9,
-    correlated: float = 0.5,
-) -> xr.Dataset:
+def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
     r"""Separate rapid, correlated changes from slow ones in two bands of any unit.
 
     Without a response there are no temperatures, but rapid changes are still the background's.
@@ -112,12 +113,6 @@ def uncalibrated_reflection(
     signal : DataArray
         (band, time, y, x), two bands in units of their own, `time` [s]; the coordinate `gain`
         (band, time) [1], if it has one, is what the noise of each frame was divided by.
-    mask : DataArray, optional
-        Pixels (y, x) of the object; all if not given.
-    order : int
-        Number of smooth functions.
-    correlated : float
-        Correlation from which a pixel enters the pooled ratio.
 
     Returns
     -------
@@ -129,8 +124,8 @@ def uncalibrated_reflection(
     Raises
     ------
     ValueError
-        If dims or bands are wrong, a value is not finite, the correlation is not in (0, 1), or
-        fewer than 100 pixels are uncorrelated or correlated.
+        If dims or bands are wrong, a value is not finite, or fewer than 100 pixels are uncorrelated
+        (correlation below 0.1) or correlated (above 0.5).
 
     References
     ----------
@@ -151,25 +146,20 @@ def uncalibrated_reflection(
     (2.0, 150)
     """
     _check_signal(signal)
-    if not 0 < correlated < 1:
-        raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
-    everywhere = np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
-    inside = everywhere if mask is None else _pixels(mask, signal, "the mask")
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
-    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, order))
+    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
     rapid = weight * values
     rapid -= [functions @ (functions.T @ part) for part in rapid]
-    quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
+    quiet = np.abs(_correlation(rapid)) < _UNCORRELATED
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
     for band, mean in enumerate(values.mean(axis=1)):
         offset, gain = _frame_errors(rapid[band], mean, quiet)
         rapid[band] -= offset[:, np.newaxis] + gain[:, np.newaxis] * mean
     correlation = _correlation(rapid)
-    quiet = inside & (np.abs(correlation) < _UNCORRELATED)
-    moving = inside & (correlation > correlated)
-    _require(moving, f"correlation above {correlated}")
+    quiet, moving = np.abs(correlation) < _UNCORRELATED, correlation > CORRELATED
+    _require(moving, f"correlation above {CORRELATED}")
     # lambda = s_2^2 / s_1^2
     power = np.einsum("btp,btp->bp", rapid, rapid)
     noise_ratio = float(power[1, quiet].mean() / power[0, quiet].mean())
@@ -190,7 +180,7 @@ def uncalibrated_reflection(
             "pooled_ratio": pooled,
             "noise_ratio": noise_ratio,
             "correlated_pixels": int(moving.sum()),
-            "order": order,
+            "order": _ORDER,
         },
     )
     for name, part in (("ratio", ratio), ("correlation", correlation)):
@@ -234,13 +224,6 @@ def _check_signal(signal: xr.DataArray) -> None:
         raise ValueError(
             f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
         )
-
-
-def _pixels(mask: xr.DataArray, signal: xr.DataArray, label: str) -> Mask:
-    """Pixels (pixel) of a map of the signal's."""
-    if mask.dims != ("y", "x"):
-        raise ValueError(f"Invalid dims {mask.dims} of {label}. Must be ('y', 'x').")
-    return np.asarray(laid_on(mask, signal, label, "the signal").values.astype(bool).ravel())
 
 
 def _frame_weight(signal: xr.DataArray) -> Array:

@@ -36,14 +36,8 @@ MARGIN: Final = 6
 _CHANGE: Final = 2  # frames over which pictures are compared to find out which ones they are
 
 
-WAYS: Final = {
-    "as published": (False, False),
-    "scale undone": (True, False),
-    "displacement undone": (False, True),
-    "both undone": (True, True),
-}
-"""Name of a separation, and whether the frames' scale and the reflections' displacement are
-undone before it."""
+WAYS: Final = {"scale undone": False, "both undone": True}
+"""Name of a separation, and whether the reflections' displacement is undone before it, too."""
 
 
 @dataclass(frozen=True)
@@ -190,8 +184,8 @@ class Comparison:
     undone: xr.DataArray  # inputs (band, time, y, x) without the frames' scale, where it allows
     separated: xr.Dataset  # from `scales.uncalibrated_reflection` of that
     scores: xr.DataArray  # its agreement (time) [1] with the authors' first map
-    edges: xr.Dataset  # from `parallax.edges_shift`
-    reflections: xr.Dataset  # from `parallax.reflections_shift`
+    edges: xr.DataArray  # from `parallax.edges_shift`
+    reflections: xr.DataArray  # from `parallax.reflections_shift`
     table: xr.DataArray  # median agreement (way, map, pixels) [1], NaN where left out
     left_out: Mapping[str, str]  # way -> why
 
@@ -209,11 +203,9 @@ def compare(scene: Scene, number: int) -> Comparison:
     shared = parallax.shared_outline(scene.outline, reflections)
     found: dict[str, xr.Dataset] = {}
     left_out = {}
-    for way in sorted(WAYS, key=lambda way: -WAYS[way][0]):  # the scale undone first
-        of_scale, of_reflections = WAYS[way]
-        movie = undone if of_scale else scene.movie
+    for way, of_reflections in WAYS.items():
         try:
-            movie = parallax.moved(movie, reflections) if of_reflections else movie
+            movie = parallax.moved(undone, reflections) if of_reflections else undone
             parts = scales.uncalibrated_reflection(movie)
         except ValueError as error:
             left_out[way] = str(error)
@@ -222,7 +214,7 @@ def compare(scene: Scene, number: int) -> Comparison:
     if not found:
         raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
     first = found[next(iter(found))]
-    pixels = {"object": shared, "moving": shared & (first["correlation"] > 0.5)}
+    pixels = {"object": shared, "moving": shared & (first["correlation"] > scales.CORRELATED)}
     frames = strongest(first["reflection"], shared, number)
     coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
     table = xr.DataArray(np.full((len(WAYS), 2, 2), np.nan), coords, attrs={"units": "1"})
@@ -252,13 +244,15 @@ def report(compared: Mapping[str, Comparison]) -> str:
     """Tables in Markdown of the displacements and of the agreement, a row a scene and way."""
     lines = [
         "Published videos, not radiometric. Displacements: the second band shows at p the first's",
-        "p + d, to the right; range of five parts, and 10 to 90 % of the strongest neighbourhoods.",
+        "p + d, to the right.",
         "",
         "| scene | still edges [pixel] | reflections [pixel] | their correlation, at 0 |",
         "|---|--:|--:|--:|",
     ]
     for name, one in compared.items():
-        both = " | ".join(_range(part.sel(axis="x")) for part in (one.edges, one.reflections))
+        both = " | ".join(
+            f"{float(part.sel(axis='x')):.2f}" for part in (one.edges, one.reflections)
+        )
         peak, at_0 = (one.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
         lines.append(f"| {name} | {both} | {peak:.2f}, {at_0:.2f} |")
     columns = [f"{kind}, {where}" for kind in KINDS for where in ("object", "moving")]
@@ -278,10 +272,6 @@ def report(compared: Mapping[str, Comparison]) -> str:
         reasons = "".join(f"; {way} left out: {why}" for way, why in one.left_out.items())
         lines.append(f"| {note}{reasons} |" + " |" * (len(columns) + 1))
     return "\n".join(lines) + "\n"
-
-
-def _range(part: xr.Dataset) -> str:
-    return "{:.2f} ({:.2f} to {:.2f})".format(*(float(part[k]) for k in ("shift", "low", "high")))
 
 
 def _file(files: Mapping[str, Path], name: str) -> Path:

@@ -140,13 +140,10 @@ def test_mirror(copies: Path) -> None:
     assert manifest.available("notes")
     assert manifest.local("notes") == expected
     assert manifest.fetch_collection("notes") == expected
-    assert manifest.fetch("two.txt", "notes") == copies / "two.txt"
     sums = {name: hashlib.sha256(content).hexdigest() for name, content in CONTENT.items()}
     assert manifest.provenance("notes") == sums
     with pytest.raises(ValueError, match=r"Unknown collection 'notices'. Must be one of .'notes'."):
         manifest.local("notices")
-    with pytest.raises(ValueError, match=r"Unknown file 'ten\.txt'"):
-        manifest.fetch("ten.txt", "notes")
 
 
 def test_a_mirror_with_a_fault(
@@ -165,7 +162,7 @@ def test_a_mirror_with_a_fault(
     with pytest.raises(FileNotFoundError, match=r"Missing 1 of 2 files of 'notes'.*'two\.txt'"):
         manifest.local("notes")
     with pytest.raises(FileNotFoundError, match=r"Missing file '.*two\.txt'"):
-        manifest.fetch("two.txt", "notes")
+        manifest.fetch_collection("notes")
     assert not (project / "data").exists()
     monkeypatch.setenv(locked.MIRROR, str(copies / "absent"))
     with pytest.raises(ValueError, match=r"Invalid DBTHERMAL_DATA '.*absent'\. Must name a folder"):
@@ -173,7 +170,7 @@ def test_a_mirror_with_a_fault(
 
 
 def test_download(served: Path, project: Path) -> None:
-    """Without a mirror, `fetch` alone takes files from their origin, once, into data/.
+    """Without a mirror, `fetch_collection` alone takes files from their origin, once, into data/.
 
     One with a wrong checksum raises an error and is removed.
     """
@@ -183,7 +180,7 @@ def test_download(served: Path, project: Path) -> None:
     assert not (project / "data").exists()
     (served / "two.txt").write_bytes(b"SECOND")
     with pytest.raises(ValueError, match=rf"two\.txt.*{hashlib.sha256(b'second').hexdigest()}"):
-        manifest.fetch("two.txt", "notes")
+        manifest.fetch_collection("notes")
     assert not (project / "data" / "notes" / "two.txt").exists()
     (served / "two.txt").write_bytes(CONTENT["two.txt"])
     found = manifest.fetch_collection("notes")
@@ -196,7 +193,7 @@ def test_download(served: Path, project: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("endless.txt", r"Invalid size of 'http.*endless\.txt'\. Must be the listed 6 bytes"),
+        ("endless.txt", r"Invalid size of 'http.*endless\.txt'\. Must be the listed 5 bytes"),
         ("to-ftp:  127.0.0.1 x.txt", "Invalid redirect of 'http.*' to 'ftp://127.0.0.1/x'"),
         ("to-file:   etc passwd.txt", "Invalid redirect of 'http.*' to 'file:///etc/passwd'"),
         ("to-.. all%20notes to-two.txt.txt", "404"),
@@ -211,19 +208,20 @@ def test_a_download_that_misbehaves(
         manifest.Collection, "url", lambda self, _: quote(f"{self.origin}{name}", ":/")
     )
     with pytest.raises(OSError, match=message):
-        manifest.fetch("two.txt", "notes")
+        manifest.fetch_collection("notes")
     assert not any((project / "data" / "notes").iterdir())
 
 
 def test_a_slow_download_ends(served: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A download that trickles on ends after the time that its listed size allows."""
     assert served.is_dir()
-    edit(project, "bytes: 6", "bytes: 1000")
+    for size in ("bytes: 5", "bytes: 6"):
+        edit(project, size, "bytes: 1000")
     for name, value in (("_SLOWEST", 5000), ("_TIMEOUT", 0.3)):
         monkeypatch.setattr(manifest, name, value)
     monkeypatch.setattr(manifest.Collection, "url", lambda self, _: f"{self.origin}slow.txt")
     with pytest.raises(OSError, match=r"Slow download of 'http.*slow\.txt'"):
-        manifest.fetch("two.txt", "notes")
+        manifest.fetch_collection("notes")
 
 
 @pytest.mark.parametrize("folder", [False, True])

@@ -1,6 +1,5 @@
 """Headline numbers come back as they were written, or an error names the file."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ def test_numbers_are_finite(value: Any, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.filterwarnings("ignore:No checksums")
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
@@ -71,16 +69,6 @@ def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
             assert "a.json" in str(error)  # noqa: PT017
             refused += 1
     assert refused > 0.97 * len(whole) * 8 / 13
-
-
-def test_numbers_without_a_checksum_are_read_with_a_warning(tmp_path: Path) -> None:
-    """Numbers of dbthermal 0.1.0 are read as before, and said to be unchecked."""
-    numbers.save({"rmse_K": 0.21}, tmp_path / "a.json", RECORD)
-    content = json.loads((tmp_path / "a.json").read_text())
-    del content["sha256"]
-    (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.json'"):
-        assert numbers.read(tmp_path / "a.json") == {"rmse_K": 0.21}
 
 
 def test_numbers_stay_outside_of_stores(tmp_path: Path) -> None:

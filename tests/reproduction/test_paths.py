@@ -32,24 +32,6 @@ def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: Path) ->
         paths.root()
 
 
-def test_places(project: Path) -> None:
-    """All of a stem has its name; recordings of hardware lie apart from what tasks remove."""
-    stem = "03_simulation"
-    places = {
-        "params/03_simulation.yaml": paths.params(stem),
-        "results/full/03_simulation_scene.png": paths.result("full", stem, "_scene.png"),
-        "results/cells/03_simulation": paths.cells(stem),
-        "data_manifest.yaml": paths.manifest(),
-        "data": paths.data(),
-        "params/sessions/scene.yaml": paths.session("scene"),
-        "recordings/lab": paths.recordings("lab"),
-        "results/full/00_acquisition": paths.emulated("full", "00_acquisition"),
-    }
-    assert {project / name: place for name, place in places.items()} == {
-        place: place for place in places.values()
-    }
-
-
 @pytest.mark.usefixtures("project")
 def test_names_are_no_paths() -> None:
     """A run is one folder's name, a stem begins with two digits, an ending has a suffix."""

@@ -116,15 +116,6 @@ def test_vessels_peak_where_the_paper_s_did(name: str) -> None:
     np.testing.assert_allclose(float(readings.max()) - 273.15, celsius, rtol=0, atol=0.15)  # K
 
 
-def test_the_level_rises() -> None:
-    """At the end of the pouring the wall is wet below the level, dry above, and was dry before."""
-    vessel = vessels.WINEGLASS
-    height = np.array([0.10, 0.14, 0.21])
-    before, after = (vessel.wetted(height, vessel.start + t) for t in (0.0, vessel.duration))
-    assert before.max() < 0.01
-    np.testing.assert_allclose(after, [1.0, 1.0, 0.0], rtol=0, atol=0.01)
-
-
 def test_prints_fade() -> None:
     """A print is warmest when the capture starts, by at least 1 K, and only fades from then on;
     a person far away moves the plate's background and leaves the print as it is.
@@ -140,15 +131,6 @@ def test_prints_fade() -> None:
     np.testing.assert_allclose(alone[BACKGROUND], AMBIENT, rtol=0, atol=1e-9)  # K
     xr.testing.assert_equal(alone[OBJECT], visited[OBJECT])
     assert float(visited[BACKGROUND].max()) > AMBIENT + 5
-
-
-def test_fingers_are_reflection_only() -> None:
-    """The plate stays at room temperature while warm skin is reflected, now and then."""
-    scene = twins.twin("fingers", SLOW, rng())
-    np.testing.assert_allclose(scene[OBJECT], AMBIENT, rtol=0, atol=1e-9)  # K
-    warm = scene[BACKGROUND] > AMBIENT + 5
-    assert warm.any("time").mean() > 0.2
-    assert not warm.all("time").any()
 
 
 def test_letters_are_reflected_in_the_plate() -> None:
@@ -263,15 +245,6 @@ def test_thermocouples_read_the_mean_under_the_bead() -> None:
     shifted = twins.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.5)[0] - exact
     assert abs(float(shifted[0])) > 0.01
     np.testing.assert_allclose(shifted, shifted[0], rtol=0, atol=1e-9)  # K
-
-
-def test_a_probe_is_on_its_ring() -> None:
-    """A probe is at its angle on the ring of vertices that is nearest to its height."""
-    cone = surfaces.revolved([(0.05, 0.0), (0.03, 0.1)], 0.03)
-    place = np.array(surfaces.on_wall(cone, 0.013, 30.0))
-    assert place[2] in cone.vertices[:, 2]
-    expected = (0.05 - 0.2 * place[2]) * np.array([0.5, -np.sqrt(0.75)])
-    np.testing.assert_allclose(place[:2], expected, rtol=0, atol=1e-12)  # m
 
 
 def bead(name: str, size: int) -> Callable[[], object]:

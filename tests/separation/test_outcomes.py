@@ -3,19 +3,15 @@
 Bounds are what the code reached on three seeds when they were written, with a tenth to spare.
 """
 
-from importlib.metadata import entry_points
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import pytest
 import xarray as xr
-from scenes import RIG, SHAPE, Shelf, field, held, judged
+from scenes import SHAPE, Shelf, field, held, judged
 
-from dbthermal import separation, simulation, store
-from dbthermal.scene import separate_capture
+from dbthermal import separation
 from dbthermal.schema import COMPLETED, Status
-from reproduction.experiments import whole
 
 
 class Bounds(NamedTuple):
@@ -302,52 +298,3 @@ def test_a_stream_agrees_with_the_whole_capture(shelf: Shelf) -> None:
         for other, lowest in ((scene.truth, least), (batch, 0.95)):
             assert held(one, other, where=good) > lowest, name
     assert float(good.sum() / (batch["status"] == 0).sum()) > 0.95
-
-
-@pytest.fixture(scope="module")
-def stores(shelf: Shelf, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the stores of a capture of two materials and of its response."""
-    folder, scene = tmp_path_factory.mktemp("stores"), shelf.scene("two materials")
-    for name, part in (("capture", scene.capture), ("response", scene.response)):
-        store.save(part, folder / f"{name}.zarr", store.provenance({}))
-    return folder
-
-
-def assert_same(found: xr.Dataset, expected: xr.Dataset) -> None:
-    """Fail if a variable of the separation differs."""
-    for name in ("object_temperature", "object_temperature_std", "emissivity", "status"):
-        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, err_msg=name)
-
-
-def test_the_command_line_separates_as_the_function_does(
-    shelf: Shelf, stores: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """`dbthermal separate` writes the result of `separate`, and says what it wrote."""
-    names = [str(stores / f"{name}.zarr") for name in ("capture", "response", "whole")]
-    (program,) = entry_points(group="console_scripts", name="dbthermal")
-    assert program.load()(["separate", *names[:2], "-o", names[2]]) == 0
-    assert capsys.readouterr().out
-    assert_same(store.open_dataset(names[2]), shelf.outcome("two materials").result)
-
-
-@pytest.mark.parametrize("name", ["one place", pytest.param("apart", marks=pytest.mark.slow)])
-def test_raw_counts_in_one_call(shelf: Shelf, name: str) -> None:
-    """With a pattern, bad pixels and a calibration of few frames: as of perfect cameras, nearly."""
-    scene, rng = shelf.scene(name), np.random.default_rng(6)
-    detector = simulation.pattern(RIG, SHAPE, rng)
-    movies = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 6), 64, detector, rng)
-    raw = simulation.capture(scene.capture, detector)
-    options: dict[str, Any] = {"registration": None, "aligning": {"offset": 0.0}}
-    result = separate_capture(raw, *whole.calibrate(movies), **options)
-    figures, perfect = judged(scene, result), judged(scene, shelf.outcome(name).result)
-    print(name, {key: round(value, 4) for key, value in figures.items()})
-    assert result.attrs["reflection_shift"] == ("none" if name == "one place" else "given")
-    if name != "one place":  # given by the step before
-        off = (result["reflection_shift"] - scene.truth["shift"]).sel(axis="x")
-        spread = float(np.sqrt((off.where(result["status"] == 0) ** 2).mean()))
-        print(f"shift off by {spread:.3f} pixel")
-        assert spread < 0.3
-    assert figures["measured"] > perfect["measured"] - 0.05
-    assert figures["p90"] < 0.1 + perfect["p90"]  # K
-    assert 0.9 < figures["cover"] < 0.99
-    assert figures["silent"] == 0.0

@@ -5,15 +5,15 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import robust_laplacian
+import trimesh
 from scipy import sparse
 
 from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
 
 _FLATTEST: Final = 1e-9
-"""A face whose area falls below this fraction of its longest edge squared is degenerate [1]."""
+"""A face that is flatter than this fraction of the mesh's size has no area [1]."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,13 @@ class Shell:
     That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in
     still air, but 1 where hot water wets it. There the half wall up to the middle belongs in
     series with the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some
-    :math:`d^2 / 2 \alpha` (6 s). The arrays are kept as read-only copies.
+    :math:`d^2 / 2 \alpha` (6 s).
 
     Attributes
     ----------
-    vertices : ndarray, shape (vertex, 3)
-        Positions [m].
-    faces : ndarray, shape (face, 3)
-        Three vertex numbers a face. Their sense does not matter; edges may be open (insulated)
-        or shared by more than two faces.
+    mesh : Trimesh
+        Surface [m]. The sense of the faces does not matter; edges may be open (insulated) or shared
+        by more than two faces.
     thickness : float
         Thickness d [m].
     solid : Solid
@@ -77,33 +75,34 @@ class Shell:
     Raises
     ------
     ValueError
-        If a shape or a number is wrong, a vertex belongs to no face, or a face is repeated or
-        has no area.
+        If a number is not finite, a vertex belongs to no face, or a face is repeated or has no
+        area.
     """
 
-    vertices: Array
-    faces: npt.NDArray[np.int64]
+    mesh: trimesh.Trimesh
     thickness: float
     solid: Solid
 
     def __post_init__(self) -> None:
-        """Copy, protect and check the arrays."""
-        if not (np.isfinite(self.thickness) and self.thickness > 0):
-            raise ValueError(
-                f"Invalid thickness {self.thickness} m of a shell. Must be finite and positive."
-            )
-        if not np.issubdtype(np.asarray(self.faces).dtype, np.integer):
-            raise ValueError(
-                f"Invalid type {np.asarray(self.faces).dtype} of faces. Must be integers."
-            )
-        for name, dtype in (("vertices", np.float64), ("faces", np.int64)):
-            kept = np.array(getattr(self, name), dtype=dtype, order="C")
-            if kept.ndim != 2 or kept.shape[1] != 3 or not len(kept):
-                raise ValueError(f"Invalid shape {kept.shape} of {name}. Must be (n, 3), n > 0.")
-            kept.flags.writeable = False
-            object.__setattr__(self, name, kept)
-        _check_vertices(self.vertices, self.faces)
-        _check_faces(self.vertices, self.faces)
+        """Check thickness and mesh."""
+        require_positive("thickness [m] of a shell", self.thickness)
+        mesh = self.mesh
+        if mesh.is_empty:
+            raise ValueError("Empty mesh of a shell. Must have a face.")
+        for what, holds in (
+            ("vertex {} that is not finite", np.isfinite(mesh.vertices).all(axis=1)),
+            ("vertex {} of no face", mesh.referenced_vertices),
+            ("face {} without an area", mesh.nondegenerate_faces(_FLATTEST * mesh.scale)),
+            ("face {}, as an earlier one", mesh.unique_faces()),
+        ):
+            if not np.all(holds):
+                number = np.flatnonzero(~np.asarray(holds))[0]
+                raise ValueError(f"Invalid {what.format(number)}. Must be left out.")
+
+    @property
+    def size(self) -> int:
+        """Number of vertices."""
+        return len(self.mesh.vertices)
 
     @cached_property
     def _operators(self) -> tuple[Any, Array]:
@@ -115,7 +114,7 @@ class Shell:
         (2020), Computer Graphics Forum 39(5), doi:10.1111/cgf.14069.
         """
         laplacian, mass = robust_laplacian.mesh_laplacian(
-            np.array(self.vertices), np.array(self.faces)
+            np.array(self.mesh.vertices, dtype=np.float64), np.array(self.mesh.faces)
         )
         return sparse.csr_matrix(laplacian), np.asarray(mass.diagonal())
 
@@ -142,41 +141,3 @@ class Shell:
     def capacity(self) -> Array:
         """Heat capacity of every vertex, (vertex,) [J/K]."""
         return self.capacity_per_area * self.area
-
-
-def _check_vertices(vertices: Array, faces: npt.NDArray[np.int64]) -> None:
-    """Refuse positions that are not finite, numbers that do not exist and unused vertices."""
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-    if bad.size:
-        raise ValueError(f"Invalid vertex {bad[0]}: {vertices[bad[0]]} m. Must be finite.")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(
-            f"Invalid vertex numbers {faces.min()} to {faces.max()} in the faces. "
-            f"Must lie in [0, {len(vertices)})."
-        )
-    unused = np.setdiff1d(np.arange(len(vertices)), faces)
-    if unused.size:
-        raise ValueError(
-            f"Invalid vertex {unused[0]}: in no face ({unused.size} such). "
-            "Must belong to a face, or be left out."
-        )
-
-
-def _check_faces(vertices: Array, faces: npt.NDArray[np.int64]) -> None:
-    """Refuse faces without an area and repeated faces."""
-    corners = vertices[faces]
-    edges = np.roll(corners, -1, axis=1) - corners
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    flat = np.flatnonzero(~(area > _FLATTEST * longest**2))
-    if flat.size:
-        raise ValueError(
-            f"Invalid face {flat[0]} with vertices {faces[flat[0]].tolist()} "
-            f"({flat.size} such). Must have an area."
-        )
-    different, count = np.unique(np.sort(faces, axis=1), axis=0, return_counts=True)
-    if np.any(count > 1):
-        raise ValueError(
-            f"Invalid face with vertices {different[count > 1][0].tolist()}: given "
-            f"{count.max()} times. Must be given once."
-        )

@@ -82,10 +82,11 @@ def simulate(
     A square of glass in air, without conduction, relaxes with the time constant
     :math:`\rho c d / h`, here 562.5 s.
 
-    >>> import numpy as np
+    >>> import trimesh
     >>> from reproduction import heat
-    >>> corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
-    >>> plate = heat.Shell(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0.003, heat.GLASS)
+    >>> corners = [[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]]
+    >>> square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+    >>> plate = heat.Shell(square, 0.003, heat.GLASS)
     >>> air = heat.Convection(10.0, 293.15)
     >>> temperature = heat.simulate(plate, [0.0, 562.5], 303.15, [air], step=5.0)
     >>> (temperature[-1] - 293.15).round(2).tolist()
@@ -94,7 +95,7 @@ def simulate(
     times = _times(time)
     limit = np.inf if step is None else float(require_positive("step [s]", step))
     stepper = _Stepper(shell, exchanges, float(require_positive("tolerance [K]", tolerance)))
-    temperature = stepper.start(_initial(initial, len(shell.vertices)), times[0])
+    temperature = stepper.start(_initial(initial, shell.size), times[0])
     result = np.empty((times.size, temperature.size))
     result[0] = temperature
     for index in range(1, times.size):
@@ -124,7 +125,7 @@ class _Stepper:
     def __init__(self, shell: Shell, exchanges: Sequence[Exchange], tolerance: float) -> None:
         self.shell, self.exchanges, self.tolerance = shell, exchanges, tolerance
         self.weight = 0.0
-        self.slope = np.zeros(len(shell.vertices))
+        self.slope = np.zeros(shell.size)
 
     def start(self, temperature: Array, time: float) -> Array:
         """Initial temperature [K]; keep its rate of change [K/s]."""

@@ -317,7 +317,7 @@ def since(
     Until the start [s] all was at room temperature; from then on the wall, of a thickness [m] and
     a solid, has its exchanges.
     """
-    shell = heat.Shell(mesh.vertices, mesh.faces, *wall)
+    shell = heat.Shell(mesh, *wall)
     before = np.array([start]) if start < time[0] else np.empty(0)
     times = np.concatenate([before, time])
     return heat.simulate(shell, times, AMBIENT, exchanges, step=STEP)[before.size :]
