@@ -16,7 +16,7 @@ def test_medians_count_what_the_default_solves() -> None:
     }
     comparison = xr.Dataset(parts, {"variant": ["subspace", "other"]})
     medians = experiments.medians(comparison)
-    expected = {"object_temperature_rmse": [0.2, 2.0], "solved": [0.75] * 2, "good": [0.75] * 2}
+    expected = {"object_temperature_rmse": [0.2, 2.0], "solved": [0.75] * 2}
     for name, values in (expected | {"wrong": [0.0, 0.0]}).items():
         np.testing.assert_allclose(medians[name], values, rtol=0, atol=1e-12)
     lost = experiments.medians(comparison.isel(pixel=[1, 2]))

@@ -81,15 +81,15 @@ def peak(source: Path, target: Path, memory: float) -> float:
 
 @pytest.mark.slow
 def test_memory_is_the_limit_of_a_process(tmp_path: Path) -> None:
-    """Of 200 MB of counts a process that may take 500 MB takes no more, its programs included."""
+    """Of 200 MB of counts a process that may take 700 MB takes no more, its programs included."""
     flat = benchmark.capture(81920, 300, 2)["counts"].values.reshape(2, 300, 128, 640)
     movie = {"counts": (("band", "time", "y", "x"), flat, {"units": "count"})}
     coords = {"band": list(RIG.bands), "time": np.arange(300) / 10.0}
     store.save(xr.Dataset(movie, coords), tmp_path / "all.zarr", {})
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
-        found = fresh.submit(peak, tmp_path / "all.zarr", tmp_path / "result.zarr", 5e8).result()
+        found = fresh.submit(peak, tmp_path / "all.zarr", tmp_path / "result.zarr", 7e8).result()
     print(f"{found / 1e6:.0f} MB")
-    assert 2e8 < found <= 5e8
+    assert 2e8 < found <= 7e8
 
 
 def test_options_of_pixels_are_cut_into_rows(path: Path, tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
     `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the default
     has no pixel or the variant loses half of them; `wrong` [1]: share of these pixels with an
     emissivity error above `WRONG`, or lost; `solved` [1]: share of all pixels with an object
-    temperature; `good` [1]: share of all without any flag.
+    temperature.
     """
     over = [dim for dim in ("pixel", "seed") if dim in comparison.dims]
     known = comparison["object_temperature_rmse"].notnull()
@@ -118,7 +118,6 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
     shares = {
         "wrong": off.where(counted).mean(over),
         "solved": known.mean(over),
-        "good": (comparison["status"] == 0).mean(over),
     }
     parts |= {name: part.assign_attrs(units="1") for name, part in shares.items()}
     return xr.Dataset(parts, attrs=comparison.attrs)

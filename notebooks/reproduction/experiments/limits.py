@@ -99,8 +99,7 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
     `reflection_ratio_error` [1] and `object_temperature_error` [K], root mean square over the
     pixels, and `reflection_ratio_bound`, `object_temperature_bound` (knowing) of the same pixels;
     `scatter` (knowing) [1], standard deviation over the pixels of the ratio's error over its bound;
-    `excess` (knowing) [1], the object's error over its bound; `solved` and `flagged` [1], shares of
-    the pixels with a temperature, and with a flag.
+    `excess` (knowing) [1], the object's error over its bound.
     """
     parts = {
         name: _rms(measured[name])
@@ -111,8 +110,6 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
             "pixel"
         ),
         "excess": parts["object_temperature_error"] / parts["object_temperature_bound"],
-        "solved": measured["object_temperature_error"].notnull().mean("pixel"),
-        "flagged": (measured["status"] != 0).mean("pixel"),
     }
     shares = {name: part.assign_attrs(units="1") for name, part in shares.items()}
     return xr.Dataset(parts | shares, attrs=measured.attrs)
@@ -139,7 +136,7 @@ def pooled(
         `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
         groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
         `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
-        separation's own standard deviation of the ratio, root mean square; `flagged` [1].
+        separation's own standard deviation of the ratio, root mean square.
     """
     uneven = [size for size in sizes if size < 1 or pixels % size]
     if uneven:
@@ -174,7 +171,6 @@ def _of_groups(size: int, truth: xr.Dataset, result: xr.Dataset, ratio: float) -
     measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
         units="K"
     )
-    measured["flagged"] = (result["status"] != 0).mean().assign_attrs(units="1")
     return xr.Dataset(measured)
 
 
@@ -233,7 +229,6 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
         {
             "right": ((), right / sum(part.size for part in inner), units),
             "bleeding": ((), bleeding, units),
-            "distance": (("y", "x"), distance, {"units": "pixel"}),
         }
     )
 

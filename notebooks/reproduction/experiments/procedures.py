@@ -30,9 +30,8 @@ def compare_procedures(
 
     A series' common errors are drawn anew for each of two or more repeats. `true` (object, band);
     over (object, procedure, band): `mean` of the estimates, their standard deviation `spread`,
-    their root mean square `error` and `largest` error, root mean square `stated` of the stated
-    standard deviations, and `coverage`, the share of errors within one, 0.68 for a calibrated
-    uncertainty [1].
+    their `largest` error, and `coverage`, the share of errors within the stated deviation, 0.68 for
+    a calibrated uncertainty [1].
     """
     true, bench = _true(response, repeats), Bench()
     estimates = np.array(
@@ -43,9 +42,7 @@ def compare_procedures(
     statistics = {
         "mean": value.mean(axis=1),
         "spread": value.std(axis=1, ddof=1),
-        "error": np.sqrt(np.mean(error**2, axis=1)),
         "largest": np.abs(error).max(axis=1),
-        "stated": np.sqrt(np.mean(std**2, axis=1)),
         "coverage": np.mean(np.abs(error) < std, axis=1),
     }
     dims, unit = ("object", "procedure", "band"), {"units": "1"}

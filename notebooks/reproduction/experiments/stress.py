@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import schema
 from reproduction.experiments.cases import score
 from reproduction.experiments.scores import INTERVAL
 
@@ -46,13 +45,14 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
         - `width` (band): stated standard deviation of the emissivity over the robust standard
           deviation of its error, both of all pixels with a value; 1 for a calibrated uncertainty;
         - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
-        - `flagged`, and `by_flag` (flag): share of pixels with any flag, with this flag;
+        - `flagged`: share of pixels with any flag;
         - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
         - `status` (pixel), and `bad` (kind, pixel), true where bad.
     """
-    statistics = {**_coverage(truth, result), **_flags(result["status"])}
+    statistics = _coverage(truth, result)
     bad, flagged = _bad(truth, result), _flat(result["status"] != 0)
     statistics |= {
+        "flagged": flagged.mean(),
         "width": _width(truth, result),
         "bad_pixels": bad.sum("pixel"),
         "bad_flagged": _share(flagged, bad, ("pixel",)),
@@ -122,13 +122,3 @@ def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
     of_object, of_emissivity = _beyond(truth, result, FAR)
     label = xr.DataArray(list(KINDS), dims="kind", name="kind")
     return xr.concat([_flat(of_object), _flat(of_object | of_emissivity)], label)
-
-
-def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
-    """Share of pixels with any flag, and with each."""
-    bits = xr.DataArray(
-        np.array(list(schema.Status), dtype=np.uint32),
-        dims="flag",
-        coords={"flag": list(schema.Status.bits())},
-    )
-    return {"flagged": (status != 0).mean(), "by_flag": ((status & bits) != 0).mean(_PIXELS)}
