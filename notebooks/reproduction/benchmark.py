@@ -1,32 +1,60 @@
-"""Time and memory on this machine: tables in results/bench.
+"""Time, accuracy and memory on this machine: tables in results/bench.
 
-First those of the default call, see `default_call`, then the time of every method. Times of one
-thread are its processor's, the better of two. What a series would not end within `LONGEST` is left
-out of it. All captures are simulated plate glass before which people walk, at `RATE`.
+First those of the default call, `separation.separate`, and of `solve`: people walk by a plate of
+glass that is heated, before cameras at one place or apart. Then the time of every method. Times of
+one thread are its processor's, the better of two. What a series would not end within `SHORT` is
+left out of it. All captures are simulated, at `RATE`.
 """
 
 import argparse
+import math
 import os
 import platform
 import re
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import xarray as xr
 
-from dbthermal import separation, simulation, store
-from reproduction import default_call, experiments, paths, verify
+from dbthermal import alignment, separation, simulation, store
+from reproduction import experiments, paths, verify
 from reproduction import methods as outside
-from reproduction.default_call import processor_time
+from reproduction.experiments.pictures import Picture, smooth_shift
+from reproduction.experiments.scores import held, rmse
+
+T = TypeVar("T")
 
 RATE: Final = 10.0  # [Hz]
-LONGEST: Final = default_call.SHORT  # [s]
+SHAPE: Final = (96, 128)
+SMALL: Final = (28, 40)  # of the first calls, which compile
+WHOLE: Final = (512, 640)  # of a camera
+FRAMES: Final = 350
+RAPID: Final = (2.0, 6.0)  # time of a rapid rise [s]
+CAMERAS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "one place": {},
+    "apart": {"shift": (2.4, 1.2)},  # its middle and its variation [pixel]
+    "one place, rapid heating": {"rise": RAPID},
+    "apart, rapid heating": {"shift": (2.4, 1.2), "rise": RAPID},
+}
+"""Scenes by the cameras' places and the object's heating."""
+
+WHOLE_SCENES: Final = ("one place", "apart")
+SHORT: Final = 8.0
+"""Time from which a call is measured once, not twice [s]."""
+
+LONGEST_WHOLE: Final = 900.0
+"""Time of one thread from which a whole frame is left out [s]."""
+
 USUAL: Final = {"pixels": 512, "frames": 350, "bands": 2}
 SERIES: Final = {
     "pixels": (128, 512, 2048, 8192, 32768, 131072),
@@ -41,6 +69,141 @@ EMISSIVITY: Final = (0.86, 0.72, 0.88, 0.95)
 
 Times = dict[tuple[str, str], dict[int, float]]
 """By method and size that is varied: seconds of one thread at each size."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call on a scene; its object where there is no flag."""
+
+    pixel: float  # time of one thread's processor, a pixel [s]
+    rmse: float  # median over the pixels [K]
+    cover: float  # share of the samples whose 95 % interval holds the truth [1]
+    frame_rate: float = np.nan  # of whole frames, by two threads [Hz]
+    peak: float = np.nan  # memory of the process, the capture included [byte]
+
+
+Calls = dict[tuple[str, str], Call]
+"""By function and scene."""
+
+
+def scene(cameras: str, shape: tuple[int, int], frames: int = FRAMES) -> xr.Dataset:
+    """Truth, and the `counts` that the cameras see of it."""
+    rng, rig, options = np.random.default_rng(3), simulation.Rig(), CAMERAS[cameras]
+    shift = smooth_shift(shape, *options["shift"]) if "shift" in options else None
+    glass = xr.DataArray(list(EMISSIVITY[:2]), {"band": list(rig.bands)}, "band")
+    picture = Picture(shape, walkers=7, rise=options.get("rise"))
+    truth = picture.draw(np.arange(frames) / RATE, glass, rng, shift)
+    return truth.assign(counts=simulation.observe(truth, rig.response(), rng)["counts"])
+
+
+def separate(counts: xr.DataArray, workers: int = 1) -> xr.Dataset:
+    """Separate by the default call."""
+    return separation.separate(counts.to_dataset(), simulation.Rig().response(), workers=workers)
+
+
+def solver(counts: xr.DataArray, cameras: str) -> Callable[[], xr.Dataset]:
+    """Call of `solve`, before cameras apart with the shift of the reflections found beforehand."""
+    capture, response = counts.to_dataset(), simulation.Rig().response()
+    apart = "shift" in CAMERAS[cameras]
+    shift = alignment.reflection_shift(capture, response) if apart else None
+    return partial(separation.solve, capture, response, reflection_shift=shift, workers=1)
+
+
+def processor_time(call: Callable[[], T]) -> tuple[float, T]:
+    """Processor time of a call [s], the better of two unless it is long, and its result."""
+    taken: list[float] = []
+    while not taken or (len(taken) < 2 and taken[0] < SHORT):
+        start = time.process_time()
+        result = call()
+        taken.append(time.process_time() - start)
+    return min(taken), result
+
+
+def judged(truth: xr.Dataset, seconds: float, result: xr.Dataset) -> Call:
+    """Time and accuracy of a result."""
+    name = "object_temperature"
+    error = (result[name] - truth[name]).where(result["status"] == 0)
+    cover = held(error, result[f"{name}_std"])
+    return Call(seconds / result["status"].size, float(rmse(error)), float(cover))
+
+
+def measured(
+    folder: Path, shape: tuple[int, int] = SHAPE
+) -> Iterator[tuple[tuple[str, str], Call]]:
+    """Yield the default call on each scene, then `solve`; whole frames by files in a folder."""
+    solved = {}
+    for cameras in CAMERAS:
+        few = scene(cameras, SMALL)["counts"]
+        separate(few)  # imports and compiles
+        solver(few, cameras)()
+        truth = scene(cameras, shape)
+        call = judged(truth, *processor_time(partial(separate, truth["counts"])))
+        solved[cameras] = judged(truth, *processor_time(solver(truth["counts"], cameras)))
+        if cameras in WHOLE_SCENES and call.pixel * math.prod(WHOLE) < LONGEST_WHOLE:
+            seconds, peak = whole_frame(cameras, folder / f"{cameras}.zarr")
+            call = replace(call, frame_rate=FRAMES / seconds, peak=peak)
+        yield ("separate", cameras), call
+    yield from ((("solve", cameras), call) for cameras, call in solved.items())
+
+
+def whole_frame(cameras: str, path: Path) -> tuple[float, float]:
+    """Seconds of the default call on a whole frame, by two threads, and peak of the memory [byte].
+
+    In a process of its own, which holds the capture; another one draws it.
+    """
+    found = (0.0, 0.0)
+    for step in (partial(_draw, cameras, path), partial(_separate, path)):
+        with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+            found = fresh.submit(step).result()
+    return found
+
+
+def _draw(cameras: str, path: Path) -> tuple[float, float]:
+    """Draw and save a capture of a whole frame."""
+    store.save(scene(cameras, WHOLE)[["counts"]], path, {})
+    return (0.0, 0.0)
+
+
+def _separate(path: Path) -> tuple[float, float]:
+    """Clock time [s] of the default call on a capture, after a small one, and memory [byte]."""
+    counts = store.open_dataset(path)["counts"].load()
+    separate(counts.isel(y=slice(SMALL[0]), x=slice(SMALL[1])))
+    start = time.perf_counter()
+    separate(counts, workers=2)
+    return time.perf_counter() - start, peak_memory()
+
+
+def peak_memory() -> float:
+    """Peak of the memory of this process [byte]."""
+    found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
+    return 1024.0 * float(found[1]) if found else float("nan")
+
+
+def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
+    """Yield the head of a table and a row for each call."""
+    yield (
+        "call",
+        "cameras",
+        "us a pixel",
+        "frames/s of 640x512, two cores, from it",
+        "measured",
+        "peak memory",
+        "error",
+        "95 % intervals",
+    )
+    for (function, cameras), call in calls.items():
+        rate = 2 * FRAMES / (call.pixel * math.prod(WHOLE))
+        whole = np.isfinite(call.frame_rate)
+        yield (
+            f"`{function}`",
+            cameras,
+            f"{1e6 * call.pixel:.0f}",
+            f"{rate:.2g}",
+            f"{call.frame_rate:.2g}" if whole else "",
+            f"{1e-9 * call.peak:.1f} GB" if whole else "",
+            f"{call.rmse:.3f} K",
+            f"{100 * call.cover:.1f} %",
+        )
 
 
 @lru_cache
@@ -84,7 +247,7 @@ def series(method: str, name: str) -> Iterator[tuple[int, float]]:
     if name == "bands" and not outside.get_method(method).any_bands:
         return
     for size in SERIES[name]:
-        if last[0] and last[1] * size / last[0] > LONGEST:
+        if last[0] and last[1] * size / last[0] > SHORT:
             return
         last = (size, seconds_of(method, usual | {name: size}))
         yield last
@@ -154,11 +317,11 @@ def rows(*cells: Sequence[str]) -> str:
     return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
 
 
-def default_figures(calls: default_call.Calls, busy: float) -> str:
+def default_figures(calls: Calls, busy: float) -> str:
     """Figures of the default call, in Markdown."""
-    height, width = default_call.SHAPE
-    size = {"rows": height, "columns": width, "frames": default_call.FRAMES}
-    table = rows(*default_call.rows(calls))
+    height, width = SHAPE
+    size = {"rows": height, "columns": width, "frames": FRAMES}
+    table = rows(*default_rows(calls))
     return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=table)
 
 
@@ -166,7 +329,7 @@ def table(default: str, times: Times, busy: float) -> str:
     """All that was measured, in Markdown: the default call's figures first."""
     enclosed = f"{MARKS[0]}\n\n{default}\n{MARKS[1]}"
     text = {"machine": machine(), "default_call": enclosed, "methods": methods(times)}
-    return HEAD.format(busy=busy, longest=LONGEST, few=FEW, **text, **USUAL)
+    return HEAD.format(busy=busy, longest=SHORT, few=FEW, **text, **USUAL)
 
 
 def methods(times: Times) -> str:
@@ -194,9 +357,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
     folder.mkdir(parents=True, exist_ok=True)
-    calls: default_call.Calls = {}
+    calls: Calls = {}
     with TemporaryDirectory(dir=folder) as place:
-        for name, call in default_call.measured(Path(place)):
+        for name, call in measured(Path(place)):
             calls[name] = call
             print(*name, call, flush=True)
     text = default = default_figures(calls, busy)

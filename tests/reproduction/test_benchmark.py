@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from reproduction import benchmark, default_call, methods, paths, verify
+from reproduction import benchmark, methods, paths, verify
 
 
 def test_the_table_says_what_was_measured() -> None:
@@ -21,7 +21,7 @@ def test_the_table_says_what_was_measured() -> None:
 
 def test_the_default_call_is_on_its_pages() -> None:
     """Its figures stand first in docs/benchmarks.md, between their marks."""
-    call = default_call.Call(pixel=7e-5, rmse=0.0312, cover=0.951, frame_rate=31.0, peak=4.2e9)
+    call = benchmark.Call(pixel=7e-5, rmse=0.0312, cover=0.951, frame_rate=31.0, peak=4.2e9)
     calls = {("separate", "one place"): call}
     text = benchmark.default_figures(calls, 0.5)
     line = "| `separate` | one place | 70 | 31 | 31 | 4.2 GB | 0.031 K | 95.1 % |"
@@ -33,10 +33,10 @@ def test_the_default_call_is_on_its_pages() -> None:
 @pytest.mark.slow
 def test_the_default_call_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On small captures at one place, of both functions and of a whole frame; and a method."""
-    cameras = {name: default_call.CAMERAS[name] for name in ("one place",)}
-    monkeypatch.setattr(default_call, "CAMERAS", cameras)
-    monkeypatch.setattr(default_call, "whole_frame", lambda *_: (10.0, 1e9))
-    calls = dict(default_call.measured(tmp_path, (28, 40)))
+    cameras = {name: benchmark.CAMERAS[name] for name in ("one place",)}
+    monkeypatch.setattr(benchmark, "CAMERAS", cameras)
+    monkeypatch.setattr(benchmark, "whole_frame", lambda *_: (10.0, 1e9))
+    calls = dict(benchmark.measured(tmp_path, (28, 40)))
     assert list(calls) == [("separate", "one place"), ("solve", "one place")]
     assert calls["separate", "one place"].frame_rate == 35.0
     for call in calls.values():

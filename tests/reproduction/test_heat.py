@@ -81,14 +81,6 @@ def test_lumped_exponential(second: float) -> None:
     np.testing.assert_allclose(cooled, exact, rtol=0, atol=1e-5 * abs(320.0 - target))
 
 
-def test_fluid_that_warms() -> None:
-    """Behind a fluid that warms steadily the shell lags by rho c d / h times the rate."""
-    fluid, lag = heat.Convection(100.0, lambda time: AMBIENT + 0.5 * time), CAPACITY / 100.0
-    times = np.linspace(0.0, 400.0, 41)
-    exact = AMBIENT + 0.5 * (times - lag * (1.0 - np.exp(-times / lag)))
-    np.testing.assert_allclose(spot(times, AMBIENT, [fluid], step=1.0), exact, rtol=0, atol=1e-3)
-
-
 def cooling_time(temperature: Array, first: float, surroundings: float, emissivity: float) -> Array:
     """Time in which radiation cools from the first temperature (Bergman et al. 2011, eq. 5.18)."""
 
@@ -109,17 +101,6 @@ def test_radiation() -> None:
     level = spot([0.0, 1e4, 2e4], AMBIENT, [side, side, heat.Heating(800.0)], step=200.0)[-1]
     balance = (AMBIENT**4 + 800.0 / (2.0 * 0.9 * SIGMA)) ** 0.25
     np.testing.assert_allclose(level, balance, rtol=0, atol=1e-5)  # K
-
-
-def test_fin() -> None:
-    """A held base and convection: cosh m(L - x) / cosh mL with m^2 = h / k d, insulated tip."""
-    body, x, edge = strip(0.05, 0.0005)
-    base = heat.Convection(np.where(edge, FILM, 0.0), AMBIENT + 40.0)
-    sides = [heat.Convection(20.0, AMBIENT), base]
-    steady = heat.simulate(body, [0.0, 1e4], AMBIENT, sides, step=100.0)[-1]
-    rate = np.sqrt(20.0 / (heat.GLASS.conductivity * THICKNESS))
-    exact = AMBIENT + 40.0 * np.cosh(rate * (0.05 - x)) / np.cosh(rate * 0.05)
-    np.testing.assert_allclose(steady, exact, rtol=0, atol=2e-3)
 
 
 def mode_error(surface: trimesh.Trimesh, mode: Array, decay: float) -> tuple[float, float]:
@@ -161,20 +142,6 @@ def test_order_in_space(errors: Callable[[], list[tuple[float, float]]]) -> None
     rms, largest = zip(*errors(), strict=True)
     assert largest[-1] < 5e-3
     np.testing.assert_allclose(orders(rms), 2.0, rtol=0, atol=0.1)
-
-
-def test_irregular_triangles() -> None:
-    """A tube of needles conducts along its axis as a strip does: within 0.5 %."""
-    angle, level = np.meshgrid(np.arange(60) * np.pi / 30, np.linspace(0.0, 0.1, 61), indexing="ij")
-    number = np.arange(60 * 61).reshape(60, 61)
-    beside = np.roll(number, -1, axis=0)
-    corners = [number[:, :-1], beside[:, :-1], beside[:, 1:], number[:, 1:]]
-    quads = np.stack([c.ravel() for c in corners], axis=1)
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    skew = level + 0.03 * np.sin(angle) * np.sin(np.pi * level / 0.1)
-    place = np.stack([0.01 * np.cos(angle), 0.01 * np.sin(angle), skew], axis=-1).reshape(-1, 3)
-    tube, mode = trimesh.Trimesh(place, faces, process=False), np.cos(np.pi * place[:, 2] / 0.1)
-    assert mode_error(tube, 10.0 * mode, ALPHA * (np.pi / 0.1) ** 2)[1] < 5e-3
 
 
 def test_order_in_time() -> None:
@@ -232,15 +199,6 @@ def test_unevenly_spaced_times() -> None:
     )
     np.testing.assert_allclose(uneven, even[[0, 3, 10, 100]], rtol=0, atol=1e-4)
     assert (min(called), max(called)) == (0.0, 100.0)
-
-
-def test_coefficient_that_jumps() -> None:
-    """The factorisation follows a liquid that arrives: each side of the jump is exponential."""
-    liquid = heat.Convection(lambda time: 1.0 if time < 10.0 else 2000.0, 350.0)
-    times = np.array([0.0, 10.0, 20.0])
-    slow, fast = np.exp(-np.diff(times) * (1.0, 2000.0) / CAPACITY)
-    exact = 350.0 - 55.0 * np.array([1.0, slow, slow * fast])
-    np.testing.assert_allclose(spot(times, AMBIENT, [liquid], step=0.01), exact, rtol=0, atol=0.1)
 
 
 TRIANGLE, FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), [[0, 1, 2]]

@@ -141,19 +141,6 @@ def test_validity_shows_what_is_wrong() -> None:
     assert plt.get_fignums() == []
 
 
-def test_validity_at_its_ends() -> None:
-    """A coverage below the axis is an arrow at its edge; a row without any has none to judge."""
-    stressed = case({})
-    low = validity(stressed.assign(object_coverage=stressed["object_coverage"] * 0.1)).axes[1]
-    arrows = [np.asarray(line.get_xdata()) for line in low.lines if line.get_marker() == "<"]
-    assert [place.size for place in arrows] == [1, 0, 0]
-    assert low.get_xlim()[0] < arrows[0][0] < 50.0  # %
-    stressed = case({"gray": slice(None)})
-    nothing = {name: stressed[name] * np.nan for name in ("object_coverage", "emissivity_coverage")}
-    axis = validity(stressed.assign(nothing)).axes[1]
-    assert [text.get_text() for text in axis.texts] == ["none to judge"]
-
-
 def drawn(flags: object) -> Figure:
     """The figure of flags (y, x)."""
     image = xr.DataArray(np.array(flags, dtype=np.uint32), dims=("y", "x"))

@@ -14,7 +14,6 @@ from dbthermal import response, schema, simulation
 from dbthermal.simulation import Rig
 from reproduction import twins
 from reproduction.twins import TWINS, Capture, Stage, solids, surfaces, vessels
-from reproduction.twins.panes import WITHDRAWAL
 from reproduction.twins.props import Writing
 from reproduction.twins.rays import Camera, Caster
 from reproduction.twins.stage import AMBIENT, clock
@@ -133,22 +132,6 @@ def test_prints_fade() -> None:
     assert float(visited[BACKGROUND].max()) > AMBIENT + 5
 
 
-def test_letters_are_reflected_in_the_plate() -> None:
-    """While CV is written the plate reflects strokes colder than the room, more and more; a second
-    after the last one no skin is seen, and 15 s later CV is still 2 K cold and more.
-    """
-    cold = (twins.twin("glass_plate", SLOW, rng())[BACKGROUND] < AMBIENT - 1).sum(("y", "x")).values
-    assert cold[0] == 0
-    assert 0 < 1.5 * cold[8] < cold[15]
-    writing = Writing(start=1.0)
-    gone = float(writing.path()[0][-1]) + WITHDRAWAL
-    capture = replace(SLOW, shape=(72, 96), time=np.array([0.0, gone, gone + 15.0]))
-    scene = twins.twin("glass_plate", capture, rng(), writing=writing)
-    change = scene[BACKGROUND].isel(time=[1, 2]) - AMBIENT
-    assert float(change.max()) < 1e-9
-    assert np.all((change < -2).mean(("y", "x")) > 0.03)
-
-
 BALL = np.array([0.1, -1.5, 0.05])
 """Middle of a warm ball before a mirror [m]."""
 
@@ -223,16 +206,6 @@ def test_a_surface_is_registered() -> None:
     assert float(abs(apart).quantile(0.9)) < 1.0  # [K], of 40 K from level to rim, in noise
     assert bool(views["counts"][1].isnull().where(~scene["on_object"]).any())
     assert 0.7 < float(views["noise_factor"][1]) < 1.0
-
-
-def test_a_baseline_needs_a_second_view() -> None:
-    """The first camera's view does not depend on the baseline; without one all is of one place."""
-    one, two = (twins.twin("fingers", replace(SHORT, baseline=away), rng()) for away in (0.0, 0.04))
-    for name in (OBJECT, BACKGROUND, "on_object"):
-        np.testing.assert_array_equal(two[name], one[name])
-    assert not two[f"second_{BACKGROUND}"].equals(two[BACKGROUND])
-    plain = simulation.observe(one, RESPONSE, rng())
-    xr.testing.assert_identical(twins.observe(one, RESPONSE, rng()), plain)
 
 
 def test_thermocouples_read_the_mean_under_the_bead() -> None:

@@ -19,7 +19,7 @@ from dbthermal import correction, separation, simulation, store
 from dbthermal.separation import _run
 from dbthermal.store import _datasets
 from reproduction import benchmark
-from reproduction.default_call import peak_memory
+from reproduction.benchmark import peak_memory
 from reproduction.experiments import whole
 
 RIG = simulation.Rig()
