@@ -1,11 +1,11 @@
-"""Moving bodies around the twins: writing, cups, hands and routes."""
+"""Moving bodies around the twins: writing, hands and routes."""
 
 import numpy as np
 
 from reproduction.twins import surfaces
 from reproduction.twins.panes import pointing
 from reproduction.twins.people import FINGERS, Route, imprint, pacing
-from reproduction.twins.props import Writing, board, cup
+from reproduction.twins.props import Writing, board
 from reproduction.twins.stage import AMBIENT, clock
 from reproduction.twins.surroundings import Pose
 
@@ -32,12 +32,6 @@ def test_the_index_writes_the_strokes() -> None:
         np.testing.assert_allclose(tips[1], expected, rtol=0, atol=1e-12)  # m
         others = [-tip[1] - part.radius for tip, part in zip(tips, FINGERS, strict=True)]
         assert min(others[:1] + others[2:]) > 0.002  # m
-
-
-def test_a_cup_is_uncovered() -> None:
-    """The top jumps from the lid's temperature to the drink's; the wall stays."""
-    mug = cup(uncovered=5.0, wall=318.0, lid=299.0, drink=335.0)
-    assert [set(mug.warmth(time)) for time in (4.9, 5.0)] == [{318.0, 299.0}, {318.0, 335.0}]
 
 
 def test_pacing_keeps_its_pace() -> None:

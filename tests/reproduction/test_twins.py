@@ -239,7 +239,7 @@ def probe(height: float, angle: float) -> Callable[[], object]:
         (lambda: Capture(GLASS.rename(band="filter")), "Must be .band,."),
         (lambda: Capture(GLASS, blur=0.0), "Invalid blur 0.0"),
         (bead("fingers", 2), "Invalid bead 2 pixels. Must be odd"),
-        (bead("bulb", 31), "its bead reaches beyond the object"),
+        (bead("coffee_pot", 31), "its bead reaches beyond the object"),
         (probe(0.01, 0.0), "Must be on the object"),
         (probe(0.152, 180.0), "behind another part of the object. Must be seen by the camera"),
     ],

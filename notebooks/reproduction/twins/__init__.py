@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
-from reproduction.twins.solids import bulb, bunny
+from reproduction.twins.solids import bunny
 from reproduction.twins.stage import Capture, Stage, take, thermocouple_readings
 from reproduction.twins.vessels import coffee_pot, wineglass
 from reproduction.twins.views import observe, registered
@@ -33,7 +33,6 @@ TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
     {
         "wineglass": wineglass,
         "coffee_pot": coffee_pot,
-        "bulb": bulb,
         "glass_plate": glass_plate,
         "fingers": fingers,
         "fingerprint": fingerprint,

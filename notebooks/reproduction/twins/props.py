@@ -1,4 +1,4 @@
-"""Objects among the surroundings: a toy car, a cup with a lid, a board that is written on."""
+"""Objects among the surroundings: a toy car, a board that is written on."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -7,11 +7,11 @@ import numpy as np
 import trimesh
 
 from reproduction.twins.rays import Array
-from reproduction.twins.surfaces import ellipsoid, revolved
+from reproduction.twins.surfaces import ellipsoid
 from reproduction.twins.surroundings import Actor, Motion, painted
 
 _SPACING: Final = 0.006
-"""Distance of the vertices of a toy or a cup [m]."""
+"""Distance of the vertices of a toy [m]."""
 
 
 def toy(motion: Motion, *, body: float = 303.15, motor: float = 315.15) -> Actor:
@@ -20,32 +20,6 @@ def toy(motion: Motion, *, body: float = 303.15, motor: float = 315.15) -> Actor
     cabin = trimesh.creation.box((0.08, 0.06, 0.04)).apply_translation((-0.02, 0, 0.07))
     bonnet = ellipsoid((0.03, 0.03, 0.012), (0.05, 0, 0.055), _SPACING)
     return painted([(frame, body), (cabin, body), (bonnet, motor)], motion)
-
-
-CUP_PROFILE: Final = ((0.0, 0.0), (0.030, 0.0), (0.040, 0.095), (0.036, 0.095), (0.0, 0.088))
-"""Radius and height of a cup and its content, the bottom to the middle of the top [m]."""
-
-
-def cup(
-    motion: Motion | None = None,
-    *,
-    uncovered: float = -np.inf,
-    wall: float = 318.15,
-    lid: float = 299.15,
-    drink: float = 335.15,
-) -> Actor:
-    """Cup with a hot drink, standing on z = 0, under a lid until it is uncovered at a time [s].
-
-    Its top is at the lid's temperature [K] before, at the drink's from then on.
-    """
-    mesh = revolved(CUP_PROFILE, _SPACING)
-    radius, height = np.linalg.norm(mesh.vertices[:, :2], axis=1), mesh.vertices[:, 2]
-    top = (height > CUP_PROFILE[-1][1] - 1e-9) & (radius < CUP_PROFILE[-2][0] + 1e-9)
-
-    def temperature(time: float) -> Array:
-        return np.where(top, drink if time >= uncovered else lid, wall)
-
-    return Actor(mesh, temperature, motion)
 
 
 LETTERS: Final = {

@@ -1,4 +1,4 @@
-"""A bulb with a palm print near a person with a hot cup, and a bunny among moving toys."""
+"""A bunny among moving toys."""
 
 from typing import Final, cast
 
@@ -8,76 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from reproduction import heat
 from reproduction.twins import surfaces
-from reproduction.twins.panes import Touch
-from reproduction.twins.people import Route, hand, imprint, pacing, person
-from reproduction.twins.props import cup, toy
+from reproduction.twins.people import hand
+from reproduction.twins.props import toy
 from reproduction.twins.rays import Array, Camera, vertex_normals
-from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, passers_by, since, table
+from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since, table
 from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 
 EMISSIVITY: Final = 0.9
-"""Total hemispherical emissivity of glass and of the bunny [1], for their radiation alone."""
+"""Total hemispherical emissivity of the bunny [1], for its radiation alone."""
 AIR: Final = 6.0
 """Coefficient to still air [W m^-2 K^-1]; 2 to 25 for free convection in gases, table 1.1 of
 Bergman et al. (2011), Fundamentals of Heat and Mass Transfer."""
-
-BULB_WALL: Final = (0.0008, heat.GLASS)
-"""Thickness [m] and solid of the bulb."""
-BULB_GAS: Final = 5.0
-"""Coefficient to the gas inside the bulb [W m^-2 K^-1]."""
-GRIP: Final = (0.045, -0.070)
-"""Where the middle of the palm lies on the bulb: height, and arc from the front [m]."""
-STAND: Final = 0.25
-"""Height of the bulb's socket above the table [m]."""
-SIPPING: Final = ((-1.0, -0.8), (0.05, -0.7), (1.0, -0.8), (1.0, 0.4))
-"""Route of a person with a cup, x and y from the bulb [m]."""
-CUP_HEIGHTS: Final = (1.10, 1.50)
-"""Height of the cup above the floor: held, and at the mouth [m]."""
-CUP_PLACE: Final = (0.05, 0.26)
-"""Where the cup is held, x and y from the middle of the body [m]."""
-
-
-def bulb(capture: Capture, rng: np.random.Generator) -> Stage:
-    """Bulb, off, that a hand has held, near a person who walks about and sips from a hot cup."""
-    touch, mesh = Touch(), surfaces.bulb()
-    # The hand reaches round the bulb: its print is wound about the axis.
-    x, y, z = np.asarray(mesh.vertices).T
-    arc = np.hypot(x, y) * np.arctan2(x, -y)
-    share = imprint(np.stack([z - GRIP[0], arc - GRIP[1]], axis=1))
-    exchanges = [
-        heat.Convection(AIR + BULB_GAS, AMBIENT),
-        heat.Radiation(EMISSIVITY, AMBIENT),
-        touch.press(share),
-    ]
-    route = pacing(SIPPING, capture.time, rng)
-    return Stage(
-        "bulb",
-        mesh,
-        since(touch.start, mesh, BULB_WALL, capture.time, exchanges),
-        Camera((0.0, -0.32, 0.060), (0.0, 0.0, 0.046), capture.shape),
-        [
-            table(-STAND),
-            *person(route, height=-TABLE - STAND),
-            cup(_sips(route, rng), uncovered=8.0),
-        ],
-        [surfaces.on_wall(mesh, 0.055, 5.0)],
-    )
-
-
-def _sips(route: Route, rng: np.random.Generator) -> Motion:
-    """Motion of a cup that is carried along a route and raised to the mouth now and then."""
-    low, high = (height - TABLE - STAND for height in CUP_HEIGHTS)
-    times, heights = [float(route.times[0])], [low]
-    while times[-1] < route.times[-1]:
-        times += [*(times[-1] + np.cumsum(rng.uniform((1.5, 0.5, 0.8, 0.5), (3.5, 0.9, 2.0, 0.9))))]
-        heights += [low, high, high, low]
-
-    def motion(time: float) -> Pose:
-        x, y = route.place(time) + CUP_PLACE
-        return Pose(translation=(x, y, float(np.interp(time, times, heights))))
-
-    return motion
-
 
 BUNNY_HEIGHT: Final = 0.15
 """Height of the bunny on the table [m]."""

@@ -34,15 +34,6 @@ COFFEE_POT_PROFILE: Final[Profile] = (
 """Radius and height of the outer wall of a glass coffee pot, bottom to rim, drawn for this
 project after pots of some 1.2 l [m]."""
 
-BULB_PROFILE: Final[Profile] = (
-    *((0.0130, 0.0000), (0.0140, 0.0100), (0.0180, 0.0220), (0.0240, 0.0340), (0.0285, 0.0450)),
-    *((0.0300, 0.0550), (0.0285, 0.0648), (0.0240, 0.0735), (0.0170, 0.0802), (0.0090, 0.0841)),
-    (0.0, 0.0855),
-)
-"""Radius and height of the glass of a light bulb 60 mm wide, cap to top, drawn for this project
-after the common A60 shape [m]."""
-
-
 _ROW: Final = np.sqrt(0.75)
 """Distance of the rows of equilateral triangles, in their sides [1]."""
 _CORNER: Final = np.deg2rad(30.0)
@@ -103,15 +94,12 @@ def capsule(
     return moved(revolved(profile, spacing), turn, start)
 
 
-def vessel(profile: Profile, spacing: float, *, floor: bool) -> trimesh.Trimesh:
-    """Smooth profile turned about the z axis, open at its top rim, with a flat floor or without."""
+def vessel(profile: Profile, spacing: float) -> trimesh.Trimesh:
+    """Smooth profile turned about the z axis, open at its top rim, with a flat floor."""
     points = np.array(profile)
     along = _along(points)
     wall = PchipInterpolator(along, points)(np.linspace(0.0, along[-1], _SAMPLES))
-    wall[-1, 0] = points[-1, 0]  # a pole stays one, whatever the rounding of the interpolation
-    if floor:
-        wall = np.concatenate([[(0.0, points[0, 1])], wall])
-    return revolved(wall, spacing)
+    return revolved(np.concatenate([[(0.0, points[0, 1])], wall]), spacing)
 
 
 def revolved(profile: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
@@ -172,17 +160,12 @@ def _band(first: int, lower: Array, upper: Array) -> npt.NDArray[np.int64]:
 
 def wineglass(spacing: float = 0.003) -> trimesh.Trimesh:
     """Outer wall of a wineglass, 0.21 m high on a foot 74 mm wide, with a stem of 8 mm."""
-    return vessel(WINEGLASS_PROFILE, spacing, floor=True)
+    return vessel(WINEGLASS_PROFILE, spacing)
 
 
 def coffee_pot(spacing: float = 0.004) -> trimesh.Trimesh:
     """Outer wall of a glass coffee pot, 0.165 m high and 0.136 m wide."""
-    return vessel(COFFEE_POT_PROFILE, spacing, floor=True)
-
-
-def bulb(spacing: float = 0.0015) -> trimesh.Trimesh:
-    """Glass of a light bulb, 60 mm wide and 86 mm high, open below, where its cap begins."""
-    return vessel(BULB_PROFILE, spacing, floor=False)
+    return vessel(COFFEE_POT_PROFILE, spacing)
 
 
 def moved(
