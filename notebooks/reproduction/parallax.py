@@ -36,6 +36,7 @@ def edges_shift(movie: xr.DataArray) -> xr.DataArray:
     """
     parts: list[Array] = []
     for frames in np.array_split(np.arange(movie.sizes["time"]), _PARTS):
+        # Register the part as if its values were counts.
         counts = movie.isel(time=frames).drop_vars("gain", errors="ignore").rename("counts")
         capture = counts.astype("float32").assign_attrs(units="count").to_dataset()
         with contextlib.suppress(ValueError):
@@ -51,11 +52,13 @@ def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArra
     pixels by a parabola. Attributes: `correlation` there, and `correlation_at_0`. NaN if it lies at
     the end of the search, `REACH`.
     """
+    # Correlate the rapid changes at every whole displacement.
     first, second = _rapid(movie, outline.values)
     scores = _correlations(first, second, outline.values)
     place = np.array(np.unravel_index(np.argmax(scores), scores.shape))
     largest = {"correlation": scores.max(), "correlation_at_0": scores[REACH]}
     attrs = {name: float(value) for name, value in largest.items()}
+    # Between whole pixels by a parabola, unless the largest lies at the end of the search.
     if np.any(place == 0) or np.any(place == np.array(scores.shape) - 1):
         return _displacement(np.full(2, np.nan)).assign_attrs(attrs)
     peak = place - REACH + np.array([_parabola(scores, place, axis) for axis in (0, 1)])

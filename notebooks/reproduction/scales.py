@@ -146,17 +146,20 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
     (2.0, 150)
     """
     _check_signal(signal)
+    # Project the smooth functions of time out of both bands.
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
     functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
     rapid = weight * values
     rapid -= [functions @ (functions.T @ part) for part in rapid]
+    # Subtract each frame's offset and gain error, as the uncorrelated pixels show it.
     quiet = np.abs(_correlation(rapid)) < _UNCORRELATED
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
     for band, mean in enumerate(values.mean(axis=1)):
         offset, gain = _frame_errors(rapid[band], mean, quiet)
         rapid[band] -= offset[:, np.newaxis] + gain[:, np.newaxis] * mean
+    # Divide the pixels by the correlation of what is left.
     correlation = _correlation(rapid)
     quiet, moving = np.abs(correlation) < _UNCORRELATED, correlation > CORRELATED
     _require(moving, f"correlation above {CORRELATED}")

@@ -198,9 +198,11 @@ def compare(scene: Scene, number: int) -> Comparison:
     change together (correlation above 0.5), by the separation with the scale undone. A way in which
     the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
     """
+    # Undo the frames' scale; find the displacement, and the pixels that both bands show.
     undone = scales.unscaled(scene.movie, still(scene.outline))
     reflections = parallax.reflections_shift(undone, scene.outline)
     shared = parallax.shared_outline(scene.outline, reflections)
+    # Separate in each way.
     found: dict[str, xr.Dataset] = {}
     left_out = {}
     for way, of_reflections in WAYS.items():
@@ -213,9 +215,11 @@ def compare(scene: Scene, number: int) -> Comparison:
             found[way] = parts.drop_vars("emission") if found else parts
     if not found:
         raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
+    # Choose pixels and frames by the first separation.
     first = found[next(iter(found))]
     pixels = {"object": shared, "moving": shared & (first["correlation"] > scales.CORRELATED)}
     frames = strongest(first["reflection"], shared, number)
+    # Correlate each reflection with each of the authors' maps.
     coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
     table = xr.DataArray(np.full((len(WAYS), 2, 2), np.nan), coords, attrs={"units": "1"})
     for way, kind, where in itertools.product(found, KINDS, pixels):

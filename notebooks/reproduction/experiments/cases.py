@@ -61,6 +61,7 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     deviation, 0.683 for a calibrated uncertainty; `good` and `with_temperature` [1], share of
     pixels with no flag, and with an object temperature.
     """
+    # Errors of the object and of the emissivities, and their intervals of one deviation.
     error = result["object_temperature"] - truth["object_temperature"]
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
     within = (of_emissivity < result["emissivity_std"]).where(of_emissivity.notnull())

@@ -163,6 +163,7 @@ def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     of them `flagged` [1], the share with any flag, and `covered` [1], share of the samples of the
     others whose 95 % interval holds the truth, NaN without any.
     """
+    # Errors of all pixels with a value; intervals of those without a flag.
     error = result["object_temperature"] - truth["object_temperature"]
     solved, good = error.notnull().any("time"), result["status"] == 0
     values = {

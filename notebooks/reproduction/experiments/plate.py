@@ -75,6 +75,7 @@ def recorded(
     trusted. The time constant of the pixels [s] undoes their lag, a patch of constant temperature
     (first row and row after, first column and column after) the cameras' drift.
     """
+    # Correct gain, offset, lag and drift of every pixel.
     path = run.input("recorded", paths.root() / folder / f"{taken['name']}.zarr")
     capture = run.read(open_capture, path).isel(time=slice(None, None, taken["every"]))
     calibration, response = _calibration(run)
@@ -84,10 +85,12 @@ def recorded(
         reference[slice(*patch[:2]), slice(*patch[2:])] = True
     options = {"time_constant": time_constant, "drift_reference": reference}
     corrected = correction.correct_capture(capture, calibration, **options)
+    # Bring both bands onto one grid and clock; find where the second sees the reflections.
     model, offset = taken["views"], 0.0 if taken["apart"] else None
     transform = alignment.register(corrected, model=model) if model else None
     corrected = alignment.align(corrected, offset=offset, transform=transform)
     shift = alignment.reflection_shift(corrected, response) if taken["apart"] else None
+    # The truth at the times of the frames, of emulated cameras.
     scene = emulated_rig.truth(path.parent).get("scene")  # none of hardware
     truth = None if scene is None else emulated_rig.shown(scene, corrected)
     return Plate(corrected, response, truth, shift)
@@ -113,6 +116,7 @@ def readings(
     films: Mapping[str, xr.DataArray | None], pixel: tuple[int, int], times: Sequence[float]
 ) -> pd.DataFrame:
     """Temperatures [degC] of films (time, y, x) [K] at a pixel and some times [s]; none of None."""
+    # Each film at the pixel and at the nearest of its frames.
     place = {"y": pixel[0], "x": pixel[1]}
     curves = {name: film.isel(place) for name, film in films.items() if film is not None}
     shown = {name: part.sel(time=times, method="nearest") for name, part in curves.items()}
@@ -142,6 +146,7 @@ def scores(
     Of each pixel by itself, in those without a flag; with known emissivities, in the same pixels;
     and of the whole scene, in all that have samples.
     """
+    # Shares of pixels without a flag, and of usable samples that have a value.
     good, name = alone["status"] == 0, "object_temperature"
     usable = ~schema.has_flag(whole["status"], "dead_pixel", "invalid_samples")
     value = whole[name].where(usable)
@@ -152,6 +157,7 @@ def scores(
     }
     if scene.truth is None or known is None:
         return {name: float(share) for name, share in shares.items()}
+    # Errors of the object, and intervals by the noise alone.
     noise, noise_of_whole = (separation.without_calibration(part) for part in (alone, whole))
     error = (alone[name] - scene.truth[name]).where(good)
     of_known = (known[name] - scene.truth[name]).where(good)
@@ -164,6 +170,7 @@ def scores(
         "twin_coverage_95": held(error, noise[f"{name}_std"], _WIDTH),
         "twin_coverage_95_whole": held(of_whole, noise_of_whole[f"{name}_std"], _WIDTH),
     }
+    # Errors of the emissivities, band by band.
     off = abs(alone["emissivity"] - scene.truth["emissivity"]).where(good)
     within = (off <= noise["emissivity_std"]).where(good).mean(("y", "x"))
     for band in off["band"].values:

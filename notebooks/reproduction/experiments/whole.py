@@ -138,10 +138,12 @@ def findings(scene: xr.Dataset, result: xr.Dataset, rate: float, late: int) -> d
 
     The second camera is exposed `late` halves of a frame later, at a frame rate [Hz].
     """
+    # Shift of the reflections, median over the pixels.
     off = result["reflection_shift"] - scene["shift"]
     shifts = {
         f"shift of the reflections, median error along {axis} [pixel]": off.sel(axis=axis).median()
         for axis in ("x", "y")
     }
+    # Offset of the second camera's clock, in frames.
     offset = result.attrs["time_offset"][1] * rate - late / 2
     return {"time offset, error [frame]": offset} | {key: float(it) for key, it in shifts.items()}
