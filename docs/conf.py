@@ -28,7 +28,7 @@ autodoc_typehints = "none"  # the docstrings have shapes and units
 numpydoc_show_class_members = False
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["colon_fence"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_update_mathjax = False
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

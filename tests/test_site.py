@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import inspect
+import json
 import re
 import shlex
 import shutil
@@ -74,9 +75,14 @@ def test_public_names_are_on_a_page(name: str) -> None:
 
 
 def test_formulas_are_drawn() -> None:
-    """Every formula of a docstring is one that browsers draw, as MathML."""
+    """Every formula of a docstring or of a notebook is one that browsers draw, as MathML."""
     module = "docutils.utils.math.latex2mathml"
     to_mathml = pytest.importorskip(module, reason="the extra docs").tex2mathml
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text("utf-8"))["cells"]
+        text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+        for formula in re.findall(r"\$\$?([^$]+)\$\$?", text):
+            to_mathml(formula.strip())
     for path in sorted((ROOT / "dbthermal").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             text = node.value if isinstance(node, ast.Constant) else None
