@@ -153,10 +153,12 @@ def _information(movies: Movies, shift: Array) -> Information:
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
+    moments = products(movies.first, movies.others, places) * used[..., np.newaxis, np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
-        auto, terms = np.moveaxis(blurred(sums[..., [0, 3]], WINDOW), 2, 0)
+        (mm, my, mx, mh), (_, yy, yx, yh), (*_, xx, xh), (*_, hh) = np.moveaxis(
+            sums, (2, 3), (0, 1)
+        )
+        auto, terms = blurred(sums[..., 0, 0], WINDOW), blurred(sums[..., 0, 3], WINDOW)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
@@ -261,7 +263,8 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     """
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
+    sums = products(movies.first, movies.others, places, rate)
+    sums *= used[..., np.newaxis, np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
@@ -275,7 +278,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
         seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
-        moved, common, second = (windows[..., place] for place in (0, 4, 14))
+        moved, common, second = windows[..., 0, 0], windows[..., 0, 4], windows[..., 4, 4]
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals

@@ -343,8 +343,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     for windows, rate in zip(sums, rates, strict=True):
         squares = np.array([len(rate), len(rate) * slope, len(rate) * slope, np.sum(rate**2)])
         squares *= side**2 * level
-        strong = [window for window in windows if window[0] > (_STRONG + 1.0) * squares[0]]
-        result.append(normal_equations(np.reshape(strong, (-1, 15)), squares))
+        strong = [window for window in windows if window[0, 0] > (_STRONG + 1.0) * squares[0]]
+        result.append(normal_equations(np.reshape(strong, (-1, 5, 5)), squares))
     return result
 
 
