@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._products import (
+    EDGE,
     Movie,
     binned,
     blurred,
@@ -32,13 +32,11 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
-_PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
 _ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
-_USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 _PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
@@ -197,20 +195,17 @@ def _positive(tensor: Array) -> Array:
     return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
-def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
-    """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
+def start(movies: Movies, spline: Spline) -> Field | None:
+    """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
     reach = movies.shape[0] // 3, movies.shape[1] // 3
-    pictures = []
-    for film, level in zip(films, movies.noise, strict=True):
-        # Changes as large as there are seldom are cut: an object's, if rapid.
-        picture = blurred(film, BLUR)
-        usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
-        picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
-        pictures.append(picture)
-    functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
-    pictures = [np.asarray(picture @ functions, np.float32) for picture in pictures]
-    freedom *= functions.shape[1] / functions.shape[0]
-    rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
+    # In deviations of noise; the splines of the first movie are nearly its values.
+    pictures = [
+        picture / np.float32(level * _VALUE_NOISE)
+        for picture, level in zip(
+            (movies.first[EDGE:-EDGE, EDGE:-EDGE], *movies.others), movies.noise, strict=True
+        )
+    ]
+    rough, share = _whole_pixels(pictures[0], pictures[1:], movies.freedom, reach)
     share *= movies.valid
     if not share.any():
         return None

@@ -13,7 +13,8 @@ Movie = npt.NDArray[np.float32]
 Image = TypeVar("Image", bound=npt.NDArray[Any])
 
 _ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
-_EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
+EDGE: Final = 3
+"""Pixels by which an image on splines is mirrored at its border."""
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
 
@@ -36,7 +37,7 @@ def splines(movie: Movie, width: float) -> Movie:
     A B-spline blurs as well: so these are blurred by less, and no filter undoes it.
     """
     part = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
-    return np.pad(part, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
+    return np.pad(part, ((EDGE, EDGE), (EDGE, EDGE), (0, 0)), mode="symmetric")
 
 
 def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
@@ -50,7 +51,7 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
         signals = np.empty((count, places[0, rows].size, movie.shape[2]), movie.dtype)
-        signals[:3] = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
+        signals[:3] = sampled(movie, places[:, rows].reshape(2, -1) + EDGE)
         if rate is not None:
             np.matmul(signals[0], rate, out=signals[3])
         for other, out in zip(others, result, strict=True):

@@ -19,7 +19,6 @@ from dbthermal.alignment._products import Movie, binned
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _FEW: Final = 64  # functions of time on the coarsest image
-_START: Final = 20  # the same of the image on which whole pixels are matched
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
 # shorter one is known, and a chi-square by the shorter one's data below so much: of people before
@@ -151,18 +150,8 @@ def _coarse(
         level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
-            # Whole frames, of which what is rare in a pixel's time is cut.
-            half = 2 if min(level.shape) >= 2 * _START else 1
-            rough = replace(
-                level,
-                valid=binned(level.valid * 1.0, half) > 0.5,
-                noise=level.noise / half,
-                factor=factor * half,
-            )
-            smoothing = capture.smoothing(period)
-            films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
-                begin = matching.start(rough, films, white, spline)
+                begin = matching.start(level, spline)
             except ValueError as error:  # slower changes may tell more
                 refusal = error
         if begin is None:
