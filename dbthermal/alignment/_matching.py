@@ -5,7 +5,7 @@ whole pixels that explain most, then Gauss-Newton from coarse images to fine one
 much later the others show what the first shows.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,6 @@ from dbthermal.alignment._products import (
     products,
     splines,
 )
-from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
 """Deviation of the window in which neighbours share a ratio and a whole-pixel match [pixel]."""
@@ -33,14 +32,12 @@ BLUR: Final = 1.2
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _ROUNDS: Final = 12
-_ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 _PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
-_NOISE_PIXELS: Final = 256  # that tell the noise of a movie
 _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
 
 
@@ -53,36 +50,22 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # those of whole frames over these [1]
+    outside: float  # those of whole frames over these, about [1]
     factor: int  # pixels of the capture along a side of one of these
 
     @classmethod
     def blurred(
-        cls,
-        movies: list[Movie],
-        valid: Mask,
-        noise: Array,
-        freedom: float,
-        factor: int,
-        whole: float = 0.0,
+        cls, movies: list[Movie], valid: Mask, noise: Array, functions: Movie, factor: int
     ) -> "Movies":
-        """Movies of pixels that are so many times coarser than the mask's."""
-        mostly = binned(valid.astype(np.float64), factor) > 0.5
-        sample = tuple(
-            index[:: max(1, index.size // _NOISE_PIXELS)] for index in np.nonzero(mostly)
-        )
-        if sample[0].size:
-            # Interpolated in time, a movie holds less rapid noise than white noise of its size.
-            white = np.sqrt(freedom / movies[0].shape[2]) / factor
-            usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
-            noise = np.minimum(noise, np.array(usual) / white)
+        """Movies along functions of time, of pixels so many times coarser than the mask's."""
+        freedom = float(np.sum(functions**2))
         return cls(
             splines(movies[0], BLUR),
             [blurred(movie, BLUR) for movie in movies[1:]],
-            mostly,
+            binned(valid.astype(np.float64), factor) > 0.5,
             noise / factor,
             freedom,
-            max(whole / freedom, 1.0),
+            max(len(functions) / freedom, 1.0),
             factor,
         )
 
@@ -164,8 +147,8 @@ def _information(movies: Movies, shift: Array) -> Information:
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         # Of all freedom, of which that outside the planes holds noise.
-        excess = residual / (variance * _VALUE_NOISE**2) - number
-        misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
+        excess = residual / (variance * _VALUE_NOISE**2 * number) - 1.0
+        misfit = np.maximum(1.0 + excess / movies.outside, 1.0)
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
@@ -176,7 +159,7 @@ def _information(movies: Movies, shift: Array) -> Information:
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     size = tensor[0] + tensor[2]
     share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
-    tensor, gradient = _positive(tensor) * share, gradient * share
+    tensor, gradient = tensor * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
 
 
@@ -187,16 +170,8 @@ def eigenvalues(tensor: Array) -> tuple[Array, Array]:
     return middle + root, middle - root
 
 
-def _positive(tensor: Array) -> Array:
-    """Tensors (3, y, x) without their negative eigenvalues."""
-    high, low = eigenvalues(tensor)
-    share = np.maximum(high, 0.0) / np.maximum(high - low, np.finfo(np.float64).tiny)
-    unit = np.array([1.0, 0.0, 1.0])[:, np.newaxis, np.newaxis]
-    return np.where(low < 0.0, share * (tensor - low * unit), tensor)
-
-
 def start(movies: Movies, spline: Spline) -> Field | None:
-    """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
+    """Field of whole-pixel matches; None without any."""
     reach = movies.shape[0] // 3, movies.shape[1] // 3
     # In deviations of noise; the splines of the first movie are nearly its values.
     pictures = [
@@ -218,18 +193,11 @@ def start(movies: Movies, spline: Spline) -> Field | None:
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
     centres, zero = movies.centres(), np.zeros_like(share)
-    field = spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
-    for _ in range(_ROBUST):
-        step = target - field.on(centres)
-        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
-        data = Information(np.stack([kept, zero, kept]), kept * step)
-        field = spline.fitted(data, centres, field)
-    return field
+    return spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
 
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    field = replace(field, settled=False)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data = _information(movies, shift)

@@ -11,7 +11,6 @@ from threadpoolctl import threadpool_limits
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _matching as matching
-from dbthermal.alignment import _planes as planes
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._planes import Capture, Scale
@@ -95,13 +94,12 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     # more than noise.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
-    movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
+    movies = capture.planes(functions)
 
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
-        freedom = planes.freedom(functions[place])
-        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
+        return Movies.blurred(pictures, capture.valid, capture.noise, functions[place], factor)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
@@ -145,9 +143,8 @@ def _coarse(
             break
         tried[period] = capture.functions(signals[0], period)
         functions = tried[period][:, :_FEW]
-        white, freedom = planes.white(frames, period), planes.freedom(functions)
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
+        level = Movies.blurred(pictures, valid, capture.noise, functions, factor)
         begin = None if result is None else result[-1]
         if begin is None:
             try:
