@@ -5,11 +5,12 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
+from dbthermal._samples import neighbour_mean
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
@@ -194,12 +195,8 @@ def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> A
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    sums = [
-        gaussian_filter(array * resolved, _WIDE / level.factor, axes=(-2, -1))
-        for array in (squares, np.ones(resolved.shape))
-    ]
-    chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
-    return np.asarray(chi * field.variances(level.centres()))
+    chi = neighbour_mean(squares, resolved, _WIDE / level.factor)
+    return np.asarray(np.fmax(chi, 1.0) * field.variances(level.centres()))
 
 
 def _result(
