@@ -5,7 +5,6 @@ that it uses, without comments, docstrings and line numbers. Damaged or old file
 again; processes that need the same function wait for the first one to compile it.
 """
 
-import dis
 import hashlib
 import logging
 import os
@@ -33,6 +32,8 @@ except ImportError:  # Windows: there each process compiles by itself
 
 _LOGGER: Final = logging.getLogger(__name__)
 _SIZE: Final = 32  # of a SHA-256 [byte]
+_CONSTANTS: Final = (int, float, complex, str, bytes, slice, np.generic)
+_USED: Final = (*_CONSTANTS, tuple, np.ndarray, Dispatcher)  # of a module, in machine code
 
 
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -163,60 +164,42 @@ def _described(value: Any, visited: dict[int, int]) -> Iterator[str]:
         first = id(value) not in visited
         yield f"function {visited.setdefault(id(value), len(visited))}"
         if first:
-            options = value.targetoptions
+            function, options = value.py_func, value.targetoptions
+            cells = [cell.cell_contents for cell in function.__closure__ or ()]
+            names = dict(zip(function.__code__.co_freevars, cells, strict=True))
+            defaults = [function.__defaults__, sorted((function.__kwdefaults__ or {}).items())]
             yield from _described([(name, options[name]) for name in sorted(options)], visited)
-            yield from _of_function(value.py_func, visited)
+            yield from _described(defaults, visited)
+            yield from _of_code(function.__code__, {**function.__globals__, **names}, visited)
     elif isinstance(value, tuple | list):
         yield f"{type(value).__qualname__} {len(value)} {getattr(value, '_fields', '')}"
         for element in value:
             yield from _described(element, visited)
-    elif not isinstance(value, ModuleType):  # of which what is used is described
-        yield _plainly(value)
-
-
-def _plainly(value: Any) -> str:
-    """A constant, or the name of what numba itself compiles, as text."""
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
-    if isinstance(value, set | frozenset):
-        return f"set {sorted(map(repr, value))}"
-    if callable(value) and hasattr(value, "__name__"):
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    elif isinstance(value, set | frozenset):
+        yield f"set {sorted(map(repr, value))}"
+    elif callable(value) and hasattr(value, "__name__"):  # which numba itself compiles
         fields = getattr(value, "_fields", "")
-        return f"{getattr(value, '__module__', 'numpy')}.{value.__name__} {fields}"
-    if isinstance(value, int | float | complex | str | bytes | slice | np.generic):
-        return repr(value)
-    if value is None or value is ...:
-        return repr(value)
-    raise TypeError(f"Invalid {value!r} in a compiled function. Must be a number, or compiled.")
-
-
-def _of_function(function: Any, visited: dict[int, int]) -> Iterator[str]:
-    """Code and defaults of a function, and what its global and free names stand for."""
-    cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    free = dict(zip(function.__code__.co_freevars, cells, strict=True))
-    yield from _described(function.__defaults__, visited)
-    yield from _described(sorted((function.__kwdefaults__ or {}).items()), visited)
-    yield from _of_code(function.__code__, {**function.__globals__, **free}, visited)
+        yield f"{getattr(value, '__module__', 'numpy')}.{value.__name__} {fields}"
+    elif value is None or value is ... or isinstance(value, _CONSTANTS):
+        yield repr(value)
+    elif not isinstance(value, ModuleType):  # of which what is used is described
+        raise TypeError(f"Invalid {value!r} in a compiled function. Must be a number, or compiled.")
 
 
 def _of_code(code: CodeType, names: Mapping[str, Any], visited: dict[int, int]) -> Iterator[str]:
-    """Instructions of code, which depend on no comment, docstring or line."""
-    yield f"arguments {code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]}"
-    owner: Any = None  # module or type of which the next instruction may take a name
-    for step in dis.get_instructions(code):
-        if step.opname in {"EXTENDED_ARG", "CACHE", "PUSH_NULL"}:  # of the encoding alone
-            continue
-        yield step.opname
-        loaded = None
-        if step.opname == "LOAD_CONST" and isinstance(step.argval, CodeType):
-            yield from _of_code(step.argval, names, visited)
-        elif step.opname == "LOAD_CONST":
-            yield from _described(step.argval, visited)
-        else:
-            yield str(step.argval)
-        if step.opname in {"LOAD_GLOBAL", "LOAD_DEREF"}:
-            loaded = names.get(step.argval)
-        elif step.opname in {"LOAD_ATTR", "LOAD_METHOD"}:
-            loaded = getattr(owner, step.argval, None)
-        yield from _described(loaded, visited)
-        owner = loaded if isinstance(loaded, ModuleType | type) else None
+    """Instructions, constants and names of code, which depend on no comment or line."""
+    yield f"{code.co_code.hex()} {code.co_exceptiontable.hex()} {code.co_varnames}"
+    yield f"{code.co_argcount} {code.co_kwonlyargcount} {code.co_names}"
+    for place, constant in enumerate(code.co_consts):
+        if isinstance(constant, CodeType):
+            yield from _of_code(constant, names, visited)
+        elif place or not isinstance(constant, str):  # the first text is the docstring
+            yield from _described(constant, visited)
+    for name in (*code.co_names, *code.co_freevars):
+        value = names.get(name)
+        yield from _described(value, visited)
+        if isinstance(value, ModuleType | type):
+            taken = (getattr(value, attribute, None) for attribute in code.co_names)
+            yield from _described([it for it in taken if isinstance(it, _USED)], visited)

@@ -80,12 +80,8 @@ class Scale:
         """Noise of a capture (band) [K]."""
         if self.noise is not None:
             return np.asarray(self.noise * _noise_factor(corrected))
-        signals = sample(corrected)
-        frames = np.all(np.isfinite(signals), axis=(0, 2))
-        scaled = [
-            signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)
-        ]
-        return noises.estimate_bands(scaled, corrected["time"].values[frames])
+        scatter, _ = noise_levels(sample(corrected), clocks.exposure_times(corrected))
+        return np.asarray(scatter / self.slopes)
 
 
 def _noise_factor(corrected: xr.Dataset) -> Array:
