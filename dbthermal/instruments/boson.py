@@ -26,7 +26,7 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import telemetry, v4l2
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
-from dbthermal.instruments.transport import Closing, Transport, open_serial
+from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = [
     "KIND",
@@ -181,8 +181,11 @@ class Boson(Closing):
 
     Examples
     --------
-    >>> with Boson.from_url("sim://boson/wide") as camera:
-    ...     camera.fpa_temperature(), camera.identity()["is_simulated"]  # K
+    >>> from dbthermal.instruments.emulated import World, camera
+    >>> bench = World()
+    >>> state = bench.add_camera("8-14", 93588)
+    >>> with Boson(camera.EmulatedBoson(bench, "8-14")) as port:
+    ...     port.fpa_temperature(), port.identity()["is_simulated"]  # K
     (308.15, True)
     """
 
@@ -201,11 +204,6 @@ class Boson(Closing):
         self._decoder = fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
-
-    @classmethod
-    def from_url(cls, url: str, world: object | None = None) -> "Boson":
-        """Open ``serial:///dev/ttyACM0`` or ``sim://boson``, see `open_serial`; nothing is sent."""
-        return cls(open_serial(url, baudrate=BAUDRATE, world=world))
 
     def close(self) -> None:
         """Release the port, once an exchange of another thread is over; the camera goes on."""
@@ -355,5 +353,5 @@ class Boson(Closing):
 
 # Of a session's ``kind: boson``.
 KIND: Final = CameraKind(
-    partial(v4l2.open_url, decode=telemetry.metadata), Boson.from_url, (0, telemetry.ROWS)
+    partial(v4l2.open_url, decode=telemetry.metadata), Boson, BAUDRATE, (0, telemetry.ROWS)
 )

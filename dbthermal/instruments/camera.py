@@ -21,6 +21,7 @@ import numpy.typing as npt
 from dbthermal import _text as texts
 from dbthermal.correction._shutter import FEWEST_COPIES
 from dbthermal.instruments.clock import Clock
+from dbthermal.instruments.transport import Transport
 from dbthermal.schema import Flags
 
 __all__ = ["KINDS", "CameraControl", "CameraKind", "Frame", "FrameFlag", "FrameSource", "Metadata"]
@@ -187,10 +188,11 @@ class CameraControl(Protocol):
 
 @dataclass(frozen=True)
 class CameraKind:
-    """A kind of camera: how to open frames and command port; see ``KIND`` of its module."""
+    """A kind of camera: its frames, and the driver of its command port; ``KIND`` of its module."""
 
     open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
-    open_control: Callable[[str, object], AbstractContextManager[CameraControl]] | None = None
+    control: Callable[[Transport], AbstractContextManager[CameraControl]] | None = None
+    baudrate: int = 115_200  # speed of the command port's line [bit/s]
     telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
 
 

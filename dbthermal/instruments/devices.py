@@ -15,10 +15,11 @@ from typing import Any, Final
 from dbthermal.instruments import camera as interface
 from dbthermal.instruments.camera import CameraControl, Counts, FrameSource, Identity
 from dbthermal.instruments.clock import SYSTEM, Clock
-from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
+from dbthermal.instruments.filterwheel import BAUDRATE, FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import LOGGER, WHEEL, Session
 from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.transport import Transport, open_serial
 
 __all__ = ["Devices", "open_devices"]
 __dir__ = __all__.copy
@@ -188,15 +189,15 @@ def open_devices(
                 view = world, band, pictures or {}, beam, *form
                 source = _emulated(".camera").EmulatedCamera(*view, kind=camera.kind)
             sources[band] = stack.enter_context(source)
-            if camera.control is not None and kind.open_control is not None:
-                url = camera.control if world is None else f"sim://{camera.kind}/{band}"
-                controls[band] = stack.enter_context(kind.open_control(url, world))
+            if camera.control is not None and kind.control is not None:
+                line = _line(world, camera.kind, camera.control, band, baudrate=kind.baudrate)
+                controls[band] = stack.enter_context(kind.control(line))
         # The wheel.
         wheel = logger = None
         if session.filters:
-            url = session.devices[WHEEL] if world is None else "sim://apt"
-            opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
-            wheel = stack.enter_context(opened)
+            line = _line(world, WHEEL, session.devices[WHEEL], baudrate=BAUDRATE, rtscts=True)
+            wheel = stack.enter_context(FilterWheel(line, session.filters, session.wheel))
+            wheel.connect()
         # The thermocouples.
         if session.thermocouples:
             if world is None:
@@ -208,6 +209,14 @@ def open_devices(
                 logger = TC08(unit).open()
             stack.enter_context(logger).set_channels(session.thermocouples)
         yield Devices(session, sources, controls, wheel, logger, world)
+
+
+def _line(world: Any, kind: str, url: str, *name: str, **form: Any) -> Transport:
+    """Open a serial line to hardware, or to the emulator of this kind of device in a world."""
+    if world is None:
+        return open_serial(url, **form)
+    line: Transport = _emulated(".devices").LINES[kind](world, *name)
+    return line
 
 
 def _emulated(module: str = "") -> Any:

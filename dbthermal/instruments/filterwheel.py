@@ -19,9 +19,8 @@ units, and addresses). Facts alone, no code.
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
@@ -36,7 +35,7 @@ from dbthermal.instruments._controller import (
     WrongDeviceError,
 )
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.transport import Closing, Transport, open_serial
+from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = [
     "FilterWheel",
@@ -139,7 +138,7 @@ class NotHomedError(WheelError):
 
 
 class FilterWheel(Closing):
-    """A filter wheel whose line is open, for one thread at a time; see `from_url`.
+    """A filter wheel at the end of an open line, for one thread at a time; `connect` comes first.
 
     `filters` has the band in each slot, 1 to 6. All methods raise `WheelError` or a kind of it if
     the controller reports an error, falls silent or is not connected, TransportError if it is gone.
@@ -156,26 +155,11 @@ class FilterWheel(Closing):
         self._scale = BSC20X
         self._is_lost = False  # the counter may not be where the wheel is
 
-    @classmethod
-    def from_url(
-        cls,
-        url: str,
-        filters: Mapping[int, str],
-        settings: Settings | None = None,
-        *,
-        world: object | None = None,
-    ) -> Self:
-        """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
-        line = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
-        wheel = cls(line, filters, settings)
-        with ExitStack() as stack:
-            stack.enter_context(wheel)
-            wheel.connect()
-            stack.pop_all()
-        return wheel
-
     def connect(self) -> None:
-        """Find the controller, check its identity, set the speeds and enable the motor."""
+        """Find the controller, check its identity, set the speeds and enable the motor.
+
+        The wheel does not move.
+        """
         info, expected = self._controller.connect(), self.settings.serial_number
         model = apt.text(info.model)
         if expected is not None and info.serial_number != expected:
@@ -198,8 +182,7 @@ class FilterWheel(Closing):
     def identity(self) -> Identity:
         """Model (not always that on the label), numbers and addresses of the controller."""
         if not self._identity:
-            rule = "Must be opened by `FilterWheel.from_url`"
-            raise WheelError(f"The wheel is not connected. {rule}.")
+            raise WheelError("The wheel is not connected. Must be, by `FilterWheel.connect`.")
         return self._identity
 
     def status(self) -> apt.Status:

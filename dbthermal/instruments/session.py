@@ -66,7 +66,7 @@ def _printable(text: str) -> str:
 
 def _address(scheme: str) -> AfterValidator:
     """Validator of an address of a scheme."""
-    return AfterValidator(lambda url: (parse(url, (scheme,)), url)[1])
+    return AfterValidator(lambda url: (parse(url, scheme), url)[1])
 
 
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
@@ -97,7 +97,7 @@ class Camera:
     kind: str = "boson"
 
     def __post_init__(self) -> None:
-        if camera_kind(self.kind).open_control is None and self.control is not None:
+        if camera_kind(self.kind).control is None and self.control is not None:
             raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
 
 
@@ -211,7 +211,7 @@ class Session:
 
     def _check_devices(self) -> None:
         for name, address in self.devices.items():
-            parse(address, (_SCHEMES[name],))
+            parse(address, _SCHEMES[name])
         # The names of the readings of a recording differ: of the cameras and the wheel, too.
         names = [*self.thermocouples.values(), WHEEL, LOGGER]
         for band in dict.fromkeys((*self.bands, *self.filters.values())):

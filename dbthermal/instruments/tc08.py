@@ -160,7 +160,7 @@ class TC08(Closing):
 
         ValueError if it is another address; else the errors of `load` and `open`.
         """
-        parse(url, ("tc08",))
+        parse(url, "tc08")
         return cls(load()).open()
 
     @property

@@ -1,17 +1,16 @@
 """Addresses of devices, and byte streams to those on a serial line.
 
-``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``sim://boson/wide`` an
-emulator that answers in memory; `parse` has the rules of all addresses. An address never names a
-program or a library: that of the TC-08 is told by an environment variable.
+``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows); `parse` has the rules of
+all addresses. An address never names a program or a library: an environment variable names that of
+the TC-08.
 """
 
-import importlib
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from dbthermal import _text as texts
 from dbthermal.instruments.clock import SYSTEM, Clock
@@ -25,43 +24,23 @@ __dir__ = __all__.copy
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 
-# Module of each emulator, imported when it is started by its ``start(name, world)``.
-EMULATORS: Final[Mapping[str, str]] = {
-    "boson": "dbthermal.instruments.emulated.camera",
-    "apt": "dbthermal.instruments.emulated.devices",
-}
-
 _NODE = r"/dev/(?!\S*\.\.)[^\s?#\\]+"
 
 # Form of the addresses of each scheme, and its regular expression.
 _RULES: Final[Mapping[str, tuple[str, str]]] = {
-    "v4l2": ("v4l2:///dev/<node>", f"v4l2://(?P<target>{_NODE})"),
-    "serial": ("serial:///dev/<port>", f"serial://(?P<target>{_NODE}|COM[0-9]+)"),
-    "tc08": ("tc08:", "tc08:(?P<target>)"),
-    "sim": (
-        "sim://<emulator>/<name>",
-        "sim://(?P<target>[a-z0-9]+)(/(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*))?",
-    ),
+    "v4l2": ("v4l2:///dev/<node>", f"v4l2://{_NODE}"),
+    "serial": ("serial:///dev/<port>", f"serial://({_NODE}|COM[0-9]+)"),
+    "tc08": ("tc08:", "tc08:"),
 }
 _LONGEST: Final = 200  # [character]
 
 
-class Address(NamedTuple):
-    """Parts of an address: `target` is the device's file, or the kind of emulator."""
-
-    scheme: str
-    target: str
-    name: str = ""
-
-
-def parse(url: str, schemes: tuple[str, ...]) -> Address:
-    """Parts of an address of one of the schemes; ValueError names it and their forms."""
-    scheme = url.partition(":")[0]
-    match = re.fullmatch(_RULES[scheme][1], url) if scheme in schemes else None
-    if match is None or len(url) > _LONGEST:
-        forms = " or ".join(_RULES[name][0] for name in schemes)
-        raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
-    return Address(scheme, **{name: text or "" for name, text in match.groupdict().items()})
+def parse(url: str, scheme: str) -> str:
+    """File of the device at an address of a scheme; ValueError names the address and its form."""
+    form, expression = _RULES[scheme]
+    if re.fullmatch(expression, url) is None or len(url) > _LONGEST:
+        raise ValueError(f"Invalid address {texts.shown(url)}. Must be {form}.")
+    return url.partition(":")[2].removeprefix("//")
 
 
 class Closing:
@@ -157,23 +136,14 @@ class SerialTransport(Closing):
             raise TransportError(f"Could not {action} '{self.url}': {error}. {rule}.") from error
 
 
-def open_serial(
-    url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
-) -> Transport:
+def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTransport:
     """Open the line to a device by its address, for this program alone; nothing is sent.
 
     `baudrate` [bit/s] is the speed of the line. With `rtscts` its flow is controlled by RTS and
-    CTS, and RTS is taken down and up once. `world` is the emulated bench of a ``sim://`` device, by
-    default a new bench. ValueError for another address, or a pseudo-terminal, which would let an
-    emulator pass for hardware; TransportError if the port cannot be opened.
+    CTS, and RTS is taken down and up once. ValueError for another address, or a pseudo-terminal,
+    which would let an emulator pass for hardware; TransportError if the port cannot be opened.
     """
-    scheme, path, name = parse(url, ("serial", "sim"))
-    if scheme == "sim":
-        if path not in EMULATORS:
-            rule = f"Must be one of {sorted(EMULATORS)} after sim://"
-            raise ValueError(f"Invalid address '{url}'. {rule}.")
-        emulated: Transport = importlib.import_module(EMULATORS[path]).start(name, world)
-        return emulated
+    path = parse(url, "serial")
     if Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
 

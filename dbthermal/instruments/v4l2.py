@@ -254,7 +254,7 @@ def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
 
     ValueError if the address is of another kind; OSError on another system than Linux.
     """
-    node = parse(url, ("v4l2",)).target
+    node = parse(url, "v4l2")
     if not sys.platform.startswith("linux"):
         raise OSError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
     return Capture(node, stream, decode=decode)

@@ -8,7 +8,7 @@ from faulty_devices import Fault, FaultyApt, FaultyBoson, FaultyTC08
 
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.clock import EmulatedClock
-from dbthermal.instruments.emulated import Line, World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
@@ -47,8 +47,7 @@ class BosonBench:
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
         self.device = FaultyBoson(self.world, "boson")
-        self.loop = Line(self.device, self.clock)
-        self.camera = Boson(self.loop, first_sequence=1)
+        self.camera = Boson(self.device, first_sequence=1)
 
     def spoil(self, *faults: Fault | None) -> None:
         """Set faults of the next requests."""
@@ -56,8 +55,8 @@ class BosonBench:
 
     def exchange(self, request: bytes) -> bytes:
         """Send bytes without the driver, and return the answer."""
-        self.loop.write(request)
-        return self.loop.read(4096, 0.1)
+        self.device.write(request)
+        return self.device.read(4096, 0.1)
 
 
 class WheelBench:
@@ -67,9 +66,8 @@ class WheelBench:
         self.clock = Clock(0.0)
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
-        loop = Line(self.device, self.clock)
         chosen = Settings(**options)  # type: ignore[arg-type]
-        self.wheel = FilterWheel(loop, FILTERS, chosen)
+        self.wheel = FilterWheel(self.device, FILTERS, chosen)
 
     def homed(self) -> FilterWheel:
         """Connect and home the wheel."""

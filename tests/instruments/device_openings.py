@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,13 +13,17 @@ from device_benches import FILTERS, QUICK, LoggerBench
 from faulty_camera import two_cameras
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
-from dbthermal.instruments import v4l2
-from dbthermal.instruments.boson import Boson
+from dbthermal.instruments import filterwheel, v4l2
+from dbthermal.instruments.boson import BAUDRATE, Boson
 from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.filterwheel import FilterWheel
+from dbthermal.instruments.emulated import World
+from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.emulated.devices import EmulatedApt
+from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.transport import Transport, open_serial
 
 
 def address(name: str) -> str:
@@ -36,27 +41,35 @@ class Opened(NamedTuple):
     again: Callable[[], object] | None = None
 
 
-def named_camera(_: ExitStack) -> Opened:
-    """A Boson's driver on the emulator, by its address."""
-    return Opened(Boson.from_url("sim://boson/wide"), True)
+def connected(line: Transport, settings: Settings | None = None) -> FilterWheel:
+    """A wheel's driver that is connected."""
+    wheel = FilterWheel(line, FILTERS, settings)
+    wheel.connect()
+    return wheel
+
+
+def emulated_camera(_: ExitStack) -> Opened:
+    """A Boson's driver on the emulator."""
+    (world := World()).add_camera("wide", 93588)
+    return Opened(Boson(EmulatedBoson(world, "wide")), True)
 
 
 def real_camera(_: ExitStack) -> Opened:
     """A Boson."""
-    url = address("DBTHERMAL_BOSON")
-    return Opened(Boson.from_url(url), False, lambda: Boson.from_url(url))
+    port = partial(open_serial, address("DBTHERMAL_BOSON"), baudrate=BAUDRATE)
+    return Opened(Boson(port()), False, port)
 
 
-def named_wheel(_: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, by its address, but a fast wheel."""
-    return Opened(FilterWheel.from_url("sim://apt/wheel", FILTERS, QUICK), True)
+def emulated_wheel(_: ExitStack) -> Opened:
+    """A wheel's driver on the emulator, with a fast wheel."""
+    return Opened(connected(EmulatedApt(World()), QUICK), True)
 
 
 def real_wheel(_: ExitStack) -> Opened:
     """A wheel."""
     url = address("DBTHERMAL_WHEEL")
-    opened = FilterWheel.from_url(url, FILTERS)
-    return Opened(opened, False, lambda: FilterWheel.from_url(url, FILTERS))
+    port = partial(open_serial, url, baudrate=filterwheel.BAUDRATE, rtscts=True)
+    return Opened(connected(port()), False, port)
 
 
 def emulated_logger(_: ExitStack) -> Opened:
@@ -103,7 +116,7 @@ def real_video(stack: ExitStack) -> Opened:
 
 Opening = Callable[[ExitStack], Opened]
 
-CAMERAS: list[Opening] = [named_camera, real_camera]
-WHEELS: list[Opening] = [named_wheel, real_wheel]
+CAMERAS: list[Opening] = [emulated_camera, real_camera]
+WHEELS: list[Opening] = [emulated_wheel, real_wheel]
 LOGGERS: list[Opening] = [emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]

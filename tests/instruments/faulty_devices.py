@@ -18,6 +18,7 @@ from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
 from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
+from dbthermal.instruments.filterwheel import BSC10X
 
 
 @dataclass
@@ -63,11 +64,19 @@ class StandingDrive(Drive):
 class FaultyApt(EmulatedApt):
     """The emulated controller with faults; `received` are the messages to its addresses."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def __init__(self, world: World, model: str = "BSC201", slot_offset: float = 0.0) -> None:
+        if model.startswith(("BSC10", "KDC")):
+            self.model, self.unit, self.address = BSC10X, apt.UNIT, apt.UNIT
+        self.info = self.info._replace(model=model.encode())
+        self.slot_offset, self.plugged = slot_offset, True
+        super().__init__(world)
         self.faults = WheelFaults()
         self.received: list[apt.Message] = []
         self._waiting: list[tuple[float, bytes]] = []
+
+    def is_plugged(self) -> bool:
+        """False once it was pulled out."""
+        return self.plugged
 
     def sent(self, name: str) -> list[bytes]:
         """Data of the messages of a name that a driver has sent."""
@@ -203,7 +212,7 @@ class FaultyBoson(EmulatedBoson):
         """Take in one request with its fault, to be answered when it is due."""
         fault = self.faults.once.popleft() if self.faults.once else None
         delay = self.faults.late if fault is Fault.LATE else 0.0
-        self._inbox.append((frame, fault, self._world.time + delay))
+        self._inbox.append((frame, fault, self.world.time + delay))
 
     def poll(self) -> list[bytes]:
         """Give the replies that are due, with their faults."""
@@ -222,7 +231,7 @@ class FaultyBoson(EmulatedBoson):
         due = self._inbox[0][2]
         if self.faults.ffc_stalls:
             due = max(due, self.camera.ffc_until)
-        return due - self._world.time
+        return due - self.world.time
 
     def _spoilt(self, frame: fslp.Frame, fault: Fault | None) -> bytes:
         """Bytes of the reply to a request, with its fault."""
@@ -272,7 +281,7 @@ class FaultyTC08(EmulatedTC08):
         if name.startswith("usb_tc08_") and name != "usb_tc08_get_last_error":
             code = 16 if self.faults.unplugged else self.faults.errors.pop(name, 0)
             if code:
-                self._error = code
+                self.error = code
                 return lambda *_: -1 if name.endswith("progress") else 0
         return super().__getattribute__(name)
 
@@ -285,7 +294,7 @@ class FaultyTC08(EmulatedTC08):
         """Wait for the firmware."""
         if self.clock() - self._opening < self.faults.firmware_delay:
             return 0
-        self._is_open |= self.faults.no_unit
+        self.is_open |= self.faults.no_unit
         return super().usb_tc08_open_unit_progress(handle, percent)
 
     def convert(self, channel: int) -> tuple[float, bool]:

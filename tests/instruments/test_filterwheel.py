@@ -11,8 +11,6 @@ from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal.instruments.emulated import Line, World
-from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
@@ -79,9 +77,9 @@ def test_filters_are_called_by_their_band() -> None:
     with pytest.raises(WheelError, match="No filter in slot 2"):
         wheel.band()
     wheel.move_to(5)
-    with FilterWheel(Line(bench.device, bench.clock), FILTERS) as later:
-        later.connect()  # a new program need not home the wheel again
-        assert later.band() == "LW"
+    later = FilterWheel(bench.device, FILTERS)
+    later.connect()  # a new program need not home the wheel again
+    assert later.band() == "LW"
 
 
 def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
@@ -113,18 +111,15 @@ def test_home_is_as_the_settings_say() -> None:
     assert (wrong.world.wheel_position, wrong.wheel.position()) == (None, 2)
 
 
-def test_by_name_of_an_emulator() -> None:
-    """A wheel of a world is opened by its name, not homed, and asked from several threads."""
-    world = World(filters=FILTERS, wheel_position=3)
-    with FilterWheel.from_url("sim://apt/wheel", FILTERS, world=world) as wheel:
-        for attempt in (wheel.position, lambda: wheel.move_to(1), lambda: wheel.select("LW")):
-            with pytest.raises(NotHomedError, match="Must be homed"):
-                attempt()
-        with ThreadPoolExecutor(max_workers=4) as pool:
-            futures = [pool.submit(wheel.status) for _ in range(200)]
-            assert len({status.result().position for status in futures}) == 1
-    with pytest.raises(ValueError, match="Invalid model 'X'"):
-        EmulatedApt(world, model="X")
+def test_a_wheel_that_is_not_homed() -> None:
+    """It is neither moved nor said where it is; it is asked from several threads."""
+    (wheel := WheelBench().wheel).connect()
+    for attempt in (wheel.position, lambda: wheel.move_to(1), lambda: wheel.select("LW")):
+        with pytest.raises(NotHomedError, match="Must be homed"):
+            attempt()
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        futures = [pool.submit(wheel.status) for _ in range(200)]
+        assert len({status.result().position for status in futures}) == 1
 
 
 SPEEDS = "01 00 00 00 00 00 9a 11 00 00 00 80 4f 01"
@@ -234,7 +229,7 @@ def test_controllers_that_are_refused(
     case: dict[str, Any], error: type[WheelError], message: str
 ) -> None:
     """A controller that would not turn the wheel as it should raises an error on connecting."""
-    bench = WheelBench(**{name: case[name] for name in {"model", "serial_number"} & {*case}})
+    bench = WheelBench(**case) if {"model", "serial_number"} & {*case} else WheelBench()
     vars(bench.device.faults).update(case)
     with pytest.raises(error, match=message):
         bench.wheel.connect()

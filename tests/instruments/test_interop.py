@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from device_benches import FILTERS, WheelBench
+from device_benches import FILTERS
 
-from dbthermal.instruments.emulated import Line, World
+from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 
 RACK, CHANNEL = {"dest": 0x11}, {"dest": 0x21, "chan_ident": 1}
@@ -34,8 +35,10 @@ SENT: dict[str, dict[str, int]] = {
 }
 
 
-class Tap(Line):
-    """A line whose bytes are kept: `sent` by the driver, and its `answers`."""
+class Tap(EmulatedApt):
+    """An emulated wheel whose bytes are kept: `sent` by the driver, and its `answers`."""
+
+    slot_offset = -12.5
 
     sent: frozenset[bytes] = frozenset()
     answers = b""
@@ -55,8 +58,7 @@ class Tap(Line):
 def test_both_speak_the_same_to_a_wheel() -> None:
     """thorlabs-apt-protocol builds what the driver sends, and reads what the emulator answers."""
     protocol = pytest.importorskip("thorlabs_apt_protocol")
-    bench = WheelBench(slot_offset=-12.5)
-    tap = Tap(bench.device, bench.clock)
+    tap = Tap(World(filters=FILTERS, wheel_position=4))
     wheel = FilterWheel(tap, FILTERS, Settings(home_offset=-12.5))
     wheel.connect()
     wheel.home()

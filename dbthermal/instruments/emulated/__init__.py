@@ -161,16 +161,23 @@ def emulated_world(session: Session, **settings: Any) -> World:
     return world
 
 
-class Device:
-    """An emulated device at the end of a line: it takes bytes, and gives replies when polled."""
+class Line(Closing):
+    """An emulated device at the end of a line: a `transport.Transport`, for any number of threads.
 
-    def __init__(self) -> None:
-        self.plugged = True  # set to False to pull out the cable
-        self._replies: list[bytes] = []
+    A device takes bytes by `receive`, and `poll` gives its replies. Bytes that a driver does not
+    read are kept. `TransportError` once the device is pulled out.
+    """
+
+    is_simulated = True
+
+    def __init__(self, world: World) -> None:
+        self.world, self.clock = world, world.clock
+        self._replies, self._pieces = list[bytes](), list[bytes]()
+        self._lock, self._closed = threading.Lock(), False
 
     def is_plugged(self) -> bool:
         """False once it was pulled out."""
-        return self.plugged
+        return True
 
     def receive(self, data: bytes) -> None:
         """Take in bytes from the driver."""
@@ -185,26 +192,11 @@ class Device:
         """Time until something may be due [s]; infinite if it waits for bytes."""
         return 0.0 if self._replies else math.inf
 
-
-class Line(Closing):
-    """A `transport.Transport` to an emulated device, on its clock; for any number of threads.
-
-    Bytes that a driver does not read are kept. `TransportError` once the device is pulled out.
-    """
-
-    is_simulated = True
-
-    def __init__(self, device: Device, clock: Clock) -> None:
-        self._device, self.clock = device, clock
-        self._lock = threading.Lock()
-        self._pieces: list[bytes] = []
-        self._closed = False
-
     def write(self, data: bytes) -> None:
         """Give bytes to the device; see `Transport.write`."""
         with self._lock:
             self._check()
-            self._device.receive(data)
+            self.receive(data)
 
     def read(self, size: int, timeout: float) -> bytes:
         """Give one piece of the device's output; see `Transport.read`."""
@@ -212,13 +204,13 @@ class Line(Closing):
         while True:
             with self._lock:
                 self._check()
-                self._pieces += self._device.poll()
+                self._pieces += self.poll()
                 if self._pieces:
                     piece = self._pieces.pop(0)
                     if piece[size:]:
                         self._pieces.insert(0, piece[size:])
                     return piece[:size]
-                pause = max(self._device.next_due(), TICK)
+                pause = max(self.next_due(), TICK)
             remaining = deadline - self.clock()
             if remaining <= 0:
                 return b""
@@ -229,5 +221,5 @@ class Line(Closing):
         self._closed = True
 
     def _check(self) -> None:
-        if self._closed or not self._device.is_plugged():
+        if self._closed or not self.is_plugged():
             raise TransportError("Lost the emulated device. It must stay connected and open.")

@@ -5,8 +5,8 @@ included. The camera adds a frame rate, a clock, buffers that overflow if no pro
 shutter that freezes the image, and telemetry. It never flags its shutter: as with a real camera,
 that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
 
-The command port answers every command of `boson` after the public descriptions, refuses as a camera
-would, and runs the shutter on command only. The duration of a correction and the settings at
+The command port answers every command of `boson` after the public descriptions, refuses all others,
+and runs the shutter on command only. The duration of a correction and the settings at
 power-on, which the descriptions leave open, are choices made here.
 """
 
@@ -28,7 +28,7 @@ from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import boson, telemetry
 from dbthermal.instruments import camera as interface
 from dbthermal.instruments.camera import Counts, FfcMode, FfcStatus, Frame
-from dbthermal.instruments.emulated import SERIAL_NUMBERS, Device, Line, World
+from dbthermal.instruments.emulated import Line, World
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 
@@ -41,12 +41,10 @@ FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source c
 MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
 )
-"""Kind of camera, as in ``sim://boson/wide``, to its model, and the time between the flat-field
-corrections that it starts by itself [s]."""
+"""Kind of camera to its model, and the time between the flat-field corrections that it starts by
+itself [s]."""
 
-# Statuses of `boson.STATUSES` with which it refuses.
-_STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
-_CHOICES = {setting.set_command: [*setting.kind.__members__.values()] for setting in boson.SETTINGS}
+_REFUSED: Final = 0x161  # of `boson.STATUSES`: of every request that the driver does not send
 
 
 @dataclass
@@ -187,16 +185,16 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     return {band: partial(picture, band) for band in bands}
 
 
-class EmulatedBoson(Device):
+class EmulatedBoson(Line):
     """The command port of a camera of a world; KeyError if there is no camera of this name."""
 
     def __init__(self, world: World, name: str) -> None:
-        super().__init__()
+        super().__init__(world)
         self.camera = world.camera(name)
         # At power-on, by the identifier that sets them; not those of a real camera.
         self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
         self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
-        self._world, self._name, self._decoder = world, name, fslp.Decoder()
+        self._name, self._decoder = name, fslp.Decoder()
 
     def is_plugged(self) -> bool:
         """False once the camera was pulled out."""
@@ -214,37 +212,29 @@ class EmulatedBoson(Device):
 
     def reply(self, request: fslp.Frame) -> bytes:
         """Bytes of the reply to a request."""
-        with self._world.lock:
+        with self.world.lock:
             if not self.camera.has_frames:
-                self.camera.frame_count = math.floor(self._world.time * FRAME_RATE)
+                self.camera.frame_count = math.floor(self.world.time * FRAME_RATE)
             status, data = self.answer(request)
         return fslp.encode(request.sequence, request.command, data, status)
 
     def answer(self, request: fslp.Frame) -> tuple[int, bytes]:
         """Status and data of the reply to a request."""
         command, data, readings = request.command, request.data, self._readings()
-        if request.status != fslp.REQUEST:
-            return _STATUS, b""
-        if command not in {boson.RUN_FFC, *self.settings, *readings}:
-            return _UNKNOWN, b""
-        # The size of its data.
-        size = 4 if command in self.settings else 0
-        if len(data) != size:
-            return (_FEW if len(data) < size else _MANY), b""
+        size = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4), **dict.fromkeys(readings, 0)}
+        if request.status != fslp.REQUEST or len(data) != size.get(command):
+            return _REFUSED, b""
         if command == boson.RUN_FFC:
-            self._world.start_ffc(self._name)
+            self.world.start_ffc(self._name)
         elif command in self.settings:
-            (value,) = struct.unpack(">i", data)
-            if value not in _CHOICES[command]:
-                return _RANGE, b""
-            self.settings[command] = value
+            (self.settings[command],) = struct.unpack(">i", data)
         return 0, readings.get(command, b"")
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
         camera = self.camera
         status = FfcStatus.COMPLETE if camera.ffc_count else FfcStatus.NONE_PERFORMED
-        if self._world.ffc_in_progress(self._name):
+        if self.world.ffc_in_progress(self._name):
             status = FfcStatus.IN_PROGRESS
         values: dict[boson.Reading[Any], tuple[int | bytes, ...]] = {
             boson.SERIAL_NUMBER: (camera.serial_number,),
@@ -258,14 +248,3 @@ class EmulatedBoson(Device):
         }
         values |= {key.reading: (self.settings[key.set_command],) for key in boson.SETTINGS}
         return {key.command: struct.pack(key.layout, *value) for key, value in values.items()}
-
-
-def start(name: str, world: World | None) -> Line:
-    """Line to the command port of a camera of a world; without a world, to that of a new camera.
-
-    KeyError if the world has no camera of this name.
-    """
-    if world is None:
-        world = World()
-        world.add_camera(name, SERIAL_NUMBERS)
-    return Line(EmulatedBoson(world, name), world.clock)

@@ -1,10 +1,10 @@
 """Emulated filter wheel FW103 on an emulated APT controller, and an emulated TC-08.
 
 The controller answers below the real driver, byte for byte, with the quirks that users report:
-speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly,
-reports of moves at any time, another model than on the label. Its counter of commanded steps agrees
-with the wheel only once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
-AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
+speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly, and
+reports of moves at any time. Its counter of commanded steps agrees with the wheel only once the
+home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of AlexShkarin/pyLabLib and the
+documentation of thorlabs_apt_device; the rest as in `_apt`.
 
 The TC-08 has the functions of the vendor's library, and none of its code: it writes into the
 caller's ctypes buffers. Signatures, error numbers and NaN for channels that are off are those of
@@ -21,24 +21,19 @@ from typing import Any, Final
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated import ROOM, Device, Line, World
-from dbthermal.instruments.filterwheel import BSC10X, BSC20X
-from dbthermal.instruments.tc08 import CHANNELS, KELVIN
+from dbthermal.instruments.emulated import ROOM, Line, World
+from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.filterwheel import BSC20X
+from dbthermal.instruments.session import WHEEL
+from dbthermal.instruments.tc08 import CHANNELS
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
 SERIAL_NUMBER: Final = 40_000_000
-NOTES: Final = b"emulated, not hardware"  # in its `Info`
 SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
 CONVERSION: Final = 0.1  # conversion time of one channel of the TC-08 [s]
 RANGE: Final = (3.15, 673.15)  # of its thermocouples of type T [K]
 WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
-
-
-MODELS: Final = MappingProxyType(
-    {"BSC201": BSC20X, "BSC203": BSC20X, "SCC201": BSC20X, "BSC101": BSC10X, "KDC101": BSC10X}
-)
-"""Controllers by the name they give (KDC101 drives no wheel); those of many counts are racks."""
 
 
 @dataclass(frozen=True)
@@ -74,32 +69,21 @@ class Drive:
         return self.acceleration * ramp**2 / 2 + self.velocity * (time - ramp)
 
 
-class EmulatedApt(Device):
+class EmulatedApt(Line):
     """A controller that turns the world's wheel, whose slot 1 is `slot_offset` [deg] from home.
 
     `position` counts the commanded steps, `wheel` is the place of the wheel from its home switch
     [count].
     """
 
-    def __init__(
-        self,
-        world: World,
-        *,
-        model: str = "BSC201",
-        serial_number: int = SERIAL_NUMBER,
-        slot_offset: float = 0.0,
-    ) -> None:
-        if model not in MODELS:
-            raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
-        super().__init__()
-        self.info = apt.Info(serial_number, model.encode(), notes=NOTES)
-        self.model, is_rack = MODELS[model], MODELS[model] is BSC20X
-        self.unit, self.address = (apt.RACK, apt.BAY_1) if is_rack else (apt.UNIT, apt.UNIT)
-        self.world = world
+    info = apt.Info(SERIAL_NUMBER, b"BSC201", notes=b"emulated, not hardware")
+    model, unit, address, slot_offset = BSC20X, apt.RACK, apt.BAY_1, 0.0
+
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
         self.position, self.enabled, self.homed = 0, False, False
         slot = 1 if world.wheel_position is None else world.wheel_position
-        self._slot_offset = slot_offset
-        self.wheel = ((slot - 1) / 6 + slot_offset / 360.0) * self.model.turn
+        self.wheel = ((slot - 1) / 6 + self.slot_offset / 360.0) * self.model.turn
         self._drive: Drive | None = None
         self._speeds, self._home = apt.Speeds(1, 0, 0, 0), apt.Home(1, 2, 1, 0, 0)
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
@@ -175,12 +159,6 @@ class EmulatedApt(Device):
         """Motion as it is carried out; replaced in tests."""
         return drive
 
-    def finish(self, drive: Drive) -> None:
-        """Take in the end of a motion, and report it."""
-        if drive.homing:
-            self.position, self.homed = 0, True
-        self.report(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
-
     def report(self, identifier: Id) -> None:
         """Report the end of a motion, without a request."""
         self.reply(identifier, param1=1)
@@ -205,7 +183,6 @@ class EmulatedApt(Device):
         bits = StatusBits.CONNECTED
         bits |= StatusBits.ENABLED if self.enabled else 0
         bits |= StatusBits.HOMED if self.homed else 0
-        bits |= StatusBits.JOGGING_FORWARD if self.info.model == b"SCC201" else 0  # it sticks
         if self._drive is not None:
             forward = self._drive.distance > 0
             bits |= StatusBits.MOVING_FORWARD if forward else StatusBits.MOVING_REVERSE
@@ -220,13 +197,12 @@ class EmulatedApt(Device):
             self.wheel += self.position - before
             if now >= drive.start + drive.duration:
                 self._drive = None
-                self.finish(drive)
+                if drive.homing:
+                    self.position, self.homed = 0, True
+                self.report(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
         # The slot that is in the beam of a wheel at rest.
-        slot = self.model.position(self.wheel, self._slot_offset, WINDOW)
+        slot = self.model.position(self.wheel, self.slot_offset, WINDOW)
         self.world.wheel_position = slot if self._drive is None else None
-
-
-_HANDLE = 1
 
 
 class EmulatedTC08:
@@ -240,7 +216,7 @@ class EmulatedTC08:
 
     def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
         self._temperature, self.clock = temperature, clock
-        self._is_open, self._error = False, 0
+        self.is_open, self.error = False, 0
         self._kinds: dict[int, str] = {}
 
     def usb_tc08_open_unit_async(self) -> int:
@@ -249,51 +225,34 @@ class EmulatedTC08:
 
     def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
         """Progress of opening: 0 pending, 1 complete (handle 0 if no unit is free), -1 failed."""
-        handle[0], percent[0] = 0 if self._is_open else _HANDLE, 100
-        self._is_open = True
+        handle[0], percent[0] = int(not self.is_open), 100
+        self.is_open = True
         return 1
 
-    def usb_tc08_close_unit(self, handle: int) -> int:
+    def usb_tc08_close_unit(self, _: int) -> int:
         """Close the unit."""
-        if not self._accepts(handle):
-            return 0
-        self._is_open, self._kinds = False, {}
+        self.is_open, self._kinds = False, {}
         return 1
 
-    def usb_tc08_get_last_error(self, handle: int) -> int:
-        """Error of the last function that failed, -1 if the handle is not open."""
-        return self._error if handle in {0, _HANDLE} else -1
+    def usb_tc08_get_last_error(self, _: int) -> int:
+        """Error of the last function that failed."""
+        return self.error
 
-    def usb_tc08_get_unit_info(self, handle: int, info: Numbers) -> int:
+    def usb_tc08_get_unit_info(self, _: int, info: Numbers) -> int:
         """Write the identity, which says that it is emulated."""
-        if not self._accepts(handle):
-            return 0
-        if info[0].size != 40:
-            return self._fail(3)
         info[0].driver, info[0].serial = b"emulated", b"EMULATED"
         info[0].hardware, info[0].variant, info[0].calibration_date = 1, 8, b"01Jan00"
         return 1
 
-    def usb_tc08_set_channel(self, handle: int, channel: int, kind: int) -> int:
-        """Set a channel to a letter; C is for channel 0 alone, a space switches it off."""
-        if not self._accepts(handle):
-            return 0
-        letters = "C " if channel == 0 else "BEJKNRST "
-        if channel not in range(CHANNELS) or chr(kind) not in letters:
-            return self._fail(3)
+    def usb_tc08_set_channel(self, _: int, channel: int, kind: int) -> int:
+        """Set a channel to a letter; a space switches it off."""
         self._kinds.pop(channel, None)
         if chr(kind) != " ":
             self._kinds[channel] = chr(kind)
         return 1
 
-    def usb_tc08_get_single(
-        self, handle: int, values: Numbers, overflow: Numbers, units: int
-    ) -> int:
+    def usb_tc08_get_single(self, _: int, values: Numbers, overflow: Numbers, __: int) -> int:
         """Convert all channels once [K], NaN for those that are off."""
-        if not self._accepts(handle):
-            return 0
-        if units != KELVIN or not self._kinds:
-            return self._fail(2 if units == KELVIN else 3)
         self.clock.sleep(CONVERSION * len(self._kinds))
         readings = [self.convert(channel) for channel in range(CHANNELS)]
         values[:] = [value for value, _ in readings]
@@ -309,20 +268,6 @@ class EmulatedTC08:
         tip = self._temperature(channel)
         return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
 
-    def _accepts(self, handle: int) -> bool:
-        """True if the unit is open, and the handle is that of the unit."""
-        accepted = self._is_open and handle == _HANDLE
-        if not accepted:
-            self._error = 3
-        return accepted
 
-    def _fail(self, error: int) -> int:
-        """Note an error, and return the 0 of a failed function."""
-        self._error = error
-        return 0
-
-
-def start(_: str, world: World | None) -> Line:
-    """Line to the emulated wheel of a world, or of a new one."""
-    world = World() if world is None else world
-    return Line(EmulatedApt(world), world.clock)
+LINES: Final = MappingProxyType({WHEEL: EmulatedApt, "boson": EmulatedBoson})
+"""Emulators at the end of a serial line: the wheel, and the command port of a kind of camera."""
