@@ -1,10 +1,9 @@
 """Emulated devices and their drivers on a simulated clock, for several tests."""
 
-from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from faulty_devices import Fault, FaultyApt, FaultyBoson, FaultyTC08
+from faulty_devices import FaultyApt, FaultyBoson, FaultyTC08
 
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.clock import EmulatedClock
@@ -48,10 +47,6 @@ class BosonBench:
         self.state = self.world.add_camera("boson", serial_number)
         self.device = FaultyBoson(self.world, "boson")
         self.camera = Boson(self.device, first_sequence=1)
-
-    def spoil(self, *faults: Fault | None) -> None:
-        """Set faults of the next requests."""
-        self.device.faults.once = deque(faults)
 
     def exchange(self, request: bytes) -> bytes:
         """Send bytes without the driver, and return the answer."""

@@ -9,7 +9,6 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from enum import Enum, auto
 from typing import Any
 
 from dbthermal.instruments import _apt as apt
@@ -177,83 +176,32 @@ def text(sequence: int, command: int) -> bytes:
     return fslp.encode(sequence, command, b"emulated debug text", 0, channel=0x99)
 
 
-class Fault(Enum):
-    """Faults of a Boson's reply."""
-
-    DROP = auto()  # it never comes
-    LATE = auto()  # it comes after `BosonFaults.late`, and so do those behind it
-    HOLD = auto()  # it comes together with the next one
-    BAD_CHECKSUM = auto()
-    ILLEGAL_ESCAPE = auto()
-    CUT = auto()  # its second half is lost
-    DEBUG_TEXT = auto()  # text on another channel comes first
-
-
-@dataclass
-class BosonFaults:
-    """Faults of a camera's command port; may be changed at any time."""
-
-    once: deque[Fault | None] = field(default_factory=deque)  # for the next requests
-    late: float = 1.5  # delay of `Fault.LATE` [s]
-    single_bytes: bool = False  # replies come byte by byte
-    ffc_stalls: bool = False  # no reply while the shutter is closed
-
-
 class FaultyBoson(EmulatedBoson):
-    """The emulated camera with faults."""
+    """The emulated camera that falls silent after some answers, or while its shutter is closed."""
 
     def __init__(self, world: World, name: str) -> None:
         super().__init__(world, name)
-        self.faults = BosonFaults()
-        self._inbox: deque[tuple[fslp.Frame, Fault | None, float]] = deque()
-        self._held = b""
+        self.answers, self.stalls = math.inf, False
+        self._inbox: deque[fslp.Frame] = deque()
 
     def request(self, frame: fslp.Frame) -> None:
-        """Take in one request with its fault, to be answered when it is due."""
-        fault = self.faults.once.popleft() if self.faults.once else None
-        delay = self.faults.late if fault is Fault.LATE else 0.0
-        self._inbox.append((frame, fault, self.world.time + delay))
+        """Take in one request, to be answered when the shutter is open."""
+        self.answers -= 1
+        if self.answers >= 0:
+            self._inbox.append(frame)
 
     def poll(self) -> list[bytes]:
-        """Give the replies that are due, with their faults."""
+        """Give the replies that are due."""
         replies = []
         while self._inbox and self.next_due() <= 0:
-            frame, fault, _ = self._inbox.popleft()
-            replies.append(self._spoilt(frame, fault))
-        if self.faults.single_bytes:
-            return [bytes([byte]) for reply in replies for byte in reply]
-        return [reply for reply in replies if reply]
+            replies.append(self.reply(self._inbox.popleft()))
+        return replies
 
     def next_due(self) -> float:
         """Time until a reply is due [s]; infinite without a request."""
         if not self._inbox:
             return math.inf
-        due = self._inbox[0][2]
-        if self.faults.ffc_stalls:
-            due = max(due, self.camera.ffc_until)
-        return due - self.world.time
-
-    def _spoilt(self, frame: fslp.Frame, fault: Fault | None) -> bytes:
-        """Bytes of the reply to a request, with its fault."""
-        spoilt = self._held + _misshapen(self.reply(frame), fault)
-        self._held = spoilt if fault is Fault.HOLD else b""
-        return b"" if fault in {Fault.HOLD, Fault.DROP} else spoilt
-
-
-def _misshapen(whole: bytes, fault: Fault | None) -> bytes:
-    """Damage the bytes of a reply."""
-    match fault:
-        case Fault.BAD_CHECKSUM:
-            # The byte before the end, to a value that needs no escape.
-            return whole[:-2] + bytes([0x00 if whole[-2] else 0x01]) + whole[-1:]
-        case Fault.ILLEGAL_ESCAPE:
-            return whole[:-1] + b"\x9e\x00" + whole[-1:]
-        case Fault.CUT:
-            return whole[: len(whole) // 2]
-        case Fault.DEBUG_TEXT:
-            return text(0, 0) + whole
-        case _:
-            return whole
+        return self.camera.ffc_until - self.world.time if self.stalls else 0.0
 
 
 @dataclass
