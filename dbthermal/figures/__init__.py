@@ -10,7 +10,7 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 from dbthermal.figures import drawing
 from dbthermal.figures._calibration import gain_offset_maps, response_fit
 from dbthermal.figures._limits import plan
-from dbthermal.figures._live import LiveFigure, Panel
+from dbthermal.figures._live import Panel, live
 from dbthermal.figures._scenes import (
     FilmPanel,
     film,
@@ -23,11 +23,11 @@ from dbthermal.figures._status import REASONS, status
 __all__ = [
     "REASONS",
     "FilmPanel",
-    "LiveFigure",
     "Panel",
     "drawing",
     "film",
     "gain_offset_maps",
+    "live",
     "plan",
     "reflection_shift",
     "response_fit",

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
+from dbthermal._arrays import Array
 from dbthermal.instruments import camera
 from dbthermal.instruments.camera import FFC_READING, FfcStatus, Frame, FrameFlag
 from dbthermal.instruments.recording import Preview
@@ -24,7 +25,7 @@ from dbthermal.instruments.recording import Preview
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
     from matplotlib.figure import Figure
 
-    from dbthermal.figures import LiveFigure, Panel
+    from dbthermal.figures import Panel
     from dbthermal.separation import Stream
 
 __all__ = ["Picture", "Separation", "Status", "View", "Watch"]
@@ -232,8 +233,9 @@ class View:
 
     It is shown on a `display`, such as IPython's ``DisplayHandle``, first by its ``display``, then
     by its ``update``; without one the figure is only kept. An update, once a second at most, of two
-    bands of 640 x 512 takes a tenth of a second of one core. `title` is the recording's name. With
-    a `separation` it shows temperatures as well.
+    bands of 640 x 512 takes a fifth of a second of one core. `title` is the recording's name. With
+    a `separation` it shows temperatures as well. `figure` is the last one that was drawn, None
+    before the first preview.
 
     Examples
     --------
@@ -253,13 +255,8 @@ class View:
         self._display, self._separation, self._watch = display, separation, Watch()
         self._title = f"{title} (emulated)" if is_simulated else title
         self._separated: xr.Dataset | None = None
-        self._drawn: LiveFigure | None = None
+        self.figure: Figure | None = None
         self._is_shown, self._time = False, -math.inf
-
-    @property
-    def figure(self) -> "Figure | None":
-        """The figure as it was last drawn, None before the first preview."""
-        return self._drawn.figure if self._drawn else None
 
     @property
     def status(self) -> dict[str, Status]:
@@ -278,47 +275,44 @@ class View:
             self._show(preview)
 
     def _show(self, preview: Preview) -> None:
-        from matplotlib.image import imsave  # noqa: PLC0415 - see the module's imports
-
-        from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415
+        from dbthermal.figures import Panel, live  # noqa: PLC0415 - see the module's imports
 
         statuses, frames = self._watch.status(), preview.frames
-        bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
-        if self._drawn is None or (self._drawn.bands, self._drawn.shape) != (bands, shape):
-            self._drawn = LiveFigure(bands, shape, _FILMS if self._separation else ())
+        empty = np.full(next(iter(frames.values())).counts.shape, np.nan)
         # A panel for each band, and for each temperature.
         panels = {}
         for band, status in statuses.items():
-            image, (low, high) = frames[band].counts if band in frames else None, status.limits
+            image, (low, high) = frames[band].counts if band in frames else empty, status.limits
             # Black and white are distinct even in a uniform picture.
-            limits = (0.0, 1.0) if image is None else (low, max(high, low + 1.0))
+            limits = (low, max(high, low + 1.0)) if band in frames else (0.0, 1.0)
             panels[band] = Panel(image, limits, status.text, status.warning)
         if self._separation:
-            panels |= {name: _temperature(name, self._separated) for name in _FILMS}
+            panels |= {name: _temperature(name, self._separated, empty) for name in _FILMS}
         title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
-        self._drawn.update(panels, title=title, foot=foot)
+        self.figure = live(panels, title=title, foot=foot)
         if self._display is not None:
             lines = [
                 f"{band}: {status.text}\n{status.warning}" for band, status in statuses.items()
             ]
             png, fast = io.BytesIO(), {"compress_level": _COMPRESSION}  # rather than small
-            imsave(png, self._drawn.pixels(), format="png", pil_kwargs=fast)
+            self.figure.savefig(png, format="png", pil_kwargs=fast)
             picture = Picture(png.getvalue(), "\n".join((title, *lines, foot)))
             (self._display.update if self._is_shown else self._display.display)(picture)
             self._is_shown = True
 
 
-def _temperature(name: str, separated: xr.Dataset | None) -> "Panel":
+def _temperature(name: str, separated: xr.Dataset | None, empty: Array) -> "Panel":
     """Panel of the last temperatures of a separation."""
     from dbthermal.figures import Panel  # noqa: PLC0415 - loads matplotlib
 
     if separated is None:
-        return Panel(None, (0.0, 1.0), "not known yet")
+        return Panel(empty, (0.0, 1.0), "not known yet", is_temperature=True)
     image = separated[f"{name}_temperature"].values[-1] - zero_Celsius
     good = 100 * float((separated["status"] == 0).mean())
     finite = image[np.isfinite(image)]
     low, high = np.percentile(finite, _PERCENTILES) if finite.size else (0.0, 1.0)
-    return Panel(image, (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag")
+    limits, text = (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag"
+    return Panel(image, limits, text, is_temperature=True)
 
 
 def _foot(preview: Preview) -> str:
