@@ -37,10 +37,6 @@ class NoReplyError(WheelError, TimeoutError):
     """The controller did not reply in time."""
 
 
-class WrongDeviceError(WheelError):
-    """Another device is at this address."""
-
-
 class Controller:
     """Requests to a controller and its replies, with what it reports by itself."""
 
@@ -80,7 +76,7 @@ class Controller:
             self._notices.clear()  # it need not know all messages of the greeting
             return apt.parse(apt.Info, reply)
         if self.decoder.dropped:
-            raise WrongDeviceError(
+            raise WheelError(
                 f"{self.decoder.dropped} bytes came that are no APT messages. "
                 "Must be an APT controller."
             )
@@ -144,7 +140,7 @@ class Controller:
             count += len(received)
             if count > MAXIMUM_UNSOLICITED:
                 came = f"More than {MAXIMUM_UNSOLICITED} unsolicited bytes came"
-                raise WrongDeviceError(f"{came}. Must be an APT controller.")
+                raise WheelError(f"{came}. Must be an APT controller.")
 
     def _replies(self, received: bytes) -> list[Message]:
         """Messages that may be replies; events and notices are kept."""

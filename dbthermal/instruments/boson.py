@@ -32,8 +32,6 @@ __all__ = [
     "KIND",
     "Boson",
     "BosonError",
-    "BosonReplyError",
-    "BosonStatusError",
     "BosonTimeoutError",
 ]
 __dir__ = __all__.copy
@@ -153,31 +151,19 @@ STATUSES: Final = MappingProxyType(
 
 
 class BosonError(RuntimeError):
-    """The camera did not carry out a command."""
+    """The camera refused a command, or its reply is wrong."""
 
 
 class BosonTimeoutError(BosonError, TimeoutError):
     """No reply came in time; a command that changes the camera may have been carried out."""
 
 
-class BosonReplyError(BosonError):
-    """The reply is of another command, of the wrong size, or without meaning."""
-
-
-class BosonStatusError(BosonError):
-    """The camera refused; `status` is a key of `STATUSES`."""
-
-    def __init__(self, message: str, status: int) -> None:
-        super().__init__(message)
-        self.status = status
-
-
 class Boson(Closing):
     """A camera's command port, a `camera.CameraControl`; for any number of threads.
 
-    Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
-    `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
-    requested again if no reply comes; a command that changes the camera never is.
+    Each method raises `BosonTimeoutError` if no reply comes, `BosonError` if a wrong one does or
+    the camera refuses, and `TransportError` if it is gone. A reading is requested again if no reply
+    comes; a command that changes the camera never is.
 
     Examples
     --------
@@ -217,11 +203,11 @@ class Boson(Closing):
         size, name = struct.calcsize(reading.layout), reading.name
         if len(data) != size:
             message = f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}."
-            raise BosonReplyError(message)
+            raise BosonError(message)
         try:
             return reading.convert(*struct.unpack(reading.layout, data))
         except ValueError as error:
-            raise BosonReplyError(f"Invalid reply to '{name}': {error}") from error
+            raise BosonError(f"Invalid reply to '{name}': {error}") from error
 
     def get(self, setting: Setting[EnumT]) -> EnumT:
         """State of a setting."""
@@ -303,7 +289,7 @@ class Boson(Closing):
         """Send a command that changes the camera, once; its reply must be empty."""
         if reply := self._exchange(name, command, data):
             size = len(reply)
-            raise BosonReplyError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
+            raise BosonError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again if no reply comes, and return the data of its reply."""
@@ -317,16 +303,15 @@ class Boson(Closing):
             reply = self._reply(name)
         # What the reply says.
         if reply.command != command:
-            raise BosonReplyError(
+            raise BosonError(
                 f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
                 f"Must be of command 0x{command:08X}."
             )
         if reply.status:
             meaning = STATUSES.get(reply.status, "unknown status")
-            raise BosonStatusError(
+            raise BosonError(
                 f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
-                "Must be 0, OK.",
-                reply.status,
+                "Must be 0, OK."
             )
         return reply.data
 
@@ -340,7 +325,7 @@ class Boson(Closing):
                 break
             received += len(piece)
             if received > MAXIMUM_RECEIVED:
-                raise BosonReplyError(
+                raise BosonError(
                     f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
                     "Must be a Boson's command port that no other program uses."
                 )

@@ -32,7 +32,6 @@ from dbthermal.instruments._controller import (
     Controller,
     NoReplyError,
     WheelError,
-    WrongDeviceError,
 )
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport
@@ -44,8 +43,6 @@ __all__ = [
     "Settings",
     "StalledWheelError",
     "WheelError",
-    "WheelTimeoutError",
-    "WrongDeviceError",
 ]
 __dir__ = __all__.copy
 
@@ -125,10 +122,6 @@ BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
 MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 
 
-class WheelTimeoutError(WheelError, TimeoutError):
-    """The wheel moved, but did not arrive in time."""
-
-
 class StalledWheelError(WheelError):
     """The wheel does not move, or stopped elsewhere."""
 
@@ -163,12 +156,12 @@ class FilterWheel(Closing):
         info, expected = self._controller.connect(), self.settings.serial_number
         model = apt.text(info.model)
         if expected is not None and info.serial_number != expected:
-            raise WrongDeviceError(f"Wrong controller {info.serial_number}. Must be {expected}.")
+            raise WheelError(f"Wrong controller {info.serial_number}. Must be {expected}.")
         # Its scale, by the beginning of its name.
         scales = [scale for beginning, scale in MODELS.items() if model.startswith(beginning)]
         if not scales:
             rule = f"Its model must begin with one of {sorted(MODELS)}"
-            raise WrongDeviceError(f"Wrong device '{model}', number {info.serial_number}. {rule}.")
+            raise WheelError(f"Wrong device '{model}', number {info.serial_number}. {rule}.")
         self._scale = scales[0]
         self._identity = {
             "model": model,
@@ -193,8 +186,8 @@ class FilterWheel(Closing):
     def home(self) -> None:
         """Search for the home switch, from which all places count; the speeds are set before.
 
-        StalledWheelError or WheelTimeoutError if the wheel does not start, stops before the switch,
-        or takes too long, and was stopped.
+        StalledWheelError if the wheel does not start, or stops before the switch; WheelError if it
+        takes too long, and was stopped.
         """
         self.identity()
         self._prepare()
@@ -217,7 +210,7 @@ class FilterWheel(Closing):
         ValueError if there is no such slot; NotHomedError if the controller was not homed since it
         was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
         stops elsewhere, or the controller reports a fault: it must be homed before the next move;
-        WheelTimeoutError if it takes too long, and was stopped.
+        WheelError if it takes too long, and was stopped.
         """
         scale = self._scale
         target = scale.target(position, self.settings.home_offset)
@@ -365,7 +358,7 @@ class FilterWheel(Closing):
                 raise StalledWheelError(f"{name}: the wheel {action} {place}. Must arrive.")
             elif now - start > limits[0]:
                 self.stop()
-                raise WheelTimeoutError(
+                raise WheelError(
                     f"{name}: the wheel was still {place} after {limits[0]} s, and was "
                     "stopped. Must arrive in this time."
                 )

@@ -5,7 +5,6 @@ the emissivity bench. At each temperature the wheel goes through its filters, an
 recording for each filter. `dbthermal.instruments.recording` opens the recordings.
 """
 
-import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -164,7 +163,6 @@ def record_scene(
     *,
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
-    stop: threading.Event | None = None,
 ) -> Summary:
     """Record a scene with all devices; an emulated scene begins with the recording.
 
@@ -174,7 +172,7 @@ def record_scene(
         Of any session; call `Devices.prepare` before.
     path : str or Path
         Folder ``*.zarr`` to make.
-    limits, preview, stop : optional
+    limits, preview : optional
         As for `dbthermal.instruments.recording.record`, whose result and errors are those of this.
 
     Examples
@@ -193,8 +191,7 @@ def record_scene(
     expected = devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:
         raise ValueError(f"Invalid filter in the beam. Must be '{expected}': prepare the devices.")
-    options = {"limits": limits, "preview": preview, "stop": stop}
-    return _record(devices, Path(path), begins=True, **options)
+    return _record(devices, Path(path), begins=True, limits=limits, preview=preview)
 
 
 def _record(devices: Devices, path: Path, *, begins: bool = False, **options: Any) -> Summary:

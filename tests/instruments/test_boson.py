@@ -18,8 +18,6 @@ from dbthermal.instruments.boson import (
     REPLY_TIMEOUT,
     Boson,
     BosonError,
-    BosonReplyError,
-    BosonStatusError,
     BosonTimeoutError,
     Reading,
     Setting,
@@ -149,19 +147,19 @@ ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED 
     ("reading", "answer", "error", "message"),
     [
         (SERIAL, MUTE, BosonTimeoutError, "No reply to 'serial number' within 1 s"),
-        (SERIAL, ENDLESS, BosonReplyError, "within 65536 bytes"),
-        (SERIAL, reply(1, FPA, b"\x01\x7c"), BosonReplyError, "Must be of command 0x00050002"),
+        (SERIAL, ENDLESS, BosonError, "within 65536 bytes"),
+        (SERIAL, reply(1, FPA, b"\x01\x7c"), BosonError, "Must be of command 0x00050002"),
         (
             SERIAL,
             reply(1, SERIAL, b"\0\1"),
-            BosonReplyError,
+            BosonError,
             "of 2 bytes to .* Must have 4",
         ),
-        (SERIAL, reply(1, SERIAL, status=0x283), BosonStatusError, "0x283, camera busy"),
-        (SERIAL, reply(1, SERIAL, status=0x6A4), BosonStatusError, "0x6A4, flash"),
-        (SERIAL, reply(1, SERIAL, status=0x999), BosonStatusError, "0x999, unknown"),
-        (STATUS, reply(1, STATUS, b"\0\0\0\x09"), BosonReplyError, "9 is not a valid FfcStatus"),
-        (PART, reply(1, PART, b"\xff" * 20), BosonReplyError, "Invalid reply to 'part number'"),
+        (SERIAL, reply(1, SERIAL, status=0x283), BosonError, "0x283, camera busy"),
+        (SERIAL, reply(1, SERIAL, status=0x6A4), BosonError, "0x6A4, flash"),
+        (SERIAL, reply(1, SERIAL, status=0x999), BosonError, "0x999, unknown"),
+        (STATUS, reply(1, STATUS, b"\0\0\0\x09"), BosonError, "9 is not a valid FfcStatus"),
+        (PART, reply(1, PART, b"\xff" * 20), BosonError, "Invalid reply to 'part number'"),
     ],
 )
 def test_readings_that_fail(
@@ -170,17 +168,15 @@ def test_readings_that_fail(
     """A mute camera is asked three times; other replies are errors with what is wrong."""
     (entries,) = (r for r in vars(boson).values() if getattr(r, "command", None) == reading)
     pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
-    with Dialogue(pairs) as line, pytest.raises(error, match=message) as caught:
+    with Dialogue(pairs) as line, pytest.raises(error, match=message):
         camera_of(line).read(entries)
-    status = getattr(caught.value, "status", 0)
-    assert f"0x{status:X}" in message or not status
 
 
 @pytest.mark.parametrize(
     ("answer", "error", "message"),
     [
         (None, BosonTimeoutError, "No reply to 'set gain mode'"),
-        (reply(1, SET_GAIN, b"\0"), BosonReplyError, "reply of 1 bytes to 'set gain mode'"),
+        (reply(1, SET_GAIN, b"\0"), BosonError, "reply of 1 bytes to 'set gain mode'"),
     ],
 )
 def test_a_change_is_sent_once(answer: bytes | None, error: type[BosonError], message: str) -> None:

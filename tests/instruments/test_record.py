@@ -2,7 +2,6 @@
 
 import errno
 import shutil
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NoReturn
@@ -169,19 +168,6 @@ def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
         opened = store.open_dataset(tmp_path / name)
         assert (opened.attrs["complete"], opened.attrs["ended"]) == (False, ended)
         assert opened.sizes["time"] >= 1
-
-
-def test_stopped_by_the_user(tmp_path: Path) -> None:
-    """A recording that the user stops is complete."""
-    stop, path = threading.Event(), tmp_path / "a.zarr"
-
-    def look(shown: Preview) -> None:
-        if shown.totals["9.5"]["frames"] > 7:
-            stop.set()
-
-    summary = record(session(60.0), bench(), path, limits=SMALL, stop=stop, preview=look)
-    assert summary.ended == "stopped"
-    assert store.open_dataset(path).attrs["complete"] is True
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

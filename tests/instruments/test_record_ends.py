@@ -114,19 +114,6 @@ def test_keyboard_interrupt_keeps_everything(
     assert sorted(numbers[numbers >= 0]) == sorted(came)
 
 
-def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
-    """A recording that lost a camera is not complete, even if the user stopped it."""
-    stop, path, world = threading.Event(), tmp_path / "a.zarr", World()
-    sources = bench(Faults(unplugged=5), world=world)
-
-    def look(_: Preview) -> None:
-        if not world.camera("8-14").plugged:
-            stop.set()
-
-    summary = record(session(9.0), sources, path, limits=SMALL, preview=look, stop=stop)
-    assert (summary.ended, store.open_dataset(path).attrs["complete"]) == ("source lost", False)
-
-
 def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
     """A camera without a frame makes the recording incomplete, and its silence is in the log."""
     sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"

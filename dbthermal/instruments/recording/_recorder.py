@@ -105,8 +105,8 @@ class Summary:
     path, totals : Path, mapping
         Folder of the recording, wherever it lies now; as in `Preview`.
     ended : str
-        ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is lost),
-        or ``"no frames"`` if a band had none.
+        ``"duration"``, ``"source lost"`` (it goes on until the last source is lost), or
+        ``"no frames"`` if a band had none.
     """
 
     path: Path
@@ -123,9 +123,8 @@ def record(
     identities: Identities | None = None,
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
-    stop: threading.Event | None = None,
 ) -> Summary:
-    """Record until the end of the session's duration, a stop, or the loss of the last camera.
+    """Record until the end of the session's duration, or the loss of the last camera.
 
     Frames that a driver buffered before the start, by their stamps, are not recorded. Two seconds
     after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
@@ -139,9 +138,9 @@ def record(
         Folder ``*.zarr`` to make; see `open_capture`.
     readings, identities : mapping, optional
         Name to an instrument; name or band to model and numbers, beside those of the sources.
-    limits, preview, stop : optional
-        `Limits`; a function called now and then with a `Preview` in the caller's thread, which may
-        take its time; and an event whose setting ends the recording.
+    limits, preview : optional
+        `Limits`; and a function called now and then with a `Preview` in the caller's thread, which
+        may take its time.
 
     Raises
     ------
@@ -159,7 +158,7 @@ def record(
     with raised_signals(), clock.joined():
         file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
         # The writer starts the other threads, this one shows the preview.
-        run = _Run(file, sources, readings, limits, session.duration, stop or threading.Event())
+        run = _Run(file, sources, readings, limits, session.duration)
         # No daemon: it ends its work whatever becomes of this thread.
         writer = Task(clock, "writer", run.write, daemon=False)
         try:
@@ -241,9 +240,8 @@ class _Run:
         readings: Mapping[str, Reading],
         limits: Limits,
         duration: float,
-        stop: threading.Event,
     ) -> None:
-        self.file, self.readings, self.limits, self.stop = file, readings, limits, stop
+        self.file, self.readings, self.limits = file, readings, limits
         self.clock = next(iter(sources.values())).clock
         self.start = self.clock()  # to make the file may have taken a while
         self.end = self.start + duration
@@ -268,8 +266,8 @@ class _Run:
         self._threads = [*self._fetching, reading]
 
     def _is_going(self) -> bool:
-        """True until the end of the duration, a stop or an error."""
-        return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
+        """True until the end of the duration, or an error."""
+        return not (self.over.is_set() or self.clock() >= self.end)
 
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do a thread's work; an error ends the recording, and is raised in the caller's thread."""
@@ -361,7 +359,7 @@ class _Run:
         for band, number in self._refused_last.items():
             self.file.refused(band, number, self.clock())
         self.ended = self._reason()
-        self.file.close(complete=self.ended in {"duration", "stopped"}, ended=self.ended)
+        self.file.close(complete=self.ended == "duration", ended=self.ended)
 
     def _frame(self, band: str, frame: camera.Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
@@ -391,7 +389,7 @@ class _Run:
             return "source lost"
         if len(self.last_frames) < len(self._room):
             return "no frames"
-        return "stopped" if self.stop.is_set() else "duration"
+        return "duration"
 
 
 def _check_space(path: Path, least: int) -> None:
