@@ -87,28 +87,22 @@ def test_scene_begins_when_it_is_told() -> None:
     assert (world.scene_time(), world.scene_time(1.0)) == (0.0, 0.0)
 
 
-def test_pictures_are_counts() -> None:
-    """A picture of another size or type raises an error."""
-    source, rule = camera(), r"Invalid picture .* in band '8-14'.* Must be \(8, 80\) of uint16"
-    for picture in (np.zeros((3, 4), dtype=np.uint16), np.zeros(SHAPE)):
-        source.pictures = {"8-14": Mock(return_value=picture)}
-        with pytest.raises(ValueError, match=rule):
-            source.read()
-
-
-def test_world_has_places_and_slots() -> None:
-    """Thermocouples read what they are at; unknown names and repeated cameras are named."""
+def test_what_does_not_fit_the_bench_is_named() -> None:
+    """Pictures of another size or type, unknown bands, cameras and places, repeated cameras."""
     source = camera(band="12", scene=lambda time: {"plate": 300.0 + time})
     world = source.world
+    world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
+    assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 296.15]
     with pytest.raises(KeyError, match="Unknown band '12'"):
         source.read()
+    for picture in (np.zeros((3, 4), dtype=np.uint16), np.zeros(SHAPE)):
+        source.pictures = {"12": Mock(return_value=picture)}
+        with pytest.raises(ValueError, match=r"Invalid picture .* Must be \(8, 80\) of uint16"):
+            source.read()
     with pytest.raises(KeyError, match="Unknown camera 'narrow'"):
         EmulatedCamera(world, "narrow", {})
-    world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
-    world.blackbody_temperature = 320.0
-    assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 320.0]
+    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
+        world.add_camera("wide", 2)
     assert np.isnan(world.thermocouple_temperature(3))
     with pytest.raises(KeyError, match="Unknown place 'moon' of thermocouple 4"):
         world.thermocouple_temperature(4)
-    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
-        world.add_camera("wide", 2)

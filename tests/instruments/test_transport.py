@@ -12,7 +12,6 @@ from collections.abc import Iterator
 
 import pytest
 import serial
-from device_benches import BosonBench
 
 from dbthermal import instruments
 from dbthermal.instruments.camera import KINDS
@@ -144,26 +143,3 @@ def test_every_module_is_on_the_map() -> None:
     assert dir(instruments) == sorted(instruments.__all__)
     with pytest.raises(AttributeError, match="Unknown module 'dialogue'"):
         _ = instruments.dialogue
-
-
-def test_a_line_in_memory() -> None:
-    """Bytes come in order and as many as asked for, silence takes no real time, an end is one."""
-    bench, closed = BosonBench(), BosonBench().device
-    line, request = (
-        bench.device,
-        bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 FF FF FF FF 01 0B AE"),
-    )
-    line.write(request[:5])
-    line.write(request[5:])
-    reply = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 00 00 00 00 00 01 6D 94 30 10 AE")
-    assert line.read(10, 1.0) + line.read(4096, 1.0) == reply
-    start = bench.clock.now
-    assert (line.read(2, 3600.0), bench.clock.now - start) == (b"", 3600.0)
-    for _ in range(2):
-        closed.close()
-    bench.state.plugged = False
-    for end in (closed, line):
-        with pytest.raises(TransportError, match="It must stay connected and open"):
-            end.write(b"x")
-        with pytest.raises(TransportError, match="It must stay connected and open"):
-            end.read(1, 30.0)
