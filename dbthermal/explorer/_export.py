@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 
-from dbthermal import figures, store
+from dbthermal import store
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
-from dbthermal.figures._status import first_reason
+from dbthermal.figures._status import legend
 
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
 _MOST_COLUMNS: Final = 3
@@ -50,9 +50,9 @@ def figure(view: View, shown: Shown) -> Figure:
     for axis, name in zip(places, names, strict=False):
         pane = view.pane(name)
         if pane.kind == "status":
-            codes, legend = status_legend(view)
-            colors = [[int(color[at : at + 2], 16) for at in (1, 3, 5)] for _, color, _ in legend]
-            axis.imshow(np.array(colors)[codes].astype(np.uint8), interpolation="nearest")
+            codes, entries = legend(xr.DataArray(view.status))
+            colors = np.array([to_rgb(color) for _, color, _ in entries])
+            axis.imshow(colors[codes], interpolation="nearest")
             axis.set(xticks=[], yticks=[])
             axis.set_title("Status: green is without a flag", fontsize=9)
         else:
@@ -70,15 +70,6 @@ def figure(view: View, shown: Shown) -> Figure:
     note = drawing.provenance_note(view.data)
     result.suptitle(f"{view.time[shown.index]:.2f} s{note}", fontsize=10)
     return result
-
-
-def status_legend(view: View) -> tuple[npt.NDArray[np.uint8], list[tuple[str, str, float]]]:
-    """Place in the legend of each pixel (y, x), and the legend: words, colour, share."""
-    first = first_reason(xr.DataArray(view.status))
-    texts = {"": ("no flag", "#a8d5b0"), **figures.REASONS}
-    names = [name for name in texts if np.any(first == name)]
-    codes = np.select([first == name for name in names], range(len(names))).astype(np.uint8)
-    return codes, [(*texts[name], float(np.mean(first == name))) for name in names]
 
 
 def _outline(region: Region, **style: Any) -> Patch:

@@ -20,6 +20,7 @@ from dbthermal.explorer._films import Values
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import COMPLETED, FILMS, View
 from dbthermal.figures import drawing
+from dbthermal.figures._status import legend
 
 PALETTES: Final = ("inferno", "cividis", "gray", "gnuplot2", "turbo")
 _DPI: Final = 80
@@ -123,7 +124,7 @@ class Explorer(anywidget.AnyWidget):
     def _answer_start(self, _: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes, times, events and legend; palettes and classes of pixels."""
         view = self.view
-        codes, legend = _export.status_legend(view)
+        codes, entries = legend(xr.DataArray(view.status))
         panes = [
             {
                 "name": pane.name,
@@ -142,7 +143,7 @@ class Explorer(anywidget.AnyWidget):
             "shape": view.shape,
             "time": [round(float(entry), 6) for entry in view.time],
             "events": view.events,
-            "legend": legend,
+            "legend": entries,
             "palettes": PALETTES,
             "colors": drawing.COLORS,
             "celsius": self._celsius,

@@ -41,7 +41,7 @@ REASONS: Final = MappingProxyType(
 """Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
 first. What is completed is drawn as that, whatever was the reason not to measure it."""
 
-_GOOD: Final = ("good", "#a8d5b0")
+_GOOD: Final = ("no flag", "#a8d5b0")
 
 
 def status(result: xr.Dataset) -> Figure:
@@ -61,16 +61,12 @@ def status(result: xr.Dataset) -> Figure:
     >>> bits = np.array([[0, 0, 0, int(schema.Status.DEAD_PIXEL)]], dtype=np.uint32)
     >>> figure = figures.status(xr.Dataset({"status": (("y", "x"), bits)}))
     >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
-    ['75.0 %  good', '25.0 %  dead pixel']
+    ['75.0 %  no flag', '25.0 %  dead pixel']
     """
     # Colour of each pixel's first flag.
-    first = first_reason(result["status"])
-    shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
-    shown = {name: share for name, share in shares.items() if share > 0}
-    image = np.zeros((*first.shape, 3))
-    for name in shown:
-        image[first == name] = to_rgb(REASONS.get(name, _GOOD)[1])
-    height = 5.2 * first.shape[0] / first.shape[1]
+    codes, shown = legend(result["status"])
+    image = np.array([to_rgb(color) for _, color, _ in shown])[codes]
+    height = 5.2 * codes.shape[0] / codes.shape[1]
     figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
     map_axis, legend_axis = axes[0]
     map_axis.get_gridspec().set_width_ratios([1.3, 1.0])
@@ -80,17 +76,25 @@ def status(result: xr.Dataset) -> Figure:
     # Legend with shares.
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
-        for name, share in shown.items()
-        for words, color in [REASONS.get(name, _GOOD)]
+        for words, color, share in shown
     ]
     legend_axis.legend(
         handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
     )
-    completed = sum(share for name, share in shares.items() if name.startswith("completed"))
-    good = f"{percent(shares[''])} of the pixels have no flag"
+    shares = {words: share for words, _, share in shown}
+    completed = sum(share for words, share in shares.items() if "completed" in words)
+    good = f"{percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
     good += f", {percent(completed)} are completed" if completed else ""
     figure.suptitle(f"Status: {good}{provenance_note(result)}", fontsize="medium")
     return figure
+
+
+def legend(flags: xr.DataArray) -> tuple[npt.NDArray[np.uint8], list[tuple[str, str, float]]]:
+    """Place in the legend of each pixel of a `status`, and the legend: words, colour, share."""
+    first, texts = first_reason(flags), {"": _GOOD, **REASONS}
+    names = [name for name in texts if np.any(first == name)]
+    codes = np.select([first == name for name in names], range(len(names))).astype(np.uint8)
+    return codes, [(*texts[name], float(np.mean(first == name))) for name in names]
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:

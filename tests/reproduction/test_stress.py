@@ -168,7 +168,7 @@ def test_status_in_words() -> None:
     prior = schema.Status.COMPLETED_FROM_PRIOR | schema.Status.COMPLETED_FROM_SURROUNDINGS
     figure = drawn([[0, schema.Status.GRAY | prior, schema.Status.COMPLETED_FRAMES, 4]])
     names = ("completed_from_prior", "completed_frames", "gray")
-    assert legend(figure) == ["25.0 %  good", *(f"25.0 %  {REASONS[name][0]}" for name in names)]
+    assert legend(figure) == ["25.0 %  no flag", *(f"25.0 %  {REASONS[name][0]}" for name in names)]
     assert "25.0 % of the pixels have no flag, 50.0 % are completed" in figure.get_suptitle()
     rare = np.zeros((100, 100))
     rare[3, 4] = schema.Status.DEAD_PIXEL
