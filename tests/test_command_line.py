@@ -399,14 +399,6 @@ def test_plan_and_data(tmp_path: Path) -> None:
     assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
 
 
-def test_record_names_the_devices(tmp_path: Path) -> None:
-    """A dry run of an emulated session opens its devices, and records nothing."""
-    session = ROOT / "params" / "sessions" / "scene.yaml"
-    _, out, _ = said(tmp_path, "record", str(session), "out", "--simulate", "--dry-run")
-    assert "8-14: device sim://boson/8-14" in out
-    assert not (tmp_path / "out").exists()
-
-
 def test_nothing_is_overwritten(results: Path) -> None:
     """A dry run writes nothing; an output that is there is kept, unless it may be replaced."""
     command = ["correct", "scene.zarr", "nuc.zarr", "-o", "again.zarr"]
