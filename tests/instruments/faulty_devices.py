@@ -1,4 +1,4 @@
-"""Emulated wheel, camera and logger with faults, each set by an attribute of `faults`.
+"""Emulated wheel, camera and logger with faults, and their drivers on a simulated clock.
 
 The tests speak to the emulated devices in bytes that `request`, `reply` and `text` make, and name
 the messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
@@ -11,13 +11,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
+
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson
 from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
-from dbthermal.instruments.filterwheel import BSC10X
+from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings
+from dbthermal.instruments.tc08 import TC08
 
 
 @dataclass
@@ -252,3 +257,82 @@ class FaultyTC08(EmulatedTC08):
         if channel in self.faults.open:
             return float("nan"), False
         return super().convert(channel)
+
+
+FILTERS = {1: "open", 3: "9.5", 5: "LW"}
+QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
+"""A wheel that turns in no time."""
+
+
+class Clock(EmulatedClock):
+    """Emulated time from a start [s], with things to do at some times [s]."""
+
+    def __init__(self, now: float = 100.0) -> None:
+        super().__init__()
+        super().sleep(now)
+        self.events: list[tuple[float, Callable[[], None]]] = []
+
+    @property
+    def now(self) -> float:
+        """The time [s]."""
+        return self()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass [s], and do what is due."""
+        super().sleep(seconds)
+        due = [event for event in self.events if event[0] <= self()]
+        for event in due:
+            self.events.remove(event)
+            event[1]()
+
+
+class BosonBench:
+    """An emulated camera and its driver, on one clock."""
+
+    def __init__(self, serial_number: int = 93588) -> None:
+        self.clock = Clock()
+        self.world = World(clock=self.clock)
+        self.state = self.world.add_camera("boson", serial_number)
+        self.device = FaultyBoson(self.world, "boson")
+        self.camera = Boson(self.device, first_sequence=1)
+
+    def exchange(self, request: bytes) -> bytes:
+        """Send bytes without the driver, and return the answer."""
+        self.device.write(request)
+        return self.device.read(4096, 0.1)
+
+
+class WheelBench:
+    """An emulated wheel and its driver, on one simulated clock."""
+
+    def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
+        self.clock = Clock(0.0)
+        self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
+        self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
+        chosen = Settings(**options)  # type: ignore[arg-type]
+        self.wheel = FilterWheel(self.device, FILTERS, chosen)
+
+    def homed(self) -> FilterWheel:
+        """Connect and home the wheel."""
+        self.wheel.connect()
+        self.wheel.home()
+        return self.wheel
+
+    def move(self, position: int) -> None:
+        """Move the motor without the driver."""
+        self.device.turn_to(position)
+
+
+class LoggerBench:
+    """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
+
+    def __init__(self) -> None:
+        self.clock = Clock(1000.0)
+        self.tips = {1: 350.0, 2: 300.0}
+        self.unit = FaultyTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
+        self.driver = TC08(self.unit)
+
+    def ready(self) -> TC08:
+        """Open the unit with two thermocouples of type T."""
+        self.driver.open().set_channels({1: "plate", 2: "room"})
+        return self.driver

@@ -7,9 +7,8 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from device_benches import BosonBench
 from dialogue import Dialogue, Pair
-from faulty_devices import reply, request, text
+from faulty_devices import BosonBench, reply, request, text
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import pytest
-from device_benches import BosonBench, LoggerBench
+from faulty_devices import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments import boson

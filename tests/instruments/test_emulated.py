@@ -6,8 +6,8 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from device_benches import Clock
 from faulty_camera import frames
+from faulty_devices import Clock
 
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.emulated import World

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
-from device_benches import FILTERS, WheelBench
 from dialogue import Dialogue, Pair
+from faulty_devices import FILTERS, WheelBench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from device_benches import FILTERS
+from faulty_devices import FILTERS
 
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.camera import EmulatedBoson

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from device_benches import LoggerBench
+from faulty_devices import LoggerBench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
