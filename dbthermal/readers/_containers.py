@@ -32,7 +32,11 @@ _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _CHUNKS: Final = 2**16  # of less than 1 kB in an array of HDF5
 _CHECKSUMS: Final = ("fletcher32", "crc32", "crc32c", "adler32")
-_DEFLATE, _MOST_DEFLATED = 1, 1032  # its code, and the most bytes that it makes of one
+# Filters of HDF5: that shuffles, that adds a sum of 4 bytes, and those that pack, by their codes.
+_SHUFFLE, _SUM = 2, 3
+_PACKERS: Final = {1: "zlib", 307: "bz2", 32000: "lzf", 32001: "blosc", 32004: "lz4 of HDF5"}
+_PACKERS.update({32008: "lz4 of HDF5", 32015: "zstd"})  # bitshuffle begins in the same way
+_VLEN: Final = 16  # of a place of text elsewhere in a file of HDF5 [byte]
 _CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _LOSSLESS: Final = "delta|(bit)?shuffle|crc32c?|adler32|fletcher32|transpose(codec)?"
 _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
@@ -153,10 +157,14 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 
 def _filters(array: Any, path: Path) -> list[int]:
-    """Codes of the filters of an array of HDF5; deflate may be the last, before a checksum."""
+    """Codes of the filters of an array of HDF5, of which one packs, behind those that shuffle."""
     h5py, form = recordings.optional("h5py", "recordings"), array.id.get_create_plist()
     filters = [form.get_filter(n) for n in range(form.get_nfilters())]
     codes = [code for code, *_ in filters]
+    packers = [code for code in codes if code not in {_SHUFFLE, _SUM}]
+    if len(packers) > 1 or not {*packers} <= _PACKERS.keys():
+        rule = f"Must be shuffle, then one of {[*_PACKERS]}, as of h5repack -f GZIP=1"
+        raise ValueError(f"Invalid filters {codes} of '{array.name}'. {rule}.")
     if not all(map(h5py.h5z.filter_avail, codes)):
         with suppress(ImportError):
             import_module("hdf5plugin")
@@ -165,9 +173,6 @@ def _filters(array: Any, path: Path) -> list[int]:
             text = f"filter {code}, {label.decode(errors='replace')}, that compresses"
             rule = "Must be installed, many with: python -m pip install hdf5plugin"
             raise ValueError(f"Missing {text} '{array.name}' of '{path.name}'. {rule}.")
-    before = codes[:-1] if codes[-1:] == [h5py.h5z.FILTER_FLETCHER32] else codes
-    if _DEFLATE in before[:-1]:
-        raise ValueError(f"Invalid filters {codes} of '{array.name}'. Must be deflate last.")
     return codes
 
 
@@ -190,21 +195,28 @@ def _check_pieces(array: Any, path: Path) -> None:
         return
     codes = _filters(array, path)
     # Chunks, all there, and none larger than it says.
-    size = math.prod(array.chunks) * array.dtype.itemsize
+    width = _VLEN if array.dtype.kind == "O" else array.dtype.itemsize
+    size = math.prod(array.chunks) * width
     wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
     if wanted > (most := max(_CHUNKS, array.nbytes // 2**10)):  # HDF5 takes 6 kB for each
         raise ValueError(f"Invalid number {wanted} of chunks of '{name}'. Must be at most {most}.")
     chunks = list[tuple[tuple[int, ...], int, int]]()
     array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
-    if len(chunks) != wanted or any(mask for _, mask, _ in chunks):
+    packer = next((n for n, code in enumerate(codes) if code in _PACKERS), len(codes))
+    if len(chunks) != wanted or not {mask for _, mask, _ in chunks} <= {0, 1 << packer}:
         raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
     if size > max(recordings.SMALL, array.nbytes):
         raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
-    for place, _, length in chunks if _DEFLATE in codes else ():
-        if length * _MOST_DEFLATED > recordings.SMALL:
+    # Contents of their size, for HDF5 takes any: one that packing does not shorten is as it is.
+    before, after = (4 * part.count(_SUM) for part in (codes[:packer], codes[packer:]))
+    for place, mask, length in chunks:
+        is_whole = length == size + before + after
+        if packer < len(codes) and not mask:
             _, packed = array.id.read_direct_chunk(place)
-            if len(zlib.decompressobj().decompress(packed, size + 64)) > size + 4:
-                raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
+            unpacks = _UNPACKED[_PACKERS[codes[packer]]]
+            is_whole = unpacks(packed[: length - after], size + before)
+        if not is_whole:
+            raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
 
 
 def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
@@ -304,6 +316,12 @@ def _zstd(packed: bytes, size: int) -> bool:
     return width > 0 and stated + 256 * (width == 2) == size
 
 
+def _lzf(packed: bytes, size: int) -> bool:
+    """Tell whether a piece of LZF unpacks to a size; an error if to more."""
+    decode = recordings.optional("imagecodecs", "recordings").lzf_decode
+    return len(decode(packed, header=False, out=size)) == size
+
+
 def _unpacks(make: Callable[[], Any]) -> Callable[[bytes, int], bool]:
     """Test whether a piece unpacks to a size, which never unpacks farther."""
     return lambda packed, size: len(make().decompress(packed, size + 1)) == size
@@ -315,6 +333,8 @@ _UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
         struct.unpack("<4xI4xI", packed[:16].ljust(16, b"\0")) == (size, len(packed))
     ),
     "lz4": lambda packed, size: int.from_bytes(packed[:4], "little") == size,
+    "lz4 of HDF5": lambda packed, size: int.from_bytes(packed[:8]) == size,
+    "lzf": _lzf,
     "zstd": _zstd,
     "gzip": _unpacks(lambda: zlib.decompressobj(31)),
     "zlib": _unpacks(zlib.decompressobj),

@@ -42,7 +42,7 @@ _ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
-    r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg\w*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
+    r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg[a-z]*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
 )
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
 
