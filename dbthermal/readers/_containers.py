@@ -30,7 +30,7 @@ _BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
 _TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
-_CHUNKS: Final = 2**16  # of less than 1 kB in an array of HDF5
+_LONGEST: Final = 2**10  # of a time [byte]; longer text, as a table in each place, is none
 _CHECKSUMS: Final = ("fletcher32", "crc32", "crc32c", "adler32")
 # Filters of HDF5: that shuffles, that adds a sum of 4 bytes, and those that pack, by their codes.
 _SHUFFLE, _SUM = 2, 3
@@ -56,6 +56,7 @@ def dims_of(values: Any) -> list[Any]:
 def are_times(name: object, values: Any) -> bool:
     """Tell whether an array is a coordinate of times, by its name."""
     is_line = 0 < values.ndim < 3 and values.size == max(values.shape)  # MATLAB has no vectors
+    is_line = is_line and values.dtype.itemsize <= _LONGEST
     return is_line and bool(_TIMES.fullmatch(str(name).rpartition("/")[2]))
 
 
@@ -198,8 +199,7 @@ def _check_pieces(array: Any, path: Path) -> None:
     width = _VLEN if array.dtype.kind == "O" else array.dtype.itemsize
     size = math.prod(array.chunks) * width
     wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
-    if wanted > (most := max(_CHUNKS, array.nbytes // 2**10)):  # HDF5 takes 6 kB for each
-        raise ValueError(f"Invalid number {wanted} of chunks of '{name}'. Must be at most {most}.")
+    recordings.check_pieces(wanted, array.nbytes, f"chunks of '{name}'")
     chunks = list[tuple[tuple[int, ...], int, int]]()
     array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
     packer = next((n for n, code in enumerate(codes) if code in _PACKERS), len(codes))
@@ -240,6 +240,9 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
                 rule = "Must be one that changes no counts: save them without it"
                 raise ValueError(f"Invalid filter '{kind}' of '{name}' of '{path.name}'. {rule}.")
+        recordings.check_pieces(array.nchunks, array.nbytes, f"chunks of '{name}'")
+        if (kind := type(array.serializer).__name__) not in {"BytesCodec", "NoneType"}:
+            raise ValueError(f"Invalid serializer '{kind}' of '{name}'. Must be bytes alone.")
         missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
         if array.ndim == 3 and missing:
             raise ValueError(
@@ -323,8 +326,14 @@ def _lzf(packed: bytes, size: int) -> bool:
 
 
 def _unpacks(make: Callable[[], Any]) -> Callable[[bytes, int], bool]:
-    """Test whether a piece unpacks to a size, which never unpacks farther."""
-    return lambda packed, size: len(make().decompress(packed, size + 1)) == size
+    """Test whether a piece, with no other behind it, unpacks to a size; never farther."""
+
+    def test(packed: bytes, size: int) -> bool:
+        stream = make()
+        length = len(stream.decompress(packed, size + 1))
+        return length == size and bool(stream.eof) and not stream.unused_data
+
+    return test
 
 
 # Test by compressor whether a piece unpacks to a size, beyond which it would take any memory.

@@ -14,6 +14,7 @@ import xarray as xr
 _TYPES: Final = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")  # from 1
 _DIMS, _VARIABLES, _ATTRIBUTES = 10, 11, 12  # tags of lists
 _LONGEST: Final = 2**20  # of a header [byte]
+_MOST_DIMS: Final = 32  # of a variable
 
 
 def arrays(path: Path) -> dict[str, xr.Variable]:
@@ -71,7 +72,10 @@ class _Header:
         """Dims, attributes, place, shape (in the file or a record) and type by the name."""
         listed = dict[str, _Form]()
         for _ in range(self.length(_VARIABLES)):
-            name, dims = self.text(), [self.dims[self.number()] for _ in range(self.number())]
+            name, number = self.text(), self.number()
+            if number > _MOST_DIMS:
+                raise ValueError(f"{number} dims of '{name}'. Must be at most {_MOST_DIMS}.")
+            dims = [self.dims[self.number()] for _ in range(number)]
             attrs, dtype, _ = self.attributes(), self.dtype(), self.number()
             shape = [size for place, (_, size) in enumerate(dims) if size or place]
             start = self.number(4 if self.content[3] == 1 else 8)

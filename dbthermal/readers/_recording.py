@@ -76,6 +76,7 @@ _APART: Final = 1.3  # axes whose roughness differs by this factor are of anothe
 # Most bytes of counts in a byte of a file: the .csq at hand has 11, its counts in a packed TIFF 3.
 _PACKED: Final = 64
 SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
+_PIECES: Final = 2**14  # of less than 1 kB in a file
 # Names of a digital number, and of units of time.
 _COUNTS: Final = re.compile(
     r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
@@ -149,14 +150,16 @@ def files(path: Paths, reader: str) -> list[Path]:
 
 @contextmanager
 def damage_named(label: str, rule: str) -> Iterator[None]:
-    """Make one line of all that a library raises for a damaged file; what a reader says stays."""
+    """Make one line of all that a library raises for a damaged file; what names it stays."""
     try:
         yield
     except DAMAGE as error:
-        if isinstance(error, ValueError) and "Must " in str(error):
-            raise
         message = " ".join(str(error).split())[:200]
-        raise ValueError(f"{label}: {message}. Must be {rule}.") from error
+        refused = isinstance(error, ValueError) and "Must " in str(error)
+        if refused and label.partition("'")[2] in str(error):
+            raise
+        message = str(error) if refused else f"{message}. Must be {rule}."
+        raise ValueError(f"{label}: {message}") from error
 
 
 def check_number(value: Any, name: str, *, whole: bool = False) -> None:
@@ -169,10 +172,10 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
         raise ValueError(f"Invalid {name} {value}. {rule}.")
 
 
-def check_present(counts: Counts, fills: Sequence[Any], name: str, *, masked: bool = False) -> None:
-    """Raise ValueError where counts are masked, or values that stand for missing ones."""
-    if masked or (fills and any(np.isin(counts[at], fills).any() for at in parts(counts))):
-        raise ValueError(f"Missing counts in '{name}': masked, or {fills}. Must all be there.")
+def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
+    """Raise ValueError where counts are values that stand for missing ones."""
+    if fills and any(np.isin(counts[at], fills).any() for at in parts(counts)):
+        raise ValueError(f"Missing counts in '{name}': {fills}. Must all be there.")
 
 
 def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
@@ -190,6 +193,12 @@ def check_memory(shape: Sequence[int], memory: float, name: str, stored: float =
         raise ValueError(f"Invalid size of '{name}': {label}. {rule}.")
 
 
+def check_pieces(number: int, size: int, label: str) -> None:
+    """Raise ValueError for pieces of less than 1 kB, each of which costs time, in large number."""
+    if number > (most := max(_PIECES, size // 2**10)):
+        raise ValueError(f"Invalid number {number} of {label}. Must be at most {most}.")
+
+
 def film(values: Any) -> Counts:
     """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time.
 
@@ -197,7 +206,12 @@ def film(values: Any) -> Counts:
     """
     counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
     for frames in parts(counts):
-        actual, place = np.asarray(values[frames]), counts[frames]
+        part, place = values[frames], counts[frames]
+        part = part.compute() if hasattr(part, "compute") else part  # NumPy alone loses a mask
+        part = part.data if isinstance(part, xr.DataArray) else part
+        if np.ma.is_masked(part):
+            raise ValueError("Missing counts in 'array': masked. Must all be there.")
+        actual = np.asarray(part)
         if (actual.dtype, actual.shape) != (values.dtype, place.shape):
             label = f"{actual.dtype} {actual.shape} of frames from {frames.start} on"
             raise ValueError(f"Invalid {label}. Must be {values.dtype} {place.shape}, as declared.")

@@ -311,6 +311,7 @@ def _pages(path: Path) -> list[_Page]:
     try:
         with tifffile.TiffFile(path) as file:
             for number, page in enumerate(file.pages):
+                recordings.check_pieces(number + 1, size, f"pages of '{path.name}'")
                 pages.append(_page(page, path, file.byteorder, number))
                 total += sum(length for _, length in pages[-1].spans)
                 total += sum(tag.valuebytecount for tag in page.tags)
@@ -381,6 +382,7 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         raise ValueError(f"Invalid {label}. Must be none, or one without loss: {_LOSSLESS}.")
     # Places of its pixels, joined where they follow one another.
     shape = (int(page.imagelength), int(page.imagewidth))
+    recordings.check_pieces(len(page.dataoffsets), 2 * math.prod(shape), f"strips of page {number}")
     spans = list[tuple[int, int]]()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
         odd = length % 2 and not codec

@@ -66,11 +66,17 @@ def _made(seed: int) -> xr.Dataset:
     return scene(np.random.default_rng(seed), shape=(16, 20)).capture
 
 
+def emptied() -> Path:
+    """Folder of what is to be damaged, without the last one."""
+    folder = Path(_workplace().name) / "damaged"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
 def _copy(name: str) -> Path:
     """Copy to be damaged, in place of the last one."""
-    source, target = originals() / name, Path(_workplace().name) / "damaged" / name
-    shutil.rmtree(target.parent, ignore_errors=True)
-    target.parent.mkdir()
+    source, target = originals() / name, emptied() / name
     (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
     return target
 
@@ -152,8 +158,7 @@ def _foreign(path: Path) -> xr.Dataset:
 def shards(rng: Rng) -> Attack:
     """A chunk, in a shard or not, that was never written: it is no black frame."""
     shape, gap = (8, 12, 16), int(rng.integers(8))
-    path = Path(_workplace().name) / "damaged" / "gap.zarr"
-    shutil.rmtree(path.parent, ignore_errors=True)
+    path = emptied() / "gap.zarr"
     fill, layers = pick(rng, [0, 18000]), pick(rng, [None, (2, 12, 16), (4, 12, 16), (8, 12, 16)])
     options: dict[str, Any] = {"shape": shape, "dtype": "u2", "chunks": (1, 12, 16)}
     array = zarr.create_array(path, shards=layers, fill_value=fill, **options)

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, mirrored, stages, steps
+from attack import arrays, containers, files, mirrored, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Verdict, carry_out
 
 _SHARES: Final = {
@@ -18,6 +18,7 @@ _SHARES: Final = {
     stages: "offset 6 align 6 register 3 correct_capture 5 fit_response 8",
     steps: "steps 17",
     files: "bits 8 kills 4 trees 3 shards 2 names 3",
+    containers: "bombs 8 lies 6",
 }
 CLASSES: Final[Mapping[str, tuple[Callable[[np.random.Generator], Attack], int]]] = {
     name: (getattr(module, name), int(share))

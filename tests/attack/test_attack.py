@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 from hostile_files import seed_of_week
 
 from attack import oracle
+from attack.containers import BOMBS, FALSE, TRUE, container
 from attack.oracle import Attack, Verdict, carry_out
 from attack.runner import CLASSES, Worker, attack_all, bad, table
 
@@ -32,6 +34,14 @@ def test_short_attack(worker: Worker, name: str) -> None:
     total = sum(share for _, share in CLASSES.values())
     number = 2 if name == "kills" else max(3, SHORT * CLASSES[name][1] // total)
     assert not bad(name, 1, [worker.run(name, seed) for seed in range(1, number + 1)])
+
+
+@pytest.mark.parametrize("name", [*BOMBS, *FALSE, *TRUE])
+def test_each_container(name: str) -> None:
+    """No container ends badly, at three sizes of each."""
+    for seed in range(3):
+        verdict = carry_out(container(np.random.default_rng(seed), name))
+        assert verdict.kind in oracle.GOOD, verdict
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,365 @@
+"""Files of few MB that unpack to gigabytes, or hold very many pieces, and containers that lie."""
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import dask.array as da
+import flir_files
+import google_crc32c
+import h5py
+import numcodecs
+import numpy as np
+import tifffile
+import xarray as xr
+import zarr
+from scipy.io import netcdf_file
+from zarr.codecs import BytesCodec, GzipCodec, ShardingCodec
+
+from attack.damage import Rng
+from attack.files import emptied
+from attack.oracle import Attack, Verdict, wrong
+from attack.scenes import pick
+from dbthermal import readers
+
+COUNTS: Final = flir_files.scene()
+"""Counts (time, y, x) of every file that is not damaged."""
+_CHUNKED: Final = (1, *COUNTS.shape[1:])
+
+
+def _zeros(megabytes: int, start: bytes = b"\x78\xda") -> bytes:
+    """Deflated zeros, of any size at once, behind the start of a format."""
+    stream = zlib.compressobj(9, wbits=-15)
+    parts = [stream.compress(bytes(2**20)) + stream.flush(zlib.Z_FULL_FLUSH) for _ in range(2)]
+    return start + parts[0] + parts[1] * (megabytes - 1) + stream.flush()
+
+
+def _megabytes(rng: Rng) -> int:
+    return int(2 ** rng.uniform(6, 13))
+
+
+def _hdf5(path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]]) -> None:
+    """HDF5 of one chunk, as it is stored, with filters by their codes."""
+    with h5py.File(path, "w") as file:
+        form = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        form.set_chunk(COUNTS.shape)
+        for code, values in filters.items():
+            form.set_filter(code, 1, values)
+        space = h5py.h5s.create_simple(COUNTS.shape)
+        array = h5py.h5d.create(file.id, b"frames", h5py.h5t.STD_U16LE, space, form)
+        array.write_direct_chunk((0, 0, 0), chunk)
+
+
+def _hdf5_chunk(rng: Rng, path: Path) -> None:
+    """A chunk that unpacks farther than it should, or whose filter states another size."""
+    way = pick(rng, ["deflate", "lzf", "offset"])
+    if way == "deflate":
+        _hdf5(path, _zeros(_megabytes(rng)), pick(rng, [{1: (6,)}, {2: (2,), 1: (6,)}]))
+    elif way == "lzf":
+        # A literal, then repetitions of 264 bytes by 3.
+        packed = b"\x00\x00" + b"\xe0\xff\x00" * int(2 ** rng.uniform(14, 21))
+        _hdf5(path, packed, {32000: (4, 0x0105, int(pick(rng, [4, COUNTS.nbytes])))})
+    else:
+        with h5py.File(path, "w") as file:
+            constant = np.full_like(COUNTS, 18000)
+            file.create_dataset("frames", data=constant, chunks=COUNTS.shape, scaleoffset=0)
+        stated = struct.pack("<III", 2, 0, COUNTS.size)
+        lie = struct.pack("<III", 2, 0, int(2 ** rng.uniform(12, 31)))
+        path.write_bytes(path.read_bytes().replace(stated, lie))
+
+
+def _hdf5_time(rng: Rng, path: Path) -> None:
+    """Times beside the frames: very many, or very long texts."""
+    number, kind = (600, "f8") if rng.random() < 0.5 else (3, f"S{int(2 ** rng.uniform(24, 31))}")
+    with h5py.File(path, "w") as file:
+        file["frames"] = COUNTS
+        length = 10**6 if kind == "f8" else 1
+        options: dict[str, Any] = {"chunks": (length,), "compression": "gzip", "maxshape": (None,)}
+        times = file.create_dataset("time", (number * length,), kind, **options)
+        packed = _zeros(-(-length * times.dtype.itemsize // 2**20))
+        for chunk in range(number):
+            times.id.write_direct_chunk((chunk * length,), packed)
+        times.make_scale("time")
+        file["frames"].dims[0].attach_scale(times)
+
+
+def _hdf5_tree(rng: Rng, path: Path) -> None:
+    deep, number = bool(rng.random() < 0.5), int(2 ** rng.uniform(7, 12.5))
+    with h5py.File(path, "w") as file:
+        file["frames"] = COUNTS
+        for name in ["/".join("g" * number)] if deep else map(str, range(number)):
+            file.create_group(name)
+
+
+def _npz(rng: Rng, path: Path) -> None:
+    """A header, or an array, that is longer than the file."""
+    number = _megabytes(rng) // 4
+    start = b"\x93NUMPY\2\0" + struct.pack("<I", number * 2**20)
+    if rng.random() < 0.5:
+        about = {"descr": "<u2", "fortran_order": False, "shape": (number, 1024, 512)}
+        start = b"\x93NUMPY\1\0" + struct.pack("<H", 118) + repr(about).ljust(117).encode() + b"\n"
+    # The header stored, then zeros, which are never made here.
+    stream = zlib.compressobj(0, wbits=-15)
+    packed = stream.compress(start) + stream.flush(zlib.Z_FULL_FLUSH) + _zeros(number, b"")
+    head = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 33, 0, len(packed), len(start), 5, 0)
+    listed = struct.pack("<HHHHHHIIIHHHHHII", 20, 20, 0, 8, 0, 33, 0, len(packed), 2**32 - 2, 5,
+                         *[0] * 6)  # fmt: skip
+    body = b"PK\3\4" + head + b"a.npy" + packed
+    end = struct.pack("<HHHHIIH", 0, 0, 1, 1, len(listed) + 9, len(body), 0)
+    path.write_bytes(body + b"PK\1\2" + listed + b"a.npy" + b"PK\5\6" + end)
+
+
+_STARTS: Final = {"zlib": b"\x78\xda", "gzip": b"\x1f\x8b\x08" + bytes(6) + b"\x03"}
+
+
+def _zarr_chunk(rng: Rng, path: Path) -> None:
+    """A chunk that unpacks farther than it should, or to more streams than one."""
+    kind, way = pick(rng, [*_STARTS, "bz2", "lzma", "zstd", "lz4", "blosc"]), rng.random()
+    codec = numcodecs.get_codec({"id": kind})
+    options: dict[str, Any] = {"chunks": _CHUNKED, "compressors": codec, "zarr_format": 2}
+    zarr.create_array(path, data=COUNTS, **options)
+    packed = codec.encode(COUNTS[1].tobytes() + bytes(int(2 ** rng.uniform(1, 25))))
+    if way < 0.5:
+        packed = codec.encode(COUNTS[1].tobytes()) + bytes(codec.encode(bytes(2**20))) * 99
+    if kind in _STARTS and way > 0.8:
+        packed = _zeros(_megabytes(rng), _STARTS[kind])
+    (path / "1.0.0").write_bytes(packed)
+
+
+def _zarr_shard(rng: Rng, path: Path) -> None:
+    """Chunks of one pixel in a shard, or shards in shards."""
+    if rng.random() < 0.5:
+        within = ShardingCodec(chunk_shape=_CHUNKED, codecs=[BytesCodec(), GzipCodec()])
+        layers: Any = ShardingCodec(chunk_shape=COUNTS.shape, codecs=[within])
+        zarr.create_array(path, data=COUNTS, serializer=layers, compressors=None)
+        packed = _zeros(_megabytes(rng), _STARTS["gzip"])
+        for number in (len(COUNTS), 1):
+            index = struct.pack(f"<{2 * number}Q", *[0, len(packed)] * number)
+            packed += index + struct.pack("<I", google_crc32c.value(index))
+        (path / "c/0/0/0").write_bytes(packed)
+        return
+    number = int(4 ** rng.uniform(6, 9))
+    options: dict[str, Any] = {"chunks": (1, 1, 1), "shards": (1, 1, number), "compressors": None}
+    zarr.create_array(path, shape=(1, 1, number), dtype="u2", **options)
+    index = np.stack([2 * np.arange(number), np.full(number, 2)], 1).astype("<u8").tobytes()
+    counts = (18000 + np.arange(number) % 999).astype("<u2").tobytes()
+    (path / "c/0/0").mkdir(parents=True)
+    sums = struct.pack("<I", google_crc32c.value(index))
+    (path / "c/0/0/0").write_bytes(counts + index + sums)
+
+
+def _tiff(rng: Rng, path: Path) -> None:
+    """A strip that unpacks farther, a description that is long to search, or very many pages."""
+    way = pick(rng, ["strip", "text", "pages"])
+    if way == "strip":
+        tifffile.imwrite(path, COUNTS, photometric="minisblack", compression="zlib")
+        with tifffile.TiffFile(path) as file:
+            tags = file.pages[0].tags
+            places = [tags[code].valueoffset for code in (273, 279)]
+        content = bytearray(path.read_bytes())
+        packed = _zeros(_megabytes(rng))
+        for at, value in zip(places, (len(content), len(packed)), strict=True):
+            content[at : at + 4] = struct.pack("<I", value)
+        path.write_bytes(bytes(content) + packed)
+    elif way == "text":
+        words = [
+            "unit=",
+            "unit=deg",
+            "DeltaT=",
+            "fps=",
+            '{"shape": [',
+            "<Item role='scale'",
+            "_",
+            " ",
+        ]
+        text = (
+            pick(rng, words) * int(rng.integers(1, 9))
+            + pick(rng, ["_", " ", "9", "[", "<"]) * 10**6
+        )
+        tifffile.imwrite(path, COUNTS, photometric="minisblack", description=text, metadata=None)
+    else:
+        number, size = int(2 ** rng.uniform(12, 16.5)), 2 + 12 * 7 + 4 + 2
+        form = ((256, 1), (257, 1), (258, 16), (259, 1), (262, 1), (273, 0), (279, 2))
+        pages = [b"II*\0", struct.pack("<I", 8)]
+        for page in range(number):
+            at, following = 8 + page * size, 8 + (page + 1) * size * (page + 1 < number)
+            tags = [(code, 4, 1, value or at + size - 2) for code, value in form]
+            entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+            last = struct.pack("<IH", following if page + 1 < number else 0, 18000 + page % 999)
+            pages += [struct.pack("<H", 7) + entries + last]
+        path.write_bytes(b"".join(pages))
+
+
+def _png(rng: Rng, path: Path) -> None:
+    """Texts and profiles in a picture, in a file of FLIR or alone."""
+    image = flir_files.compressed(COUNTS[0], "png")
+    kind = pick(rng, [b"zTXta\0\0", b"iCCPa\0\0", b"iTXta\0\1\0\0\0"])
+    chunk = kind + _zeros(_megabytes(rng))
+    chunk = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    image = image[:33] + chunk + image[33:]
+    body = flir_files.geometry(COUNTS[0], 1, "<") + image
+    fff = flir_files.frame([(1, 2, body)], "<", sums=False)
+    path.write_bytes(image if rng.random() < 0.5 else fff)
+
+
+def _netcdf(rng: Rng, path: Path) -> None:
+    """A variable of very many dims, of one number each."""
+    dims = int(2 ** rng.uniform(6, 17.5))
+    words = [struct.pack(">5I", 0, 10, 1, 1, 0x74000000), struct.pack(">I", 1) + bytes(8)]
+    words += [struct.pack(f">{dims + 5}I", 11, 1, 1, 0x61000000, dims, *[0] * dims) + bytes(8)]
+    start = 4 + sum(map(len, words)) + 12
+    path.write_bytes(b"CDF\1" + b"".join(words) + struct.pack(">4I", 8, 2, start, 0))
+
+
+BOMBS: Final[dict[str, Callable[[Rng, Path], None]]] = {
+    "chunk.h5": _hdf5_chunk,
+    "time.h5": _hdf5_time,
+    "tree.h5": _hdf5_tree,
+    "header.npz": _npz,
+    "chunk.zarr": _zarr_chunk,
+    "shard.zarr": _zarr_shard,
+    "stack.tif": _tiff,
+    "picture.png": _png,
+    "dims.nc": _netcdf,
+}
+"""File -> what makes one of at most 10 MB that takes much memory or time if nothing is checked."""
+
+
+def _read(source: Any) -> xr.Dataset:
+    """Counts of a file or array at 10 Hz, by the reader of its form."""
+    form = source.suffix if isinstance(source, Path) else ""
+    if form == ".png" and source.read_bytes()[:3] == b"FFF":
+        return readers.flir(source, clock=10.0)
+    reader = readers.tiff if form in {".tif", ".png"} else readers.array
+    return reader(source, unit="count", clock=10.0)
+
+
+def _blocks(change: Callable[[Any], Any]) -> Callable[[Rng, Path], Any]:
+    """Array of dask that says to be of uint16, and of which a block is another one."""
+    blocks = da.from_array(COUNTS, chunks=_CHUNKED)
+    return lambda *_: blocks.map_blocks(change, dtype="u2", meta=np.empty((0, 0, 0), "u2"))
+
+
+def _records(rng: Rng, path: Path) -> Path:
+    """NetCDF 3 whose number of records is another one."""
+    with netcdf_file(path := path.with_suffix(".nc"), "w") as file:
+        for name, size in zip(("time", *"yx"), (None, *COUNTS.shape[1:]), strict=True):
+            file.createDimension(name, size)
+        frames = file.createVariable("frames", "i2", ("time", "y", "x"))
+        frames[:], frames._Unsigned = COUNTS.astype("i2"), "true"
+    number = pick(rng, [0, 1, 2, 4, 2**31])
+    path.write_bytes(path.read_bytes()[:4] + struct.pack(">I", number) + path.read_bytes()[8:])
+    return path
+
+
+def _short(rng: Rng, path: Path) -> Path:
+    """HDF5 whose chunk has fewer numbers than it should."""
+    part = COUNTS.tobytes()[: int(rng.integers(2, COUNTS.nbytes))]
+    packed = pick(rng, [(part, {}), (part, {2: (2,)}), (zlib.compress(part), {1: (6,)})])
+    _hdf5(path := path.with_suffix(".h5"), *packed)
+    return path
+
+
+def _noisy(_: Rng, path: Path) -> Path:
+    """HDF5 of which a chunk cannot be packed, and is stored as it is."""
+    with h5py.File(path := path.with_suffix(".h5"), "w") as file:
+        file.create_dataset("frames", data=COUNTS, chunks=_CHUNKED, compression="lzf")
+    return path
+
+
+def _said(**attrs: Any) -> Callable[[Rng, Path], Any]:
+    """HDF5 with attributes of its counts."""
+
+    def make(_: Rng, path: Path) -> Path:
+        with h5py.File(path := path.with_suffix(".h5"), "w") as file:
+            file.create_dataset("frames", data=COUNTS).attrs.update(attrs)
+        return path
+
+    return make
+
+
+def _timed(*times: Any) -> Callable[[Rng, Path], Any]:
+    """HDF5 with times of its frames, in numbers or text."""
+
+    def make(_: Rng, path: Path) -> Path:
+        with h5py.File(path := path.with_suffix(".h5"), "w") as file:
+            file["frames"], file["time"] = COUNTS, [*times]
+        return path
+
+    return make
+
+
+_NOON: Final = "2026-10-25T0{}:59:59.{}{}"  # about the end of summer time
+FALSE: Final[dict[str, Callable[[Rng, Path], Any]]] = {
+    "blocks of floats": _blocks(lambda block: block + 0.4),
+    "negative blocks": _blocks(lambda block: block.astype(int) - 40000),
+    "blocks of long numbers": _blocks(lambda block: block.astype("i8") + 2**16),
+    "blocks in another order of bytes": _blocks(lambda block: block.astype(">u2")),
+    "blocks of another size": _blocks(lambda block: block[:, 1:]),
+    "masked blocks": _blocks(lambda block: np.ma.masked_greater(block, 18100)),
+    "a masked array": lambda *_: np.ma.masked_greater(COUNTS, 18100),
+    "objects": lambda *_: COUNTS.astype(object),
+    "of a structure": lambda *_: COUNTS.view([("a", "u1"), ("b", "u1")]),
+    "records of NetCDF": _records,
+    "a short chunk": _short,
+    "a fill value that is there": _said(_FillValue=COUNTS[1, 2, 3]),
+    "a scale of NaN": _said(scale_factor=np.nan),
+    "an offset": _said(add_offset=-273.15),
+    "in kelvin": _said(units="K"),
+    "units of two kinds": _said(units="count", unit="degC", scale_factor=0.01),
+    "times that go back": _timed(0.0, 0.2, 0.1),
+    "times of another rate": _timed(0.0, 0.5, 1.0),
+    "times that are NaN": _timed(0.0, np.nan, 0.2),
+    "times in two zones": _timed(
+        *(_NOON.format(2, n, z) for n, z in ((0, "+02:00"), (1, "+01:00"), (2, "+01:00")))
+    ),
+}
+"""Containers that say what is not so: they are refused."""
+TRUE: Final[dict[str, Callable[[Rng, Path], Any]]] = {
+    "plain": lambda *_: COUNTS,
+    "turned in memory": lambda *_: COUNTS[::-1, ::-1, ::-1].copy()[::-1, ::-1, ::-1],
+    "by columns": lambda *_: np.asfortranarray(COUNTS),
+    "big-endian": lambda *_: COUNTS.astype(">u2"),
+    "read only": lambda *_: np.frombuffer(COUNTS.tobytes(), "u2").reshape(COUNTS.shape),
+    "masked nowhere": lambda *_: np.ma.masked_equal(COUNTS, 1),
+    "blocks as declared": _blocks(lambda block: block),
+    "a chunk not packed": _noisy,
+    "a negative fill value": _said(_FillValue=-1, missing_value=np.nan, units=" Counts "),
+    "attributes of no meaning": _said(comment=np.nan, empty="", NAME=b"\xff", valid_min=-1),
+    "times in two zones of one moment": _timed(
+        *(_NOON.format(h, n, z) for h, n, z in ((2, 0, "+02:00"), (1, 1, "+01:00"), (0, 2, "Z")))
+    ),
+}
+"""Containers that are right, and unusual: they are read."""
+
+
+def container(rng: Rng, name: str) -> Attack:
+    """A container of a name: its counts are as stored, or it is refused by name."""
+    path = emptied() / name
+    if name in BOMBS:
+        BOMBS[name](rng, path)
+        source: Any = path
+    else:
+        path = path.with_name("lie")
+        source = {**TRUE, **FALSE}[name](rng, path)
+
+    def judge(opened: xr.Dataset) -> Verdict:
+        alike = opened["counts"].shape == COUNTS.shape
+        is_stored = name not in FALSE and alike and np.array_equal(opened["counts"], COUNTS)
+        # Of a bomb, as of very many pages, counts of another size may be right.
+        return wrong("other counts", where=not is_stored and (alike or name not in BOMBS))
+
+    names = f"array|frames|{path.name}"
+    return Attack(name, lambda: _read(source), judge, (names,), name in TRUE)
+
+
+def bombs(rng: Rng) -> Attack:
+    """A file of at most 10 MB that takes much memory or time where sizes are not checked."""
+    return container(rng, pick(rng, [*BOMBS]))
+
+
+def lies(rng: Rng) -> Attack:
+    """A container that is not as it says, or an unusual one that is."""
+    return container(rng, pick(rng, [*FALSE, *TRUE]))
