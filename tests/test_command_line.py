@@ -513,7 +513,7 @@ plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
-import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock: 'a.tif' does not tell
+import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock for 'a.tif', which tells no times
 import a.tif b.tif --bands 8-14 9.5 10.6 --clock 10 -o x.zarr -> --bands of 3 names.* Must be two
 import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 rates
 {ONE} --offset 0 --frames 0 -o x.zarr -> Invalid --frames .* first and end

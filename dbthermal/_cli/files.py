@@ -71,7 +71,7 @@ def kind_of(path: Path, options: argparse.Namespace) -> str:
     if not reader and raw:  # of any suffix but those of TIFF and arrays
         kinds = [*(kind for kind in kinds if kind != "FLIR"), "raw files"]
     if not kinds:
-        path.stat()  # a file that is missing has no format
+        recordings.refuse_text(path)  # a file that is missing has no format
         label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
         rule = "Must be a recording; bare numbers need --shape and --byte-order"
         raise ValueError(f"{label}. {rule}.")
@@ -82,11 +82,28 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     """Recording of one camera, by the kind of its files, with its origin; large ones on disk."""
     kind = kind_of(paths[0], options)
     reader, _ = READERS[kind]
-    # Arguments of the reader, by the options of the same names.
-    parameters, stated = signature(reader).parameters, accepted(reader, options)
+    if kind != "raw files":
+        recordings.refuse_text(paths[0])  # of a suffix that promises more
+    stated = _arguments(reader, options, paths[0].name, camera)
     selected = {"time": frames_of(options), "y": _rows_of(options)} if "rows" in options else {}
-    if stated.pop("frames", None) and selected and "frames" in parameters:
+    if stated.pop("frames", None) and selected and "frames" in signature(reader).parameters:
         stated["frames"] = selected.pop("time")
+    # Files of the kinds that make one recording together.
+    several = kind in {"FLIR", "TIFF"}
+    if len(paths) > 1 and not several:
+        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
+    with on_disk(_room(options)):  # films that are large
+        movie = reader(paths if several else paths[0], **stated).isel(selected)
+    if not all(movie.sizes.values()):
+        raise ValueError(f"No frame or row of '{paths[0].name}' selected. Must be at least one.")
+    return movie.assign_attrs(origin="simulated") if options.simulated else movie
+
+
+def _arguments(
+    reader: Callable[..., xr.Dataset], options: argparse.Namespace, file: str, camera: int
+) -> dict[str, Any]:
+    """Arguments of a reader, by the options of the same names; ValueError if one is missing."""
+    parameters, stated = signature(reader).parameters, accepted(reader, options)
     if "unit" in parameters:
         stated.setdefault("unit", "count")
     if options.clock:
@@ -98,17 +115,9 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     for name, parameter in parameters.items():
         required = parameter.kind is Parameter.KEYWORD_ONLY and parameter.default is Parameter.empty
         if required and name not in stated:
-            label = f"Missing --{name.replace('_', '-')}: '{paths[0].name}' does not tell"
+            label = f"Missing --{name.replace('_', '-')}: '{file}' does not tell"
             raise ValueError(f"{label}. Must be stated.")
-    # Files of the kinds that make one recording together.
-    several = kind in {"FLIR", "TIFF"}
-    if len(paths) > 1 and not several:
-        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
-    with on_disk(_room(options)):  # films that are large
-        movie = reader(paths if several else paths[0], **stated).isel(selected)
-    if not all(movie.sizes.values()):
-        raise ValueError(f"No frame or row of '{paths[0].name}' selected. Must be at least one.")
-    return movie.assign_attrs(origin="simulated") if options.simulated else movie
+    return stated
 
 
 def frames_of(options: argparse.Namespace, most: int | None = None) -> slice:
@@ -147,7 +156,7 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
         raise ValueError(f"{label}. Must be one, or one for each camera.")
     if len(options.bands) != 2:
         label = f"Invalid --bands of {len(options.bands)} names: {', '.join(options.bands)}"
-        raise ValueError(f"{label}. Must be two, of two cameras.")
+        raise ValueError(f"{label}. Must be two, of two cameras, with a space between.")
     cameras = enumerate((paths[:place], paths[place + 1 :]))
     first, second = (recording(files, options, camera) for camera, files in cameras)
     with on_disk(_room(options)):
@@ -219,25 +228,32 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 def info(options: argparse.Namespace) -> dict[str, Any]:
     """Command `info`."""
     paths: list[Path] = options.files
-    is_store = len(paths) == 1 and (paths[0] / "zarr.json").is_file() and options.unit is None
-    if is_store:
+    if len(paths) == 1 and _is_store(paths[0]) and options.unit is None:
         return {str(paths[0]): summary(opened(paths[0]), everything=True)}
     # A recording; without a clock its sizes can be said all the same.
-    unknown = options.clock is None and kind_of(paths[0], options) != "FLIR"
-    options.clock = [1.0] if unknown else options.clock
+    unknown = False
     try:
         dataset = recording(paths, options)
     except ValueError as error:
-        stamp = re.search(r"frame (\d+) at (\S+) s, by clock=", str(error)) if unknown else None
-        if stamp is None:
+        unknown = options.clock is None and bool(re.match("Missing (--)?clock", str(error)))
+        if not unknown:
             raise
-        options.clock, unknown = [int(stamp[1]) / float(stamp[2])], False  # as in the file
+        options.clock = [1.0]
         dataset = recording(paths, options)
     lines = summary(dataset, everything=True)
     if unknown:
         lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
         lines["clock"] = "not in the file: state the frame rate by --clock"
     return {str(paths[0]): lines}
+
+
+def _is_store(path: Path) -> bool:
+    """Tell whether a folder is a store of dbthermal or a part of one, not one of other programs."""
+    folders = [folder for folder in (path, path.parent) if (folder / "zarr.json").is_file()]
+    if not folders or folders[0] != path:
+        return False
+    text = (folders[-1] / "zarr.json").read_text(encoding="utf-8", errors="replace")
+    return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 
 
 def outline(dataset: xr.Dataset) -> dict[str, Any]:

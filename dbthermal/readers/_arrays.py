@@ -15,7 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal._arrays import empty, parts
+from dbthermal._arrays import Array, empty, parts
 from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock
@@ -35,7 +35,7 @@ def array(
     name: str | None = None,
     *,
     unit: str,
-    clock: Clock,
+    clock: Clock | None = None,
     memory: float = MEMORY,
 ) -> xr.Dataset:
     """Counts of a NumPy, HDF5, NetCDF or zarr file, or of an array that is opened already.
@@ -53,7 +53,8 @@ def array(
     name : str, optional
         Name of the array in a file of several, such as ``"entry/frames"``.
     unit, clock, memory
-        As for `tiff`; an array's own ``units``, and its times to half a frame, must agree.
+        As for `tiff`; an array's own ``units``, and its times to half a frame, must agree. Without
+        a clock its times are taken; those without a unit are seconds if the rate is 1 to 1000 Hz.
 
     Returns
     -------
@@ -88,15 +89,15 @@ def array(
         (path,) = recordings.files([source], "array")
         inside = path.rglob("*") if path.is_dir() else [path]
         stored = sum(file.lstat().st_size for file in inside)
-    rules = _Rules(label, unit, clock, memory, stored, {})
+    rules = _Rules(label, unit, clock, memory, stored, {}, [])
     # The array, checked before it is read.
     with ExitStack() as stack:
         values: Any = source
         if not isinstance(source, str | Path):
             rules.check(source, containers.dims_of(source))
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            for times in [axis for axis in coords if containers.are_times(axis.name, axis)][:1]:
-                rules.compare(times)
+            listed = (axis for axis in coords if containers.are_times(axis.name, axis))
+            rules.compare(next(listed, None))
         elif (kind := recordings.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
             values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
@@ -111,7 +112,8 @@ def array(
     attributes = rules.attributes
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
-    recordings.check_present(counts, fills, label)
+    recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
+    clock = rules.seconds[0] if clock is None else clock
     return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
@@ -120,10 +122,11 @@ class _Rules(NamedTuple):
 
     label: str
     unit: str
-    clock: Clock
+    clock: Clock | None
     memory: float
     stored: float  # size of its file [byte]
     attributes: dict[str, Any]  # of the array, as it is checked
+    seconds: list[Array]  # times of its frames, as they are compared
 
     def check(self, values: Any, dims: Sequence[Any] = ()) -> None:
         """Raise ValueError for what is no stack of counts, before it is read."""
@@ -141,7 +144,7 @@ class _Rules(NamedTuple):
         dtype = np.dtype(getattr(values, "dtype", object))
         unsigned = str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}
         if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):
-            rule = "Must be uint16: counts, neither temperatures nor objects"
+            rule = "Must be uint16: counts, neither temperatures nor objects; convert whole numbers"
             raise ValueError(f"Invalid dtype {dtype} of '{self.label}'. {rule}.")
         shape = getattr(values, "shape", ())
         recordings.check_memory(shape, self.memory, self.label, self.stored)
@@ -149,10 +152,15 @@ class _Rules(NamedTuple):
         recordings.check_unit(self.unit if text in {"", "1"} else text, self.label)
 
     def compare(self, times: Any) -> None:
-        """Raise ValueError for times that the clock contradicts."""
-        if (moments := containers.moments(times)) is not None:
+        """Take times, if any; ValueError without them and a clock, or where those contradict."""
+        moments = None if times is None else containers.moments(times)
+        clock = next(iter(self.seconds), None) if self.clock is None else self.clock
+        if moments is not None:
             text = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
-            recordings.check_times(moments, str(text or ""), self.clock, self.label)
+            seconds = recordings.check_times(moments, str(text or ""), clock, self.label)
+            self.seconds.append(seconds)
+        elif clock is None:
+            recordings.stamps(clock, 0, self.label)  # refuses it
 
 
 def _numpy_file(path: Path, name: str | None, rules: _Rules, stack: ExitStack) -> Any:
@@ -163,7 +171,11 @@ def _numpy_file(path: Path, name: str | None, rules: _Rules, stack: ExitStack) -
             stream.seek(0)
             return _numpy_array(stream, path.name, rules)
         archive = stack.enter_context(zipfile.ZipFile(path))
-        names = [member.removesuffix(".npy") for member in archive.namelist()]
+        members = archive.namelist()
+        if not all(member.endswith(".npy") for member in members):
+            rule = "Must hold arrays of NumPy alone: unpack it"
+            raise ValueError(f"Invalid files {members[:3]} in '{path.name}'. {rule}.")
+        names = [member.removesuffix(".npy") for member in members]
         member = archive.infolist()[names.index(recordings.array_name(names, name, path))]
         if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             label = f"compression {member.compress_type} of '{member.filename}' of '{path.name}'"
@@ -185,6 +197,7 @@ def _numpy_array(stream: IO[bytes], name: str, rules: _Rules) -> npt.NDArray[Any
         with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
             shape, by_columns, dtype = read(BytesIO(start + stream.read(length)))
     rules.check(SimpleNamespace(shape=shape, dtype=dtype))
+    rules.compare(None)
     counts, size = empty(shape[::-1] if by_columns else shape, np.uint16), 0
     for frames in parts(counts):
         size += stream.readinto(counts[frames].view("u1").data)  # type: ignore[attr-defined]

@@ -120,12 +120,15 @@ def read(
         # Shapes first, then what is stored, then times and numbers.
         values = arrays[name]
         check(values, dims_of(values))
-        for times in _times_of(arrays, name, frames := values.shape[0]):
+        listed = _times_of(arrays, name, frames := values.shape[0])
+        for times in listed:
             if times.size != frames:
                 rule = f"Must be {frames}, one for each frame"
                 raise ValueError(f"Invalid number {times.size} of times of '{name}'. {rule}.")
             _check_whole(times, path)
             compare(times)
+        if not listed:
+            compare(None)
         _check_whole(values, path)
         with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
             by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)

@@ -35,7 +35,9 @@ _MAGIC: Final = (
     *((8, b"AVI ", "film"), (4, b"ftyp", "film"), (8, b"WEBP", "picture"), (0, b"BM", "picture")),
     *((0, b"\xff\xd8\xff", "JPEG"), (0, b"\x89PNG\r\n\x1a\n", "PNG")),
     *((0, b"\x93NUMPY", "NumPy"), (0, b"PK\3\4", "zip"), (0, b"MATLAB 5.0", "MATLAB 5")),
-    *((0, b"\x0e\x03\x13\x01", "HDF4"), (0, b"SIMPLE  =", "FITS")),
+    *((0, b"\x0e\x03\x13\x01", "HDF4"), (0, b"SIMPLE  =", "FITS"), (4, b"jP  ", "JPEG 2000")),
+    *((0, b"\x1f\x8b\x08", "gzip"), (0, b"P5\n", "PGM"), (0, b"P5 ", "PGM")),
+    *((0, b"\x80\4\x95", "pickle"), (0, b"\x80\5\x95", "pickle")),
 )
 PNG: Final = b"\x89PNG\r\n\x1a\n"
 _HDF5: Final = b"\x89HDF\r\n\x1a\n"  # at 0, 512, 1024, ...: what precedes is the user's
@@ -55,12 +57,17 @@ _FOREIGN: Final = {
     **dict.fromkeys(("film", "picture"), _DRAWN),
     "MATLAB 5": "save it anew by save(..., '-v7.3') and use readers.array",
     "HDF4": "convert it by h4toh5 and use readers.array",
-    "FITS": "save its array with NumPy and use readers.array",
+    **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
+    "gzip": "unpack it by gunzip",
+    **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
+    "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",
 }
 """What to do with a format that no reader opens, by suffix or first bytes."""
 MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default [byte]
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _FASTEST: Final = 1e6  # frame rate of a camera [Hz]
+_TEXT: Final = 512  # bytes at the beginning of a file, without a control character
+_STEPS: Final = (1e-3, 1.0)  # between frames whose times have no unit and are seconds [s]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
 # What the libraries of the formats raise for files that are damaged.
 DAMAGE: Final = (
@@ -116,6 +123,16 @@ def format_of(path: Path) -> str:
     return next((name for at, mark, name in _MAGIC if start[at:].startswith(mark)), "")
 
 
+def refuse_text(path: Path) -> None:
+    """Raise ValueError for a file that begins as a text; bare numbers hardly ever do."""
+    if format_of(path):
+        return
+    with path.open("rb") as stream:
+        start = stream.read(_TEXT)
+    if start and not re.search(rb"[^\t\r\n -~\x80-\xff]", start):
+        raise ValueError(f"Refused '{path.name}', a text: {_FOREIGN['text']}.")
+
+
 def reader_of(path: Path) -> str:
     """Reader of a file by its first bytes, empty if unknown; ValueError for a foreign format."""
     form, suffix = format_of(path) if path.exists() else "", path.suffix.lower()
@@ -135,7 +152,9 @@ def files(path: Paths, reader: str) -> list[Path]:
     numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
     for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):
         if len(before) == len(after) and after <= before:
-            rule = "Must rise: 'frame10' comes after 'frame9', which the order of text does not"
+            rule = (
+                "Must rise, not in the order of text, frame1, frame10, frame2: $(ls -v frame*.png)"
+            )
             raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
     for file in paths:
         actual = "" if reader == "raw" else reader_of(file)
@@ -146,6 +165,22 @@ def files(path: Paths, reader: str) -> list[Path]:
         if not is_store and texts.regular_file(file, _LARGEST).stat().st_size == 0:
             raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
     return paths
+
+
+def numbered(paths: Sequence[Path]) -> Array | None:
+    """Places in time of files with a frame each [frame], by their names; None without a gap."""
+    numbers = [[int(digits) for digits in re.findall("[0-9]+", path.stem)] for path in paths]
+    if len({*map(len, numbers)}) > 1 or len(paths) < 3:
+        return None
+    table = np.array(numbers, dtype=np.float64)
+    (counting,) = np.nonzero(np.ptp(table, axis=0))
+    if counting.size != 1:  # dates, or parts of a recording
+        return None
+    # Whole multiples of the usual step are frames that are missing.
+    steps = np.diff(table[:, counting[0]])
+    places = steps / np.median(steps)
+    gaps = places.max() > _GAP and bool(np.all(places == np.rint(places)))
+    return np.cumsum(np.append(0.0, places)) if gaps else None
 
 
 @contextmanager
@@ -256,27 +291,32 @@ def check_unit(unit: str, name: str) -> None:
         )
 
 
-def check_times(values: npt.NDArray[Any], unit: str, clock: Clock, name: str) -> None:
-    """Raise ValueError for a file's own times that do not rise, or that the clock contradicts."""
+def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: str) -> Array:
+    """Seconds since the first frame, by a file; ValueError if the clock, where stated, differs."""
     # Seconds since the first frame; of numbers without a unit in any that is in use.
     word = unit.partition(" since ")[0].strip()
     scales = [scale for text, scale in _SECONDS.items() if re.fullmatch(text, word, re.IGNORECASE)]
     if values.dtype.kind in "mM":
         values, scales = (values - values[0]) / np.timedelta64(1, "s"), [1.0]
     elif not word:
-        scales = [1.0, 1e-3, 1e-6, 1e-9]
+        scales = [1.0] if clock is None else [1.0, 1e-3, 1e-6, 1e-9]
+        step = abs(float(values[-1]) - float(values[0])) / max(len(values) - 1, 1)
+        if clock is None and not _STEPS[0] < step <= _STEPS[1]:
+            label = f"Missing unit of the times of '{name}', which rise by {step:g} a frame"
+            raise ValueError(f"{label}. Must be s, ms, us, ns; or state the frame rate by clock=.")
     if not scales:
         raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
-    stated = stamps(clock, len(values), name)
     apart = values.astype(np.float64) - float(values[0])
+    stated = scales[0] * apart if clock is None else stamps(clock, len(values), name)
     seconds = min((apart * scale for scale in scales), key=lambda s: np.abs(s - stated).max())
     agrees = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
     agrees &= np.diff(seconds, prepend=-1.0) > 0
     if not agrees.all():
         first = int(np.argmin(agrees))
         mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
-        rule = "Must agree to half a frame, and rise: give clock= the times, or leave those out"
+        rule = "Must agree to half a frame, and rise; without clock= those of the file are taken"
         raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
+    return np.asarray(seconds)
 
 
 def byte_order(name: str, value: str) -> str:
@@ -286,8 +326,11 @@ def byte_order(name: str, value: str) -> str:
     return "<" if value == "little" else ">"
 
 
-def stamps(clock: Clock, frames: int, name: str) -> Array:
+def stamps(clock: Clock | None, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
+    if clock is None:
+        rule = "Must be the frame rate [Hz], or the time of each frame [s]"
+        raise ValueError(f"Missing clock= for '{name}', which tells no times. {rule}.")
     stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
     values = stated.values.astype(np.float64)
     rule = f"Must be a rate in (0, {_FASTEST:g}] Hz, or one finite time each in s"
@@ -365,7 +408,7 @@ def _of_8_bits(counts: Counts) -> bool:
 
 
 def clocked(counts: Counts, clock: Clock, name: str, *sentences: str, **attrs: str) -> xr.Dataset:
-    """Dataset of one band of a file that tells no times, from a rate [Hz] or times [s]."""
+    """Dataset of one band of a file, from a rate [Hz] or times [s]."""
     seconds = stamps(clock, len(counts), name)
     made = recording(counts, seconds, name, {"source": name, **attrs})
     return warned(made, *sentences, *_time_elsewhere(counts, name))

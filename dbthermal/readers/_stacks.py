@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal._arrays import empty, release
+from dbthermal._arrays import Array, empty, release
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock, Counts, Paths
 
@@ -60,11 +60,13 @@ _TIME_UNIT: Final = re.compile(_STATED.format("tunit|TimeIncrementUnit|DeltaTUni
 _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slices are ImageJ's own
 
 
-def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
+def tiff(
+    path: Paths, *, unit: str, clock: Clock | None = None, memory: float = MEMORY
+) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
-    These tell neither the unit nor, for sure, the time of frames, so both must be stated. An
-    interval of frames in a description of ImageJ or OME must agree with the clock.
+    These do not tell the unit, and rarely the time of frames. An interval of frames, or times, in a
+    description of ImageJ or OME must agree with the clock, and are taken without it.
 
     Parameters
     ----------
@@ -74,8 +76,9 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     unit : {"count"}
         Unit of the pixels. Temperatures, also as whole numbers (temperature-linear data), are
         refused: the camera made them with an emissivity, and mixtures add up in counts only.
-    clock : float or array_like
-        Frame rate [Hz] or time of each frame [s].
+    clock : float or array_like, optional
+        Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers
+        leave some out have gaps in time there.
     memory : float
         Largest memory that the counts may take [byte]; refused before it is taken.
 
@@ -102,8 +105,8 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     Warns
     -----
     UserWarning
-        If a description has another frame rate, which may be that of playing it, or if another
-        axis than the first may be time.
+        If a description has another frame rate, which may be that of playing it, numbers of files
+        are left out, or another axis than the first may be time.
 
     Examples
     --------
@@ -128,7 +131,13 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     shape = (sum(page.images for page in pages), *pages[0].shape)
     stored = sum(length for page in pages for _, length in page.spans)
     recordings.check_memory(shape, memory, name, stored)
-    sentences = _check_clock(pages[0].description, shape[0], clock, name)
+    seconds, sentences = _times(pages[0].description, shape[0], clock, name)
+    places = recordings.numbered(paths) if np.ndim(clock) == 0 and shape[0] == len(paths) else None
+    if places is not None:
+        missing = int(places[-1]) + 1 - len(paths)
+        rule = "Must be all that were recorded: there are gaps in time in their place"
+        sentences.append(f"The numbers of '{name}' leave out {missing} frames. {rule}.")
+        seconds = places * seconds[1]
     # Their pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
     flat = counts.reshape(-1)
@@ -141,7 +150,7 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
     form = "PNG" if pages[0].codec == "png" else "TIFF"
-    return recordings.clocked(counts, clock, name, *sentences, format=form, **decided)
+    return recordings.clocked(counts, seconds, name, *sentences, format=form, **decided)
 
 
 def raw(
@@ -238,20 +247,22 @@ def _are_longer(counts: Counts) -> bool:
     return max(near, *fourths) > _LONGER * (min(fourths) + 1)
 
 
-def _check_clock(text: str, frames: int, clock: Clock, name: str) -> list[str]:
-    """Refuse a clock that times in a description contradict; sentence on a frame rate that does."""
+def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Array, list[str]]:
+    """Seconds by the clock, or else a description, which must agree; sentence on another rate."""
     unit = (_TIME_UNIT.findall(text) or ["s"])[0]
     interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
     times = np.array(_TIMES.findall(text), dtype=np.float64)
     times = times if times.size == frames else np.multiply(interval, np.arange(frames))
     if times.any():
-        recordings.check_times(times, unit, clock, name)
-    elif (
-        rate and abs((frames - 1) / rate - recordings.stamps(clock, frames, name)[-1]) > 0.5 / rate
-    ):
+        seconds = recordings.check_times(times, unit, clock, name)
+        return (seconds if clock is None else recordings.stamps(clock, frames, name)), []
+    seconds = recordings.stamps(clock, frames, name)
+    if rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate:
         rule = "Must be the rate of recording; that in the file may be of playing it"
-        return [f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."]
-    return []
+        return seconds, [
+            f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
+        ]
+    return seconds, []
 
 
 class _Page(NamedTuple):

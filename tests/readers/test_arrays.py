@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import struct
 import zipfile
 import zlib
@@ -74,7 +75,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
             for m in ("1e9", np.nan, True)
         ),
         (scene(), {"unit": ["count"]}, "unit.*Must be 'count'"),
-        (scene(), {"clock": None}, "clock.*Must be a real number"),
+        (scene(), {"clock": None}, "Missing clock= for 'array', which tells no times"),
         *(
             (scene(), {"clock": one}, r"Invalid .*clock .*of 'array'.*in \(0, 1e\+06\] Hz")
             for one in (0, -1.0, np.nan, np.inf, 1e300, 2e6, 1e-9 * np.arange(3))
@@ -182,6 +183,31 @@ def test_times_of_an_array_agree_with_the_clock(
                 read(source)
         else:
             assert_allclose(read(source).time, [0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("times", "unit", "expected"),
+    [
+        ([0.0, 0.1, 0.7], None, [0.0, 0.1, 0.7]),
+        ([5, 105, 205], "ms", [0.0, 0.1, 0.2]),
+        ([0, 100, 200], None, "Missing unit of the times of 'a.h5', which rise by 100 a frame"),
+        ([0.0, 0.2, 0.1], "s", "Must agree to half a frame, and rise"),
+        ([5.0, 5.1], None, "Missing clock= for 'a.h5', which tells no times"),
+    ],
+)
+def test_times_of_a_file_are_its_clock(
+    tmp_path: Path, times: list[float], unit: str | None, expected: Any
+) -> None:
+    """Without a clock the times of the file are taken; those without a unit must be seconds."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"], file["time"] = scene(), times
+        file["time"].attrs.update({} if unit is None else {"units": unit})
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=re.escape(expected)):
+            readers.array(tmp_path / "a.h5", unit="count")
+    else:
+        made = readers.array(tmp_path / "a.h5", unit="count")
+        assert_allclose(made["exposure_time"], expected, atol=1e-9)  # [s]
 
 
 def test_dates_of_an_array_agree_with_the_clock() -> None:

@@ -8,6 +8,8 @@ import imagecodecs
 import numpy as np
 import pytest
 import tifffile
+import xarray as xr
+import zarr
 from flir_files import scene, sequence
 
 from dbthermal import readers
@@ -60,6 +62,9 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
         "MATLAB 5.0 MAT-file": r"MATLAB 5: save it anew by save\(\.\.\., '-v7\.3'\)",
         "\x0e\x03\x13\x01": "HDF4: convert it",
         "SIMPLE  =    T": "FITS: save its array",
+        "\x1f\x8b\x08": "gzip: unpack it",
+        "P5\n24 32": "PGM: save it as PNG",
+        "\x80\x04\x95": "pickle: save its array",
     }
     path, options = tmp_path / "a.dat", {"unit": "count", "clock": 10.0}
     for start, expected in starts.items():
@@ -72,6 +77,29 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
         (tmp_path / f"a.{suffix}").write_bytes(b"something else")
         with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': export its counts"):
             readers.flir(tmp_path / f"a.{suffix}")
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.tif", "a.npy", "a"])
+def test_texts_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    """A table, a page of a server or a pointer to a file is a text, whatever its name."""
+    for content in ("21,5;21,6\n" * 9, "<!DOCTYPE html><html>", "version https://git-lfs\n"):
+        (tmp_path / name).write_text(content)
+        status, text = info(capsys, tmp_path / name)
+        assert status == 1
+        assert f"Refused '{name}', a text" in text
+
+
+def test_zarr_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An array or group of zarr that dbthermal has not saved is a recording, with its times."""
+    zarr.save_array(tmp_path / "a.zarr", scene())
+    film = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
+    moments = np.datetime64("2026-01-01", "ns") + np.arange(3) * np.timedelta64(100, "ms")
+    film = film.assign_coords(time=moments)
+    film.to_dataset().to_zarr(tmp_path / "b.zarr", zarr_format=3, consolidated=False)
+    for name, words in (("a.zarr", "clock: not in the file"), ("b.zarr", "frame_rate_Hz: 10.0")):
+        status, text = info(capsys, tmp_path / name)
+        assert status == 0
+        assert words in text
 
 
 def test_another_reader_is_named(tmp_path: Path) -> None:

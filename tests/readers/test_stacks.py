@@ -39,9 +39,9 @@ def write(path: Path, counts: Any, **options: Any) -> None:
     tifffile.imwrite(path, counts, **{"photometric": "minisblack", **options})
 
 
-def read(path: Path | list[Path]) -> xr.Dataset:
-    """Stack of counts at 10 Hz."""
-    return readers.tiff(path, unit="count", clock=10.0)
+def read(path: Path | list[Path], clock: float | None = 10.0) -> xr.Dataset:
+    """Stack of counts, at 10 Hz."""
+    return readers.tiff(path, unit="count", clock=clock)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -65,6 +65,19 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
     write(paths[1], scene()[0, :-1])
     with pytest.raises(ValueError, match=r"Invalid page of \(23, 32\) in 'frame9\.tif'"):
         read(paths)
+
+
+def test_numbers_that_are_left_out_are_gaps_in_time(tmp_path: Path) -> None:
+    """Frames of one file each that are missing by their numbers leave a gap, with a warning."""
+    names = [f"run2_{number}" for number in (10, 12, 14, 20, 22)]
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    for path in paths:
+        write(path, scene()[0])
+    with pytest.warns(UserWarning, match=r"'run2_10.tif to run2_22.tif' leave out 2 frames"):
+        made = read(paths)
+    assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.5, 0.6], atol=1e-9)  # [s]
+    assert_array_equal(made["frame_flags"] > 0, [False, False, False, True, False])
+    assert_allclose(read(paths[:3])["exposure_time"], [0.0, 0.1, 0.2])  # every second one
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -154,6 +167,7 @@ def test_intervals_of_a_description(tmp_path: Path, options: Any, agrees: bool) 
     write(path := tmp_path / "a.tif", scene(), **options)
     if agrees:
         assert_array_equal(read(path).counts, scene())
+        assert_allclose(read(path, clock=None)["exposure_time"], [0.0, 0.1, 0.2])  # [s]
     else:
         with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
             read(path)
