@@ -124,6 +124,7 @@ materials text*         as listed by 'data'; all by default
 --workers whole=2       number of threads
 --title text            heading of the report
 --author text           name below it
+--logo path             picture beside it, *.png
 --noise number!         of the camera without a filter [K]
 --seconds number=35     length of the capture
 --rate number=10        frame rate [Hz]
@@ -154,7 +155,7 @@ _METHODS: Final = (
     "apparent (temperature as of a black body)"
 )
 _OUTPUTS: Final = {
-    "export": "file *.csv, *.tif, *.nc, *.png, *.pdf or *.svg",
+    "export": "file *.csv, *.tif, *.nc, *.gif, *.webp, *.png, *.pdf or *.svg",
     "explore": "notebook *.ipynb",
     "report": "page *.html",
 }
@@ -223,13 +224,14 @@ write a result for other programs: curves, film, picture, or everything as NetCD
 result.zarr --pixel 120 200 --region 10 60 10 90 -o curves.csv
 result.zarr --variable background_temperature -o film.tif
 result.zarr -o object.png
+result.zarr -o object.gif
 result.zarr -o result.nc
 
 explore export.explore result shown --output
 make a notebook to look around in a result or a capture, for JupyterLab
 result.zarr aligned.zarr response.zarr -o look.ipynb
 
-report export.report result shown --region --title --author --output
+report export.report result shown --region --title --author --logo --output
 write a report on a result, one HTML file that needs no network
 result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+from PIL import Image
 
 from dbthermal import __main__ as command_line
 from dbthermal import __version__, schema, simulation, store
@@ -358,10 +359,12 @@ def test_curves_films_pictures(results: Path) -> None:
     whole = "rows 0 to 24 columns 0 to 32 measured"
     assert last[f"{whole} status"] == "no_flag"
     assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
-    for suffix in ("tif", "png", "nc"):
+    for suffix in ("tif", "png", "nc", "gif"):
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
     np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    with Image.open(results / "out.gif") as film:
+        assert film.n_frames == FRAMES // 2  # type: ignore[attr-defined]
     assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
     (results / "out.tif").unlink()
     line = refused(results, "export", "result.zarr", "-o", "out.tif")

@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
-from dbthermal._cli.files import PICTURES, opened, provenance, staged
+from dbthermal._cli.files import ANIMATED, PICTURES, opened, provenance, staged
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
     names = sorted(map(str, result.data_vars))
     if suffix != ".nc":  # pictures, or curves over time
-        dims, last = (("time", "y", "x"), 4) if suffix == ".csv" else (("y", "x"), 2)
+        dims, last = (("y", "x"), 2) if suffix in (".tif", *PICTURES) else (("time", "y", "x"), 4)
         names = [name for name in names if result[name].dims[-last:] == dims]
         if not names:
             rule = "Must be a result, as from: dbthermal separate"
@@ -100,6 +100,15 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
     return {"shape": list(values.shape), "dtype": str(values.dtype), "units": about["units"]}
 
 
+def _animation(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Animate a variable, in degrees Celsius if it is a temperature."""
+    from dbthermal.explorer import _export  # noqa: PLC0415 - optional
+
+    view = explorer.View(result)
+    _export.save_film(view, path, _export.Shown([options.variable], 0, {}, celsius=True))
+    return {"bytes": path.stat().st_size}
+
+
 def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Draw a variable at the last time, in degrees Celsius if it is a temperature."""
     from dbthermal import figures  # noqa: PLC0415 - optional
@@ -150,6 +159,7 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
     result, *shown = _shown(options, "separated")
     regions = _regions(result, options.region)
     named = {"title": options.title} if options.title else {}
+    named |= {"logo": options.logo} if options.logo else {}
     named["author"] = ", ".join(
         filter(None, [options.author, f"reported on {datetime.now().astimezone():%Y-%m-%d}"])
     )
@@ -176,4 +186,4 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
 _EXTREMES = ("minimum", "maximum")  # of the pixels of a region
 _DECIMALS = 4  # of the values in a table: a tenth of a millikelvin
 _WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
-_WRITERS |= dict.fromkeys(PICTURES, _picture)
+_WRITERS |= dict.fromkeys(PICTURES, _picture) | dict.fromkeys(ANIMATED, _animation)

@@ -33,6 +33,8 @@ READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
 }
 """Kind of files -> its reader, whose arguments are the options, and its suffixes."""
 PICTURES: Final = (".png", ".pdf", ".svg")
+ANIMATED: Final = (".gif", ".webp")
+NO_TABLES: Final = (".tif", ".nc", *PICTURES, *ANIMATED)
 _UNEQUAL: Final = 0.05  # of the duration, by which two cameras' recordings may differ
 _BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import PICTURES, READERS, kind_of
+from dbthermal._cli.files import NO_TABLES, READERS, kind_of
 from dbthermal.response import ACCURACY
 
 _FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
@@ -29,7 +29,7 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return _of_files(options)
     if options.command == "align" and options.offset is not None:
         return {"with --offset": "search"}
-    if options.command == "export" and options.output.suffix in {".tif", ".nc", *PICTURES}:
+    if options.command == "export" and options.output.suffix in {*NO_TABLES}:
         suffix = options.output.suffix
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":

@@ -19,7 +19,9 @@ from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
 from dbthermal.figures._status import legend
 
-SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
+ANIMATED: Final = (".gif", ".webp")
+SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc", *ANIMATED)
+_FILMED: Final = 150  # frames of an animated picture, at most
 _MOST_COLUMNS: Final = 3
 
 
@@ -72,6 +74,26 @@ def figure(view: View, shown: Shown) -> Figure:
     return result
 
 
+def save_film(view: View, path: Path, shown: Shown) -> None:
+    """Save the films among the panes side by side, as an animated picture at their own speed."""
+    every = slice(None, None, -(-view.time.size // _FILMED))
+    panels = []
+    for pane in (view.pane(name) for name in shown.names if view.pane(name).kind == "film"):
+        unit, zero = pane.unit(celsius=shown.celsius)
+        low, high = shown.limits.get(pane.name) or view.limits(pane.name)
+        values = pane.read(every) - np.float32(zero)
+        film = xr.DataArray(values, {"time": view.time[every]}, ("time", "y", "x"))
+        style: dict[str, Any] = {"limits": (low - zero, high - zero), "palette": shown.palette}
+        panels.append(figures.FilmPanel(film, pane.label, f"[{unit}]", **style))
+    if not panels:
+        raise ValueError(f"Invalid film of {list(shown.names)}. Must have a picture that changes.")
+    origin = drawing.provenance_note(view.data).strip(" (),") or "film"
+    first, *further = map(Image.fromarray, figures.film(panels, title=origin))
+    period = float(view.time[-1] - view.time[0]) / max(len(further), 1)  # [s]
+    milliseconds = max(20, round(1000 * period))
+    first.save(path, save_all=True, append_images=further, duration=milliseconds, loop=0)
+
+
 def _outline(region: Region, **style: Any) -> Patch:
     """Outline of a region on a picture, whose first pixel has its centre at 0."""
     corners = np.array(region.points)[:, ::-1] - 0.5  # (x, y)
@@ -100,7 +122,8 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
     """Save what is seen, by suffix.
 
     ``.csv``: curves of the regions in the first pane; ``.tiff``: its frame, 32-bit float in its own
-    units; ``.png``: all panes; ``.nc``: all panes' frames, and the curves.
+    units; ``.png``: all panes; ``.nc``: all panes' frames, and the curves; ``.gif``, ``.webp``: the
+    films among them.
     """
     path, (name, *_), index = Path(path), shown.names, shown.index
     if path.suffix not in SUFFIXES:
@@ -109,6 +132,8 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
     if path.suffix == ".csv":
         lines = curves(view, name, shown.regions, shown.pixels)
         path.write_text(_table(view, lines, celsius=shown.celsius))
+    elif path.suffix in ANIMATED:
+        save_film(view, path, shown)
     elif path.suffix == ".png":
         store.save_figure(figure(view, shown), path, store.provenance(what))
     elif path.suffix == ".tiff":

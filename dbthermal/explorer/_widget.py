@@ -154,11 +154,15 @@ class Explorer(anywidget.AnyWidget):
 
     def _answer_frames(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes at a frame, and on which side of an isotherm their pixels are."""
-        names, level = request["panes"], request["isotherm"]
-        frames = {name: self.view.frame(name, request["index"]) for name in names}
+        names, level, less = request["panes"], request["isotherm"], request.get("reference")
+        frames = {name: self._frame(name, request) for name in names}
         limits = zip(names, request["limits"], strict=True)
         ranges = {name: limit or self._range(name) for name, limit in limits}
+        for name in (name for name in names if less is not None and self._is_film(name)):
+            reach = 0.5 * (self._range(name)[1] - self._range(name)[0])
+            ranges[name] = ranges[name] if request["limits"][names.index(name)] else (-reach, reach)
         lined = [name for name in names if level is not None and self.view.panes[name].absolute]
+        lined = lined if less is None else []
         sides = [
             np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
             for name in lined
@@ -170,19 +174,40 @@ class Explorer(anywidget.AnyWidget):
         codes = [quantised(frames[name], *ranges[name]) for name in names]
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
+    def _is_film(self, name: str) -> bool:
+        return self.view.panes[name].kind == "film"
+
+    def _frame(self, name: str, request: dict[str, Any]) -> Values:
+        """Frame of a pane, of a film less that of reference if there is one."""
+        frame, less = self.view.frame(name, request["index"]), request.get("reference")
+        if less is None or not self._is_film(name):
+            return frame
+        return np.asarray(frame - self.view.frame(name, less))
+
     def _answer_profile(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the values of a pane along a line, about one for each pixel."""
         start, stop = np.array(request["points"])
         number = int(np.ceil(np.abs(stop - start).max())) + 1
         places = np.linspace(start, stop, number).astype(int)
         rows, columns = np.clip(places, 0, np.array(self.view.shape) - 1).T
-        frame = self.view.frame(request["pane"], request["index"])
+        frame = self._frame(request["pane"], request)
         return {}, [frame[rows, columns].astype(np.float32)]
 
     def _answer_probe(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer values and flags of a pixel."""
         place = [request[name] for name in ("index", "row", "column")]
-        return {**self.view.probe(request["panes"], *place), "at": place}, []
+        answer = self.view.probe(request["panes"], *place)
+        if request.get("reference") is not None:  # a difference, without its deviation
+            values = {
+                name: float(self._frame(name, request)[place[1], place[2]])
+                for name in answer["values"]
+                if self._is_film(name)
+            }
+            answer["values"] |= {
+                name: (value if np.isfinite(value) else None, None)
+                for name, value in values.items()
+            }
+        return {**answer, "at": place}, []
 
     def _answer_curves(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the curves of all regions in a pane."""

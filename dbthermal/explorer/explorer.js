@@ -8,8 +8,8 @@ const TOOLS = { move: "Move", rectangle: "Rectangle", ellipse: "Ellipse", polygo
 const PALETTES = { gnuplot2: "iron", turbo: "rainbow" }; // as other programs call them
 const PIXELS = { unflagged: "flagged: hatched", hidden: "flagged: hidden", measured: "measured only", all: "all pixels count" };
 const HIDDEN = { unflagged: [0, 0, 0], all: [0, 0, 0], hidden: [0, 0, 1], measured: [0, 1, 1] }; // good, completed, flagged
-const FILES = { ".csv": "curves of the regions", ".png": "these pictures", ".tiff": "frame of the chosen picture, 32-bit float", ".nc": "frames and curves" };
-const HELP = "Arrow keys: frame, with shift ten. Space: play. M: mark this time. Title: choose what is plotted. Wheel on a clicked "
+const FILES = { ".csv": "curves of the regions", ".png": "these pictures", ".tiff": "frame of the chosen picture, 32-bit float", ".nc": "frames and curves", ".gif": "film of these pictures" };
+const HELP = "Arrow keys: frame, with shift ten. Space: play. M: mark this time. R: all films less this frame, and back. Title: choose what is plotted. Wheel on a clicked "
   + "picture: zoom; double click: all of it, or the end of a polygon. Delete: remove the region last clicked or drawn. Ctrl+Z: undo. "
   + "Hatched: flagged; dotted: completed, not measured. Triangles: hottest and coldest measured pixel.";
 
@@ -126,7 +126,7 @@ class Picture {
     const number = (place, title) => make(this.foot, "input", "dbt-number", {
       type: "number", step: "any", title, ariaLabel: `${this.pane.label}: ${title}`,
       onchange: ({ target }) => {
-        const limits = this.range.with(place, parseFloat(target.value) + this.explorer.offset(this.pane));
+        const limits = this.range.with(place, parseFloat(target.value) + this.explorer.zero(this.pane));
         this.rescale(limits[0] < limits[1] ? limits : this.limits);
       },
     });
@@ -165,7 +165,7 @@ class Picture {
     bar.fillStyle = getComputedStyle(this.foot).color;
     numbers.forEach((number, at) => { const high = Math.min(15, (15 * number) / most); bar.fillRect(at, 16 - high, 1, high); });
     [this.low.value, this.high.value] = [explorer.text(from, pane), explorer.text(to, pane)];
-    this.unit.textContent = explorer.unit(pane);
+    this.unit.textContent = explorer.shownUnit(pane);
   }
   draw() {
     const { explorer, canvas, pane, explorer: { zoom: { x, y, factor }, cursor, shape } } = this;
@@ -197,6 +197,7 @@ class Picture {
       stroke(context, new Path2D(cross(5, 15)), ["black", 3], ["white", 1]);
     }
     this.title.classList.toggle("dbt-chosen", explorer.chosen === pane.name);
+    this.title.textContent = capital(pane.label) + (explorer.isDifference(pane) ? `, less that at ${explorer.time[explorer.reference].toFixed(2)} s` : "");
     this.readout.textContent = cursor ? this.words(cursor) : "";
   }
   words([row, column]) {
@@ -205,14 +206,14 @@ class Picture {
     const [value, std] = explorer.probed?.[pane.name] ?? [];
     if (value === undefined) return "\u2026";
     if (value === null) return "no value";
-    return `${explorer.text(value, pane)}${std === null ? "" : ` \u00b1 ${std.toFixed(DIGITS[pane.units] ?? 2)}`} ${explorer.unit(pane)}`;
+    return `${explorer.text(value, pane)}${std === null ? "" : ` \u00b1 ${std.toFixed(DIGITS[pane.units] ?? 2)}`} ${explorer.shownUnit(pane)}`;
   }
 }
 
 class Explorer {
   constructor(model, el) {
     Object.assign(this, { pictures: new Map(), shown: [], changed: new Set(), curves: new Map(), regions: new Map(), past: [], events: {}, drawn: -1, number: 1 });
-    Object.assign(this, { zoom: { x: 0, y: 0, factor: 1 }, cursor: null, probed: null, selection: "unflagged", palette: 0, isotherm: null });
+    Object.assign(this, { zoom: { x: 0, y: 0, factor: 1 }, cursor: null, probed: null, selection: "unflagged", palette: 0, isotherm: null, reference: null });
     this.root = make(el, "div", "dbt-explorer");
     Object.assign(this.root.dataset, { testid: "explorer", lmSuppressShortcuts: "true" }); // or JupyterLab takes the arrow keys
     this.root.explorer = this;
@@ -375,15 +376,15 @@ class Explorer {
     const panes = this.shown.filter((name) => this.pictures.get(name).pane.kind === "film" || !this.pictures.get(name).codes);
     const limits = panes.map((name) => this.pictures.get(name).limits);
     const isotherm = this.isotherm === null ? null : this.isotherm + (this.celsius ? ZERO_CELSIUS : 0);
-    this.link.ask("frames", { index: this.index, panes, limits, isotherm });
+    this.link.ask("frames", { index: this.index, panes, limits, isotherm, reference: this.reference });
     this.askProbe();
     this.askProfile();
   }
   askProfile() {
-    if (this.line) this.link.ask("profile", { index: this.index, pane: this.chosen, points: this.line.points });
+    if (this.line) this.link.ask("profile", { index: this.index, pane: this.chosen, points: this.line.points, reference: this.reference });
   }
   askProbe() {
-    if (this.cursor) this.link.ask("probe", { index: this.index, row: this.cursor[0], column: this.cursor[1], panes: this.shown });
+    if (this.cursor) this.link.ask("probe", { index: this.index, row: this.cursor[0], column: this.cursor[1], panes: this.shown, reference: this.reference });
   }
   counted() { return this.selection === "hidden" ? "unflagged" : this.selection; }
   askCurves() {
@@ -423,6 +424,12 @@ class Explorer {
     this.level.value = value === null ? "" : +value.toFixed(2);
     this.goTo(this.index);
   }
+  setReference(index) {
+    // Films less their frame at an index, whose ranges are others; null for the films themselves.
+    this.reference = index;
+    for (const picture of this.pictures.values()) if (picture.pane.kind === "film") Object.assign(picture, { limits: null, codes: null });
+    this.goTo(this.index);
+  }
   play() {
     const starts = !this.player;
     clearInterval(this.player);
@@ -439,6 +446,7 @@ class Explorer {
       Home: () => this.goTo(0),
       End: () => this.goTo(this.time.length - 1),
       " ": () => this.play(),
+      r: () => this.setReference(this.reference === null ? this.index : null),
       m: () => this.link.ask("event", { name: `mark ${Object.keys(this.events).length + 1}`, time: this.time[this.index] }),
       Escape: () => { this.draft = this.line = this.profile = null; this.redraw(); },
       Delete: () => this.remove(this.regions.has(this.selected) ? this.selected : [...this.regions.keys()].at(-1)),
@@ -524,7 +532,10 @@ class Explorer {
   // What is drawn
   offset(pane) { return pane.absolute && this.celsius ? ZERO_CELSIUS : 0; }
   unit(pane) { return pane.absolute && this.celsius ? "\u00b0C" : pane.units; }
-  text(value, pane) { return (value - this.offset(pane)).toFixed(DIGITS[pane.units] ?? 2); }
+  zero(pane) { return this.isDifference(pane) ? 0 : this.offset(pane); } // of what pictures show
+  shownUnit(pane) { return this.isDifference(pane) ? pane.units : this.unit(pane); }
+  isDifference(pane) { return this.reference !== null && pane.kind === "film"; }
+  text(value, pane) { return (value - this.zero(pane)).toFixed(DIGITS[pane.units] ?? 2); }
   repaint() {
     this.hidden = this.classes.map((one) => HIDDEN[this.selection][one]);
     for (const picture of this.pictures.values()) picture.paint();
@@ -626,13 +637,13 @@ class Explorer {
     const { section, profile, line } = this, pane = this.panes.find((one) => one.name === this.chosen);
     section.hidden = !line || !profile;
     if (section.hidden) return;
-    const [width, height, values] = [section.clientWidth, section.clientHeight, [...profile].map((value) => value - this.offset(pane))];
+    const [width, height, values] = [section.clientWidth, section.clientHeight, [...profile].map((value) => value - this.zero(pane))];
     Object.assign(section, { width: width * devicePixelRatio, height: height * devicePixelRatio });
     const context = section.getContext("2d"), [left, right, top, bottom] = [64, width - 12, 18, height - 32];
     context.scale(devicePixelRatio, devicePixelRatio);
     Object.assign(context, { font: "12px sans-serif", fillStyle: getComputedStyle(this.root).color, strokeStyle: "#8884" });
     const finite = values.filter(Number.isFinite), [from, to] = line.points;
-    context.fillText(`${capital(pane.label)} along the line ${this.unit(pane) && `[${this.unit(pane)}]`}`, left, 12);
+    context.fillText(`${capital(pane.label)} along the line ${this.shownUnit(pane) && `[${this.shownUnit(pane)}]`}`, left, 12);
     if (!finite.length) return;
     const length = Math.hypot(to[0] - from[0], to[1] - from[1]), margin = Math.max(0.06 * (Math.max(...finite) - Math.min(...finite)), 1e-3);
     const [low, high] = [Math.min(...finite) - margin, Math.max(...finite) + margin];
@@ -669,6 +680,8 @@ class Explorer {
       make(line, "div", "", { textContent: `mean ${mean(i).toFixed(digits)}${bar} ${this.unit(this.plotted)}` });
       make(line, "div", "dbt-faint", { textContent: `${low(i).toFixed(digits)} to ${high(i).toFixed(digits)}; ${counts[1]} of ${counts[0]} pixels` });
       const unit = this.plotted?.absolute ? "K" : this.unit(this.plotted);
+      const since = this.reference;
+      if (since !== null && this.plotted?.kind === "film") make(line, "div", "dbt-faint", { textContent: `since ${this.time[since].toFixed(2)} s: ${(mean(i) - mean(since)).toFixed(digits)} ${this.plotted.units}` });
       if (order) make(line, "div", "dbt-faint", { textContent: `less ${regions[0][0]}: ${(mean(i) - regions[0][2].mean(i)).toFixed(digits)} ${unit}` });
       return line;
     });

@@ -146,12 +146,18 @@ class FilmPanel:
         Title, and unit of the colour bar.
     symmetric : bool
         Zero in the middle of the range of colour.
+    limits : (float, float), optional
+        Range of colour, in place of that of the values.
+    palette : str
+        Colours, by their name in matplotlib.
     """
 
     values: xr.DataArray
     title: str
     unit: str = "[\N{DEGREE SIGN}C]"
     symmetric: bool = False
+    limits: tuple[float, float] | None = None
+    palette: str = "inferno"
 
 
 def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.uint8]]:
@@ -175,8 +181,8 @@ def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.
     figure, axes = canvas(1, len(panels), size)
     figure.set_dpi(_DPI)
     for axis, panel in zip(axes[0], panels, strict=True):
-        scale = limits_of(panel.values, symmetric=panel.symmetric)
-        cmap = "RdBu_r" if panel.symmetric else "inferno"
+        scale = panel.limits or limits_of(panel.values, symmetric=panel.symmetric)
+        cmap = "RdBu_r" if panel.symmetric else panel.palette
         image = panel.values.isel(time=0)
         draw_image(figure, axis, image, panel.title, panel.unit, cmap=cmap, limits=scale)
     heading = figure.suptitle(f"{title}, {' ' * 7}")

@@ -12,6 +12,7 @@ from typing import Any, Final
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from dbthermal import _text as texts
 from dbthermal import store
 from dbthermal._text import missing_library
 
@@ -22,6 +23,8 @@ try:
 except ImportError as error:
     raise ImportError(missing_library(error.name, "report")) from error
 
+_PNG: Final = b"\x89PNG\r\n\x1a\n"  # the first bytes of a file
+_LOGO: Final = 2**20  # largest picture beside the title [byte]
 
 # The poster is the picture that is printed; the button lies below the film and hides none of it.
 _FILM: Final = Markup("""{
@@ -52,7 +55,7 @@ class Section:
     body: Sequence[str]
 
 
-def save_page(
+def save_page(  # noqa: PLR0913 - what is above the sections, by name
     path: str | Path,
     title: str,
     sections: Iterable[Section],
@@ -62,6 +65,7 @@ def save_page(
     provenance: Mapping[str, Any],
     about: str = "",
     answer: Sequence[str] = (),
+    logo: str | Path | None = None,
 ) -> None:
     """Save sections as one HTML file that asks for nothing else.
 
@@ -79,7 +83,12 @@ def save_page(
         Author, date and files, beside the origin.
     answer : sequence of str
         Sentences above the sections.
+    logo : str or Path, optional
+        File ``*.png`` beside the title, of at most 1 MB.
     """
+    picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
+    if logo is not None and not picture.startswith(_PNG):
+        raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
     environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True)
     text = resources.files("dbthermal.reporting").joinpath("page.html").read_text("utf-8")
     page = environment.from_string(text).render(
@@ -87,6 +96,7 @@ def save_page(
         origin=origin,
         about=about,
         answer=list(answer),
+        logo=base64.b64encode(picture).decode(),
         sections=list(sections),
         numbers=htmlsafe_json_dumps(numbers, allow_nan=False, sort_keys=True),
         provenance=json.dumps(provenance, indent=2, sort_keys=True),

@@ -53,6 +53,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     materials: xr.Dataset | None = None,
     title: str = "Separated thermal scene",
     author: str = "",
+    logo: str | Path | None = None,
     provenance: Mapping[str, Any] | None = None,
     celsius: bool = True,
     codec: Literal["vp9", "h264"] = "h264",
@@ -81,6 +82,8 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         not given.
     title, author : str
         Heading, and a name below it.
+    logo : str or Path, optional
+        File ``*.png`` of at most 1 MB, shown beside the heading.
     provenance : mapping, optional
         From `store.provenance`; that of the result if not given.
     celsius : bool
@@ -163,6 +166,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         numbers=numbers,
         provenance=made_by,
         about=", ".join(filter(None, about)),
+        logo=logo,
         answer=[
             sentence.replace("+-", "\N{PLUS-MINUS SIGN}").replace("degC", "\N{DEGREE SIGN}C")
             for sentence in sentences

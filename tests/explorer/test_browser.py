@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from PIL import Image
 
 from dbthermal import separation, simulation, store
 from dbthermal.explorer import Region, View
@@ -212,6 +213,26 @@ def check_tools(page: Any, view: View, region: Region, index: int) -> None:
     measured = np.where(view.counted("measured"), frame, np.nan)
     expected = [np.nanmin(measured), np.nanmax(measured)]
     np.testing.assert_allclose([value for *_, value in spots], expected, rtol=0, atol=1e-4)  # [K]
+    # All films less the frame of reference, and back.
+    page.locator("[data-testid=time]").focus()
+    for key in ("r", "Shift+ArrowRight"):
+        page.keyboard.press(key)
+    page.wait_for_function(f"{EXPLORER}.drawn === {index + 10} && !{EXPLORER}.link.busy")
+    rise = view.frame("object_temperature", index + 10) - frame
+    measured = np.where(view.counted("measured"), rise, np.nan)
+    spots = page.evaluate(f"{EXPLORER}.pictures.get('object_temperature').spots")
+    expected = [np.nanmin(measured), np.nanmax(measured)]
+    np.testing.assert_allclose([value for *_, value in spots], expected, rtol=0, atol=1e-4)  # [K]
+    titles = page.locator(".dbt-title").all_inner_texts()
+    assert f"Object temperature, less that at {view.time[index]:.2f} s" in titles
+    for key in ("r", "Shift+ArrowLeft"):
+        page.keyboard.press(key)
+    page.wait_for_function(f"{EXPLORER}.drawn === {index} && !{EXPLORER}.link.busy")
+    # An animated picture of all films.
+    with page.expect_download() as download:
+        page.get_by_role("button", name="GIF").click()
+    with Image.open(download.value.path()) as film:
+        assert film.n_frames == view.time.size  # type: ignore[attr-defined]
     # A second region, less the first.
     page.locator("[data-tool=rectangle]").click()
     drag(page, canvas, (0.7, 0.4), (0.9, 0.8))

@@ -221,6 +221,32 @@ def test_exported_files(tmp_path: Path) -> None:
         assert saved["mean"].sel(region="door").values.tolist() == [310.0, 311.0, 312.0]
         assert saved["object_temperature"].attrs["units"] == "K"
     assert "Must end in one of" in answer(explorer, **shown, suffix=".txt")[0]["error"]
+    for suffix in (".gif", ".webp"):  # the films alone, at their own speed
+        (tmp_path / f"a{suffix}").write_bytes(answer(explorer, **shown, suffix=suffix)[1][0])
+        with Image.open(tmp_path / f"a{suffix}") as film:
+            film.seek(1)
+            film.load()
+            assert (film.n_frames, film.info["duration"]) == (3, 500)  # type: ignore[attr-defined]
+    still = {**shown, "panes": ["status"], "suffix": ".gif"}
+    assert "Must have a picture that changes" in answer(explorer, **still)[0]["error"]
+    explorer.close()
+
+
+def test_frames_less_a_frame_of_reference() -> None:
+    """Films, profiles and values of a pixel are less those of the frame; maps are as they are."""
+    explorer = dbthermal.explore(separated())
+    names = ["object_temperature", "emissivity 9.5"]
+    shown = {"panes": names, "index": 2, "reference": 0}
+    frames, _ = answer(explorer, kind="frames", limits=[None, None], isotherm=300.0, **shown)
+    assert [value for *_, value in frames["spots"][names[0]]] == [2.0, 2.0]  # [K]
+    assert frames["ranges"][0][0] == -frames["ranges"][0][1]
+    assert frames["lined"] == []
+    line = {"pane": names[0], "points": [[0, 0], [0, 3]]}
+    _, (profile,) = answer(explorer, kind="profile", **line, **shown)
+    np.testing.assert_array_equal(np.frombuffer(profile, np.float32), 2.0)
+    probed, _ = answer(explorer, kind="probe", row=1, column=1, **shown)
+    assert probed["values"][names[0]] == (2.0, None)
+    assert probed["values"][names[1]][1] is not None
     explorer.close()
 
 

@@ -1,5 +1,6 @@
 """The report: its numbers against closed forms, hostile words, and the page in a browser."""
 
+import base64
 import json
 import re
 import shutil
@@ -92,6 +93,19 @@ def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     assert materials["plate window glass"]["emissivity"]["9.5"] == pytest.approx(0.718)
     assert "96 pixels alike" in page
     assert "construction concrete (0.0)" in page
+
+
+def test_a_logo_is_in_the_page(tmp_path: Path) -> None:
+    """A PNG stands beside the heading; any other file, or a large one, is refused by name."""
+    png = b"\x89PNG\r\n\x1a\n" + b"picture"
+    (tmp_path / "logo.png").write_bytes(png)
+    dbthermal.report(scene(), tmp_path / "scene.html", logo=tmp_path / "logo.png")
+    head = (tmp_path / "scene.html").read_text("utf-8").partition("<h1>")[0]
+    assert f'src="data:image/png;base64,{base64.b64encode(png).decode()}"' in head
+    for content, rule in ((b"<svg/>", "Must be a PNG"), (png * 99999, "Must be at most 1048576")):
+        (tmp_path / "logo.png").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"logo\.png'.*{rule}"):
+            dbthermal.report(scene(), tmp_path / "no.html", logo=tmp_path / "logo.png")
 
 
 def test_only_measured_pixels_count(tmp_path: Path) -> None:
