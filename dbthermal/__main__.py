@@ -31,7 +31,6 @@ _EXTRAS: Final = {
     **dict.fromkeys(("pydantic", "serial", "yaml"), "instruments"),
     **dict.fromkeys(("h5py", "imagecodecs", "tifffile"), "recordings"),
     "av": "video",
-    "cv2": "alignment",
     "matplotlib": "figures",
     "skimage": "materials",
 }

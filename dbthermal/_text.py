@@ -108,11 +108,8 @@ def shown(value: object) -> str:
 
 def missing_library(name: str | None, extra: str) -> str:
     """Message that a library is not installed, with the command that installs its extra."""
-    command = f"python -m pip install 'dbthermal[{extra}]'"
-    clone = f"in a clone: python -m pip install '.[{extra}]'"
-    return (
-        f"Missing library '{name}', of the extra '{extra}'. Must be installed: {command}; {clone}."
-    )
+    rule = f"Must be installed, in a clone: python -m pip install '.[{extra}]'"
+    return f"Missing library '{name}', of the extra '{extra}'. {rule}."
 
 
 def repeated(values: Iterable[Any]) -> list[Any]:

@@ -51,7 +51,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `separation.separate`.
 
     Clocks and shift of a large capture are estimated from means over some pixels and frames.
-    Errors as the steps; ImportError without OpenCV, for a registration.
+    Errors as the steps.
 
     Parameters
     ----------

@@ -21,7 +21,6 @@ PLACES = {
     "h5py": {"readers"},
     "anywidget": {"explorer"},
     "av": {"readers", "store"},
-    "cv2": {"alignment"},
     "skimage": {"separation"},
     "serial": {"instruments"},
 }

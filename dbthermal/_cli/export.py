@@ -179,8 +179,8 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
         draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
     install = ""
     if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
-        install = "python -m pip install 'dbthermal[explorer]' jupyterlab; "
-    return {str(options.output): f"opened by: {install}jupyter lab {options.output}"}
+        install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then"
+    return {str(options.output): f"opened by{install}: jupyter lab {options.output}"}
 
 
 _EXTREMES = ("minimum", "maximum")  # of the pixels of a region

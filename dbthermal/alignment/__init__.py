@@ -1,8 +1,8 @@
 """Alignment of two cameras or more: one clock and one pixel grid.
 
-`register` estimates where the pixels of the first view lie in the others (it needs OpenCV, the
-extra ``alignment``), `time_offset` by how much one camera is exposed later than the first, and
-`align` brings all bands onto one clock and onto the grid of the first.
+`register` estimates where the pixels of the first view lie in the others, `time_offset` by how much
+one camera is exposed later than the first, and `align` brings all bands onto one clock and onto the
+grid of the first.
 """
 
 from dbthermal.alignment._align import align

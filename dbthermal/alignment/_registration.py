@@ -34,7 +34,6 @@ _NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
 _RIGID: Final = 0.01
 _FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
-_STEPS, _TOLERANCE = 200, 1e-7  # of the maximised correlation: iterations, relative change
 _LEAST_CORRELATION: Final = 0.5
 _LEAST_OVERLAP: Final = 0.5  # of the image: the last rows of two views correlate by chance
 
@@ -45,8 +44,8 @@ def register(
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
     Smooth curves are fitted robustly to each pixel, so that passing reflections hardly count. The
-    translation of the highest correlation of their means [1]_ is refined to some hundredths of a
-    pixel by robust least squares of the curves,
+    translation between their means, from coarse to fine images, is refined to some hundredths of a
+    pixel by robust least squares of the curves [1]_,
 
     .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \right)
 
@@ -79,16 +78,14 @@ def register(
 
     Raises
     ------
-    ImportError
-        If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
         two views is below 0.5, or they share less than half the image.
 
     References
     ----------
-    .. [1] Evangelidis, Psarakis (2008), IEEE Transactions on Pattern Analysis and Machine
-       Intelligence 30, 1858, doi:10.1109/TPAMI.2008.113
+    .. [1] Baker, Matthews (2004), International Journal of Computer Vision 56, 221,
+       doi:10.1023/B:VISI.0000011205.11775.fd
 
     Examples
     --------
@@ -286,30 +283,23 @@ def _overlap(places: Array, band: str) -> Mask:
 
 
 def _start(pair: list[Array], band: str) -> tuple[float, Array]:
-    """Highest correlation of two images (y, x), and its translation (3, 3)."""
-    import cv2  # noqa: PLC0415  (optional: only registration needs it)
-
-    matrix, correlation = np.eye(3), 0.0
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
-    everywhere = np.ones(pair[0].shape, dtype=np.uint8)
+    """Correlation of two images (y, x), and the translation (3, 3) between them, coarse to fine."""
+    matrix, blurred = np.eye(3), pair
     for share in _BLURS:
-        reference, target = (
-            gaussian_filter(it, share * it.shape[0]).astype(np.float32) for it in pair
-        )
-        start = matrix[:2].astype(np.float32)
-        try:
-            correlation, matrix[:2] = cv2.findTransformECC(
-                reference, target, start, cv2.MOTION_TRANSLATION, stop, everywhere, 1
-            )
-        except cv2.error as error:
-            raise ValueError(
-                f"Invalid view in band '{band}': no transform to the first is found ({error.err})."
-                " Must show the same object, displaced by at most a tenth of the image."
-            ) from error
+        blur = share * len(pair[0])
+        blurred = [gaussian_filter(image, blur) for image in pair]
+        films = [image[np.newaxis] for image in blurred]
+        matrix = _fitted(films, matrix, _FREE["translation"], blur, band)
+    # What both show at the same place must be alike.
+    places = positions(matrix, pair[0].shape)
+    overlap = _overlap(places, band)
+    values = sampled(spline_filter(blurred[1])[..., np.newaxis], places[:, overlap])[0]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of an image without detail
+        correlation = float(np.corrcoef(blurred[0][overlap], values.ravel())[0, 1])
     if not correlation >= _LEAST_CORRELATION:
         raise ValueError(
             f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
-            f"Must be at least {_LEAST_CORRELATION}; they do not show the same, or lie too far "
-            "apart."
+            f"Must be at least {_LEAST_CORRELATION}: the same object, displaced by at most a tenth "
+            "of the image."
         )
-    return float(correlation), matrix
+    return correlation, matrix

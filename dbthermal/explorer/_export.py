@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 
-from dbthermal import store
+from dbthermal import figures, store
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing

@@ -13,8 +13,6 @@ from dbthermal.simulation import Rig
 from reproduction import disturbances
 from reproduction.experiments import whole
 
-pytest.importorskip("cv2")
-
 RIG = Rig()
 SHAPE = (96, 128)
 
