@@ -28,7 +28,7 @@ __dir__ = __all__.copy
 _EXTRAS: Final = {
     **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
     "jinja2": "report",
-    **dict.fromkeys(("pydantic", "serial", "yaml"), "instruments"),
+    **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
     **dict.fromkeys(("h5py", "imagecodecs", "tifffile"), "recordings"),
     "av": "video",
     "matplotlib": "figures",

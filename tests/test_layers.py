@@ -23,6 +23,7 @@ PLACES = {
     "av": {"readers", "store"},
     "skimage": {"separation"},
     "serial": {"instruments"},
+    "usb": {"instruments"},
 }
 
 
@@ -93,7 +94,7 @@ def test_the_rig_is_apart() -> None:
 
 def test_importing_the_package_is_light() -> None:
     """`import dbthermal`, and its readers, load neither optional nor heavy packages."""
-    heavy = {"torch", "serial", "matplotlib", "anywidget", "av"}
+    heavy = {"torch", "usb", "serial", "matplotlib", "anywidget", "av"}
     code = f"import sys, dbthermal.readers; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -1,11 +1,17 @@
-"""The inventory of the rig in a written sysfs tree."""
+"""The inventory of the rig on an emulated USB bus and a written sysfs tree."""
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import usb.backend
+import usb.backend.libusb0
+import usb.backend.libusb1
+import usb.backend.openusb
 
 from dbthermal.instruments import inventory
 from dbthermal.instruments.inventory import Device
@@ -20,7 +26,7 @@ class EmulatedDevice:
     serial: str = "EMULATED"
     bus: int = 1
     ports: tuple[int, ...] = (1,)  # on the way
-    speed: str = "480"  # [Mbit/s]
+    speed: int = 3  # as libusb numbers it; 2 is full, 3 high
     nodes: tuple[str, ...] = ()  # as sysfs lists them below the device's interfaces
 
     @property
@@ -39,34 +45,68 @@ def boson(number: int = 1, **settings: Any) -> EmulatedDevice:
 
 def apt(**settings: Any) -> EmulatedDevice:
     """An APT controller on its FTDI chip, at full speed."""
-    defaults: dict[str, Any] = {"ports": (3,), "speed": "12", "nodes": ("ttyUSB0",)}
+    defaults: dict[str, Any] = {"ports": (3,), "speed": 2, "nodes": ("ttyUSB0",)}
     return EmulatedDevice(0x0403, 0xFAF0, **{**defaults, **settings})
 
 
 def tc08(**settings: Any) -> EmulatedDevice:
     """A TC-08, at full speed, without a kernel driver."""
-    return EmulatedDevice(0x0CE9, 0x1000, **{"ports": (4,), "speed": "12", **settings})
+    return EmulatedDevice(0x0CE9, 0x1000, **{"ports": (4,), "speed": 2, **settings})
 
 
-def look(tmp_path: Path, *devices: EmulatedDevice, frame_rate: float = 30.0) -> list[Device]:
-    """Find the devices in a sysfs tree of their own, beside a root hub and the interfaces."""
-    bus, dev = tmp_path / "bus" / "usb" / "devices", tmp_path / "dev"
-    (bus / "usb1").mkdir(parents=True)
+class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
+    """A backend of pyusb with devices of its own, which can only be listed.
+
+    Everything that would open or disturb a live device is missing: pyusb then raises an error.
+    """
+
+    def __init__(self, *devices: EmulatedDevice) -> None:
+        self.devices = devices
+
+    def enumerate_devices(self) -> Iterator[EmulatedDevice]:
+        """List what is plugged in."""
+        return iter(self.devices)
+
+    def get_device_descriptor(self, dev: EmulatedDevice) -> SimpleNamespace:
+        """Give the device descriptor, with what libusb adds: bus, address, ports, speed."""
+        fixed = {
+            **dict.fromkeys(("bDeviceClass", "bDeviceSubClass", "bDeviceProtocol"), 0),
+            **dict.fromkeys(("bDescriptorType", "iSerialNumber", "bNumConfigurations"), 1),
+            **dict(zip(("bLength", "bcdUSB", "bMaxPacketSize0"), (18, 0x0200, 64), strict=True)),
+            **dict(zip(("bcdDevice", "iManufacturer", "iProduct"), (0x0100, 0, 0), strict=True)),
+        }
+        return SimpleNamespace(
+            **fixed,
+            idVendor=dev.vendor,
+            idProduct=dev.product,
+            address=dev.ports[0],
+            bus=dev.bus,
+            port_number=dev.ports[-1],
+            port_numbers=dev.ports,
+            speed=dev.speed,
+        )
+
+
+def write_trees(sysfs: Path, dev: Path, devices: tuple[EmulatedDevice, ...]) -> None:
+    """Write what Linux's sysfs would hold of the devices, and their nodes."""
     for device in devices:
-        texts = {"idVendor": f"{device.vendor:04x}", "idProduct": f"{device.product:04x}"}
-        texts |= {"busnum": f"{device.bus}", "devnum": f"{device.ports[0]}"}
-        texts |= {"speed": device.speed, **({"serial": device.serial} if device.serial else {})}
-        (folder := bus / device.path).mkdir()
-        for name, text in texts.items():
-            (folder / name).write_text(f"{text}\n", encoding="utf-8")
+        folder = sysfs / "bus" / "usb" / "devices" / device.path
+        folder.mkdir(parents=True)
+        if device.serial:
+            (folder / "serial").write_text(f"{device.serial}\n", encoding="utf-8")
         usb_node = dev / f"bus/usb/{device.bus:03d}" / f"{device.ports[0]:03d}"
         usb_node.parent.mkdir(parents=True, exist_ok=True)
         usb_node.touch()
-        (bus / f"{device.path}:1.0").mkdir()
         for node in device.nodes:
             (folder / f"{device.path}:1.0" / node).mkdir(parents=True)
             (dev / Path(node).name).touch()
-    return inventory.find(sysfs=tmp_path, dev=dev, frame_rate=frame_rate)
+
+
+def look(tmp_path: Path, *devices: EmulatedDevice, frame_rate: float = 30.0) -> list[Device]:
+    """Find the devices on a bus of their own, with the sysfs that belongs to it."""
+    write_trees(tmp_path, tmp_path / "dev", devices)
+    backend = EmulatedBackend(*devices)
+    return inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev", frame_rate=frame_rate)
 
 
 def test_whole_rig(tmp_path: Path) -> None:
@@ -91,7 +131,7 @@ def test_nothing_plugged_in(tmp_path: Path) -> None:
         "FLIR Boson: not found (09cb:4007). Must be plugged in and switched on; "
         "'lsusb -d 09cb:4007' lists it then."
     )
-    lines = inventory.describe(look(tmp_path / "slow", boson(speed="12"))).splitlines()
+    lines = inventory.describe(look(tmp_path / "slow", boson(speed=2))).splitlines()
     assert lines[1].startswith("  ! It runs at full speed")
     assert lines[2].startswith("Thorlabs APT controller: not found")
 
@@ -119,7 +159,7 @@ def test_missing_driver(tmp_path: Path) -> None:
 
 def test_rates_that_a_bus_cannot_carry(tmp_path: Path) -> None:
     """A camera at full speed and two cameras on one bus have a warning with the rates."""
-    (slow,) = look(tmp_path / "slow", boson(speed="12"), frame_rate=60.0)
+    (slow,) = look(tmp_path / "slow", boson(speed=2), frame_rate=60.0)
     rule = "It runs at full speed, and 60 frames/s take 314.6 Mbit/s. Must be at high speed"
     assert slow.warnings[0].startswith(rule)
     pair = boson(1, ports=(1, 1)), boson(2, ports=(1, 2))
@@ -148,6 +188,14 @@ def test_node_that_may_not_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_system_without_sysfs() -> None:
-    """Elsewhere than on Linux the error says so."""
-    with pytest.raises(OSError, match=r"No list of USB devices, '/nowhere/.*Must be Linux"):
-        inventory.find(sysfs=Path("/nowhere"))
+    """Without sysfs the devices are listed, and their nodes are reported as unknown."""
+    (device,) = inventory.find(EmulatedBackend(boson()), sysfs=Path("/nowhere"))
+    assert device.warnings[0].startswith("Its nodes and number are not known: there is no /nowhere")
+
+
+def test_missing_libusb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without libusb the error says what to install."""
+    for module in (usb.backend.libusb1, usb.backend.libusb0, usb.backend.openusb):
+        monkeypatch.setattr(module, "get_backend", lambda: None)
+    with pytest.raises(inventory.LibusbMissingError, match=r"No libusb found\. Must be installed"):
+        inventory.find()

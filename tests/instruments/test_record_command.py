@@ -144,13 +144,13 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A missing list of the bus is reported, and the devices are opened by their nodes."""
+    """A missing libusb is reported, and the devices are opened by their nodes."""
 
     def missing(**_: object) -> list[inventory.Device]:
-        raise OSError("no list")
+        raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
     emulated = from_yaml(TEXT)
     real = replace(emulated, simulated=False)
-    assert inventory.plugged_in(real) == "The USB bus was not looked at: no list"
+    assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)
