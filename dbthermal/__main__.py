@@ -6,6 +6,7 @@ standard error.
 """
 
 import argparse
+import difflib
 import json
 import os
 import re
@@ -17,7 +18,7 @@ from functools import cache
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
 from dbthermal._cli import is_source, leaves, progress
@@ -237,8 +238,24 @@ result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 data steps.data
 list the filters and materials that come with the package
 --json
+
+completion main.completion
+print the completion of commands for bash and zsh, taken over by: eval "$(dbthermal completion)"
+-
 """
 """Command, its function and arguments; its summary; examples."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser that asks after the name that was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the message, and exit."""
+        options = re.findall(r"(?m)^--[\w-]+", _ARGUMENTS)
+        for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
+            listed = ", ".join(f"'{option}'" for option in options)
+            message += _suggestion(f"'{wrong}': choose from {listed}")
+        super().error(message + _suggestion(message))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -246,7 +263,7 @@ def _parser() -> argparse.ArgumentParser:
     # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     order = "In this order: demo (or import), calibrate, correct, align, separate, report, explore."
-    parser = argparse.ArgumentParser("dbthermal", description=f"{__doc__}\n{order}", **plain)
+    parser = _Parser("dbthermal", description=f"{__doc__}\n{order}", **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
@@ -317,6 +334,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
         reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
+        reason += _suggestion(reason)
     print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
     return status
 
@@ -340,8 +358,23 @@ def _reason(error: Exception, options: argparse.Namespace) -> str:
     return f"{type(error).__name__}: {message} (--traceback shows where)"
 
 
+def _suggestion(reason: str) -> str:
+    """Question after the name that is most like an unknown one, of those that a message lists."""
+    unknown = re.search(r"'([^']+)'.*(?:Must be one of|choose from)\s(.*)", reason)
+    if unknown is None or "Did you mean" in reason:
+        return ""
+    wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))
+    names = names or unknown.group(2).strip(" .)").split(", ")
+    words = [name for name in names if wrong.lower() in name.lower()]
+    like = [*difflib.get_close_matches(wrong, names, 1), *words]
+    return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
+
+
 def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Check the options, and what is read and written; run the command; print its summary."""
+    if options.command == "completion":
+        print(_completion())
+        return 0
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
@@ -393,6 +426,24 @@ def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[
         if path.exists() and not getattr(options, "overwrite", path.is_dir()):
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     return sources, targets
+
+
+def _completion() -> str:
+    """Function of bash, and of zsh, for names of commands and options; files are left to it."""
+    commands = next(action.choices for action in _parser()._actions if action.choices)
+    named = {
+        name: " ".join(parser._option_string_actions) for name, parser in dict(commands).items()
+    }
+    cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
+    return f"""_dbthermal() {{
+  local words='{" ".join(named)}'
+  [ "$COMP_CWORD" -gt 1 ] && case "${{COMP_WORDS[1]}}" in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+[ -z "${{ZSH_VERSION-}}" ] || {{ autoload -U compinit bashcompinit; compinit; bashcompinit; }}
+complete -o default -F _dbthermal dbthermal"""
 
 
 def _plain(value: Any) -> Any:

@@ -523,10 +523,12 @@ import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock o
 {ONE} --offset 0 --frames 300 400 -o x.zarr -> No frame or row of 'a.tif' selected
 {ONE} --offset 0 --every 0 -o x.zarr -> Invalid --every 0
 {ONE} --offset 0 --rows 9 3 -o x.zarr -> Invalid --rows 9 3
-seperate a b -> invalid choice: 'seperate' .choose from .*separate
-align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset 0
-align a.zarr --register homograph -o x.zarr -> 'homograph' .*homography
-export result.zarr --variable object -o x.tif -> 'object' for .tif.*'object_temperature'
+seperate a b -> invalid choice: 'seperate' .choose from .*Did you mean 'separate'
+align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset 0 Did you mean '--offset'
+align a.zarr --register homograph -o x.zarr -> 'homograph' .*Did you mean 'homography'
+export result.zarr --variable object -o x.tif -> 'object' for .tif.*mean 'object_temperature'
+plan plate_window_glas --noise 0.03 -> 'plate_window_glas'.*Did you mean 'plate window glass'
+plan glass --noise 0.03 -> Did you mean 'plate window glass'
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C
 calibrate --at 5c a.tif b.tif -o a.zarr -> temperature '5c'. Must be a number, with a decimal point
@@ -612,6 +614,17 @@ def test_a_warning_is_said_once(results: Path) -> None:
     with warnings.catch_warnings(action="always"):
         _, _, error = said(results, "calibrate", *at.split(), *STATED, "-o", "border.zarr")
     assert error.count("Warning: 3 rows and 0 columns of band") == 2
+
+
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    """Bash takes the completion over, and completes a command and an option of one."""
+    (tmp_path / "completion").write_text(run(tmp_path, "completion").stdout, encoding="utf-8")
+    for typed, completed in ((["al"], "align"), (["align", "--ref"], "--reference")):
+        words = f"COMP_WORDS=(dbthermal {' '.join(typed)}); COMP_CWORD={len(typed)}"
+        code = f"source completion; {words}; _dbthermal; echo ${{COMPREPLY[@]}}"
+        command = ["bash", "-c", code]
+        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert found.stdout.split() == [completed]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
