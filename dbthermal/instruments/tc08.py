@@ -4,7 +4,7 @@ The TC-08's USB protocol is not public. Its readings come through the vendor's o
 ``libusbtc08``, which is not part of this project and is loaded only when a unit is opened. Names,
 types and error numbers are those of the header ``usbtc08.h`` that the vendor publishes.
 
-A reading without a temperature is NaN, and `Flag` says why. Not every open thermocouple can be
+A reading without a temperature is NaN. Not every open thermocouple can be
 detected: one may also read a noisy room temperature (picotech.com, topic 29871). Move the
 blackbody, and see whether the reading follows.
 """
@@ -15,7 +15,6 @@ import os
 import threading
 from collections.abc import Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
-from enum import IntFlag
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, Self
 
@@ -26,7 +25,7 @@ from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.transport import Closing, parse
 
-__all__ = ["ERRORS", "TC08", "Flag", "ReadingError", "Scan", "TC08Error", "load"]
+__all__ = ["ERRORS", "TC08", "ReadingError", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
 # A library bound by `load`, or an object with the same functions, such as the emulated one. Where C
@@ -107,25 +106,18 @@ SIGNATURES: Final = MappingProxyType(
 )
 
 
-class Flag(IntFlag):
-    """Reason why a reading is not a temperature; 0 if it is one."""
-
-    GOOD = 0
-    OVERFLOW = 1  # the voltage was beyond the converter's range
-    MISSING = 2  # the library returned NaN: open thermocouple, or channel off
-    OUT_OF_RANGE = 4  # the temperature is not positive
-
-
 class Scan(NamedTuple):
     """A reading of all nine channels, of which index 0 is the cold junction.
 
     `time` is the middle of the scan on the host's clock [s], for the channels are converted one
-    after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`.
+    after another. `temperature` (9,) [K] is NaN where the voltage was beyond the converter's range,
+    which `overflow` (9,) says, where the thermocouple is open or the channel off, and where the
+    library gives none above 0 K.
     """
 
     time: float
     temperature: npt.NDArray[np.float64]
-    flag: npt.NDArray[np.uint8]
+    overflow: npt.NDArray[np.bool_]
 
 
 class TC08(Closing):
@@ -252,12 +244,13 @@ class TC08(Closing):
                 self._scan = scan = self.single()
                 self._used.clear()
             self._used.add(channel)
-        if scan.flag[channel]:
+        if np.isnan(temperature := float(scan.temperature[channel])):
+            reason = "overflow" if scan.overflow[channel] else "open"
             raise ReadingError(
                 f"No temperature of thermocouple '{self.channels[channel]}' in channel {channel}: "
-                f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
+                f"{reason}. Must be connected, and within its range."
             )
-        return float(scan.temperature[channel])
+        return temperature
 
     def single(self) -> Scan:
         """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
@@ -270,7 +263,11 @@ class TC08(Closing):
         start = self.clock()
         self._call("get_single", "take a single reading", values, overflow, KELVIN)
         middle = 0.5 * (start + self.clock())
-        return Scan(middle, *flagged(np.array(values, dtype=np.float64), overflow[0]))
+        # The library's nine values, where they are temperatures.
+        kelvin = np.array(values, dtype=np.float64)
+        beyond = (overflow[0] >> np.arange(CHANNELS)) & 1 > 0
+        valid = np.isfinite(kelvin) & (kelvin > 0.0) & ~beyond
+        return Scan(middle, np.where(valid, kelvin, np.nan), beyond)
 
     def _call(self, function: str, action: str, *arguments: Any) -> None:
         """Call a function of the library on the open unit; it returns 0 if it fails."""
@@ -283,28 +280,17 @@ class TC08(Closing):
         return TC08Error(action, self._library.usb_tc08_get_last_error(self._handle))
 
 
-def flagged(
-    values: npt.NDArray[np.float64], overflow_bits: int
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Temperatures [K], NaN unless valid, and flags, of the library's nine values [K]."""
-    overflow = (overflow_bits >> np.arange(CHANNELS)) & 1
-    flag = np.where(overflow, Flag.OVERFLOW, Flag.GOOD)
-    flag |= np.where(np.isfinite(values), Flag.GOOD, Flag.MISSING)
-    flag |= np.where(np.isfinite(values) & (values <= 0.0), Flag.OUT_OF_RANGE, Flag.GOOD)
-    return np.where(flag == 0, values, np.nan), flag.astype(np.uint8)
-
-
-def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
+def load() -> Library:
     """Load the vendor's library and declare the types of its functions.
 
-    Its `path`, the variable `ENVIRONMENT`, or the system's search for ``usbtc08`` names the file
+    The variable `ENVIRONMENT`, or the system's search for ``usbtc08``, names the file
     (FileNotFoundError without any). OSError if it cannot be loaded, or lacks a function.
     """
-    name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
+    name = os.environ.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:
         raise FileNotFoundError(
             "No library 'usbtc08'. Must be installed (libusbtc08 of Pico Technology, often in "
-            f"/opt/picoscope/lib), or named by its path or by the variable {ENVIRONMENT}."
+            f"/opt/picoscope/lib), or named by the variable {ENVIRONMENT}."
         )
     library = ctypes.CDLL(name)
     for function, arguments in SIGNATURES.items():

@@ -37,7 +37,7 @@ from dbthermal.instruments.emulated.camera import EmulatedBoson
 from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.tc08 import TC08, Flag
+from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import Transport, TransportError, open_serial
 
 
@@ -262,7 +262,6 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
     scan = logger.single()
     assert 273.0 < scan.temperature[0] < 320.0
     assert 200.0 < scan.temperature[1] < 400.0
-    assert list(scan.flag[:3]) == [0, 0, Flag.MISSING]
     assert np.isnan(scan.temperature[2])
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
         logger.set_channels({9: "tip"})

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from ctypes import c_int8, c_int16
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from dbthermal.instruments import tc08
-from dbthermal.instruments.tc08 import TC08, Flag, TC08Error
+from dbthermal.instruments.tc08 import TC08, TC08Error
 
 FLOAT32 = 4e-5  # [K] the library's numbers have 24 bits
 
@@ -26,21 +27,24 @@ def rig() -> LoggerBench:
 
 
 def test_single_reading_in_kelvin(rig: LoggerBench) -> None:
-    """Two tips and the cold junction are read, in the middle of 0.3 s; six sockets are missing."""
+    """Two tips and the cold junction are read, in the middle of 0.3 s; six sockets are off."""
     scan = rig.ready().single()
     assert_allclose(scan.temperature[:3], [296.15, 350.0, 300.0], rtol=0, atol=FLOAT32)
-    assert list(scan.flag) == [0, 0, 0] + [Flag.MISSING] * 6
     assert np.isnan(scan.temperature[3:]).all()
     assert scan.time == pytest.approx(1000.15)
 
 
-@given(st.lists(st.floats(width=32), min_size=9, max_size=9), st.integers(-(2**15), 2**15 - 1))
+@given(st.lists(st.floats(width=32), min_size=9, max_size=9), st.integers(0, 2**9 - 1))
 def test_any_answer_of_the_library(raw: list[float], bits: int) -> None:
-    """Any raw values give a finite positive temperature, or NaN with a flag."""
-    temperature, flag = tc08.flagged(np.array(raw), bits)
-    assert np.all(temperature[flag == 0] > 0.0)
-    assert np.isfinite(temperature[flag == 0]).all()
-    assert np.isnan(temperature[flag != 0]).all()
+    """Any raw values give a finite positive temperature, as it is, or NaN."""
+    driver, unit = (rig := LoggerBench()).ready(), rig.unit
+    with patch.object(unit, "convert", lambda channel: (raw[channel], bits >> channel & 1)):
+        scan = driver.single()
+    valid = np.isfinite(scan.temperature)
+    assert np.all(scan.temperature[valid] > 0.0)
+    np.testing.assert_array_equal(scan.overflow, [bits >> channel & 1 for channel in range(9)])
+    assert not np.any(valid & scan.overflow)
+    assert_allclose(scan.temperature[valid], np.array(raw)[valid], rtol=0, atol=0)
 
 
 def test_unit_is_opened_and_closed(rig: LoggerBench) -> None:
@@ -128,10 +132,12 @@ def test_url_is_checked(url: str) -> None:
 def test_missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without the vendor's library the error says where to get it and how to name it."""
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
+    monkeypatch.delenv(tc08.ENVIRONMENT, raising=False)
     with pytest.raises(FileNotFoundError, match=r"No library 'usbtc08'.*DBTHERMAL_USBTC08"):
-        tc08.load(environment={})
+        tc08.load()
+    monkeypatch.setenv(tc08.ENVIRONMENT, str(tmp_path / "gone.so"))
     with pytest.raises(OSError, match=r"gone\.so"):
-        tc08.load(environment={tc08.ENVIRONMENT: str(tmp_path / "gone.so")})
+        tc08.load()
 
 
 STUB = r"""
@@ -182,11 +188,13 @@ def test_types_of_a_real_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (info["serial_number"], info["calibration_date"]) == ("STUB/00/123", "01Jan2000")
     assert (info["driver"], info["variant"]) == ("2.0.17.1441", "8")
     assert (scan.temperature[0], scan.temperature[2]) == (290.0, 292.0)
-    assert list(scan.flag[[1, 8]]) == [Flag.MISSING, Flag.OVERFLOW]
+    assert np.isnan(scan.temperature[[1, 8]]).all()
+    assert np.flatnonzero(scan.overflow).tolist() == [8]
 
 
-def test_other_library_is_refused(tmp_path: Path) -> None:
+def test_other_library_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library without the functions is named, before anything is called."""
+    monkeypatch.setenv(tc08.ENVIRONMENT, compiled(tmp_path, "int nothing;"))
     with pytest.raises(OSError, match=r"stub.so' without usb_tc08_\w+. Must be libusbtc08"):
-        tc08.load(compiled(tmp_path, "int nothing;"))
+        tc08.load()
     assert tc08.SIGNATURES["usb_tc08_set_channel"] == [c_int16, c_int16, c_int8]
