@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
@@ -50,14 +50,24 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # those of whole frames over these, about [1]
+    outside: float  # those of all changes within the period over these [1]
     factor: int  # pixels of the capture along a side of one of these
 
     @classmethod
     def blurred(
-        cls, movies: list[Movie], valid: Mask, noise: Array, functions: Movie, factor: int
+        cls,
+        movies: list[Movie],
+        valid: Mask,
+        noise: Array,
+        functions: Movie,
+        *,
+        factor: int,
+        period: float,
     ) -> "Movies":
-        """Movies along functions of time, of pixels so many times coarser than the mask's."""
+        """Movies along functions of time, of pixels so many times coarser than the mask's.
+
+        The functions show changes within a period [frame].
+        """
         freedom = float(np.sum(functions**2))
         return cls(
             splines(movies[0], BLUR),
@@ -65,7 +75,7 @@ class Movies:
             binned(valid.astype(np.float64), factor) > 0.5,
             noise / factor,
             freedom,
-            max(len(functions) / freedom, 1.0),
+            max((1.0 - 2.0 / period) * len(functions) / freedom, 1.0),
             factor,
         )
 
@@ -111,11 +121,9 @@ def _whole_pixels(
 
 
 def inside(places: Array, valid: Mask) -> Mask:
-    """Places (2, ...) that lie on valid pixels of an image."""
-    near = np.rint(places)
-    result = np.all([(n >= 0) & (n < size) for n, size in zip(near, valid.shape, strict=True)], 0)
-    row, column = np.where(result, near, 0).astype(np.intp)
-    return np.asarray(result & valid[row, column])
+    """Places (2, ...) whose nearest pixel of an image is valid."""
+    near = map_coordinates(valid.astype(np.uint8), places, order=0, mode="grid-constant")
+    return np.asarray(near > 0)
 
 
 def _information(movies: Movies, shift: Array) -> Information:
@@ -161,13 +169,6 @@ def _information(movies: Movies, shift: Array) -> Information:
     share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
     tensor, gradient = tensor * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
-
-
-def eigenvalues(tensor: Array) -> tuple[Array, Array]:
-    """Larger and smaller eigenvalue (y, x) of tensors (3, y, x)."""
-    down, mixed, right = tensor
-    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), mixed)
-    return middle + root, middle - root
 
 
 def start(movies: Movies, spline: Spline) -> Field | None:

@@ -149,10 +149,15 @@ class Capture:
 
     def functions(self, signals: Movie, period: float) -> Movie:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
-        smoothing = self.smoothing(period)
-        sample = signals.reshape(-1, signals.shape[-1])
-        sample = sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))]
-        functions = rapid(smooth.leading(rapid(sample, smoothing), _PLANES).T, smoothing).T
+        smoothing, sample = self.smoothing(period), signals.reshape(-1, signals.shape[-1])
+
+        def rapid(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            """Signals (time, ...) less their mean, and what the smoother passes."""
+            changes = flat - flat.mean(axis=0)
+            return np.asarray(changes - solveh_banded(smoothing, changes))
+
+        changes = rapid(sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))].T)
+        functions = rapid(smooth.leading(changes.T, _PLANES))
         return np.ascontiguousarray(functions, np.float32)
 
     def planes(self, functions: list[Movie]) -> list[list[Movie]]:
@@ -199,13 +204,6 @@ def bridged(film: Movie) -> tuple[Movie, Array]:
         line = np.interp(frame, present, film[present, pixel]) if present.size else 0.0
         result[:, pixel] = line
     return result, measured.mean(axis=0)
-
-
-def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:
-    """Signal (y, x, time) less what a smoother passes."""
-    flat = signal.reshape(-1, signal.shape[-1]).T
-    flat = flat - flat.mean(axis=0)
-    return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
 
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:

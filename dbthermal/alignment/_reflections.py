@@ -100,7 +100,8 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
-        return Movies.blurred(pictures, capture.valid, capture.noise, functions[place], factor)
+        fine, noise = capture.valid, capture.noise
+        return Movies.blurred(pictures, fine, noise, functions[place], factor=factor, period=period)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
@@ -145,7 +146,9 @@ def _coarse(
         tried[period] = capture.functions(signals[0], period)
         functions = tried[period][:, :_FEW]
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, functions, factor)
+        level = Movies.blurred(
+            pictures, valid, capture.noise, functions, factor=factor, period=period
+        )
         begin = None if result is None else result[-1]
         if begin is None:
             try:
@@ -174,18 +177,23 @@ def _coarse(
     return result
 
 
+def _windows(data: Information, factor: int) -> tuple[Array, Array]:
+    """Information (y, x, 2, 2) and gradient (2, y, x) of the data of a window alone."""
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
+    return tensor, area * data.gradient
+
+
 def _resolved(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
-    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
-    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
+    return np.asarray(np.linalg.eigvalsh(_windows(data, factor)[0])[..., 1] > 1.0 / _KNOWN**2)
 
 
 def _squares(data: Information, factor: int = 1) -> Array:
     """Squares (2, y, x) of the steps that windows ask for, over their variances [1]."""
-    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
-    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
+    tensor, gradient = _windows(data, factor)
     inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
-    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
+    steps = np.einsum("yxij,jyx->iyx", inverse, gradient)
     return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
 
 

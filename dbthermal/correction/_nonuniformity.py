@@ -27,7 +27,7 @@ _PARAMETERS |= {"offset_renewed"}
 _PATTERN = {"offset_std", "gain_std", "centre"}
 _PASSES = 2  # fits of the mean, of which the first finds the outliers
 _LEVELS = 65536  # samples of a band, about, for the levels of a capture
-_ROUNDING = 0.01  # differences between pixels that are rounding [count]
+_ROUNDING = 0.01  # differences between pixels that are rounding [count], or [1] of logarithms
 
 
 def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
@@ -264,12 +264,11 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
-    # Apply gain and offset, one band at a time: no second movie in memory.
     maps = _maps(correction, counts)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
     for band in range(len(counts)):
-        # One band at a time, written where it stays: no second movie in memory.
+        # Gain and offset of one band, written where it stays: no second movie in memory.
         raw = counts.isel(band=band).values
         gain, offset = maps["gain"].values[band], maps["offset"].values[band]
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
@@ -343,7 +342,7 @@ def _fit_band(
         good &= rising
         # A gain that is off by dg is off by dg std(level) in counts, as the residuals are.
         scale = float(np.std(level))
-        good &= _inliers(gain * scale, good, threshold) & _inliers(residual, good, threshold)
+        good &= ~(outlying(gain * scale, good, threshold) | outlying(residual, good, threshold))
     level = _level(frames, good, band)
     gain, offset, _ = _least_squares(frames, level)
     error = (gain * frames + offset - level[:, np.newaxis])[:, good]
@@ -378,13 +377,13 @@ def _least_squares(frames: Array, level: Array) -> tuple[Array, Array, Mask]:
     return gain, level.mean() - gain * centre, rising
 
 
-def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
-    """Values [count] within `threshold` robust standard deviations of the good pixels' median."""
+def outlying(values: Array, good: Mask, threshold: float) -> Mask:
+    """Values farther than `threshold` robust standard deviations off the good pixels' median."""
     if not good.any():
         return good
     centre = np.median(values[good])
     scale = MAD * np.median(np.abs(values[good] - centre))
-    return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
+    return np.asarray(np.abs(values - centre) > threshold * max(scale, _ROUNDING))
 
 
 def _checked(correction: xr.Dataset) -> xr.Dataset:

@@ -14,7 +14,7 @@ from dbthermal import _numbers, _rows, schema
 from dbthermal import _samples as samples
 from dbthermal._arrays import Array, Mask
 from dbthermal._warnings import warned
-from dbthermal.correction._nonuniformity import OUTLIER
+from dbthermal.correction._nonuniformity import OUTLIER, outlying
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
 
@@ -35,7 +35,6 @@ _UNCORRECTED: Final = (
     "with gain and offset of these cameras, as of 'calibrate', renewed since the shutter's last "
     "event; no flag and no error bar has this error"
 )
-_ROUNDING = 0.01  # differences of the logarithm of the noise that are rounding [1]
 _BLOCK = 8_000_000  # samples of a block of rows
 
 
@@ -258,19 +257,13 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     """Pixels whose noise differs from that around them by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.log(level / usual)  # minus infinity where nothing changes
-    finite = np.isfinite(logarithm)
-    if not finite.any():
-        return np.asarray(level == 0)
-    centre = np.median(logarithm[finite])
-    scale = max(MAD * float(np.median(np.abs(logarithm[finite] - centre))), _ROUNDING)
-    return np.asarray((np.abs(logarithm - centre) > threshold * scale) | (level == 0))
+    return outlying(logarithm, np.isfinite(logarithm), threshold) | (level == 0)
 
 
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
     for rows in _rows.blocks(movie.shape, _BLOCK):
-        # A row more on each side: the neighbours.
         # Include a row of neighbours on either side.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
         changes = _changes(_samples(movie, slice(top, bottom)), stepped)
