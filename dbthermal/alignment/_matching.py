@@ -167,8 +167,18 @@ def _information(movies: Movies, shift: Array) -> Information:
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     size = tensor[0] + tensor[2]
     share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
-    tensor, gradient = tensor * share, gradient * share
+    tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
+
+
+def _positive(tensor: Array) -> Array:
+    """Tensors (3, y, x) without their negative eigenvalues, of noise that was subtracted."""
+    down, mixed, right = tensor
+    middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), mixed)
+    low, high = middle - root, np.maximum(middle + root, 0.0)
+    share = high / np.maximum(2.0 * root, np.finfo(np.float64).tiny)
+    unit = np.array([1.0, 0.0, 1.0])[:, np.newaxis, np.newaxis]
+    return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
 def start(movies: Movies, spline: Spline) -> Field | None:
