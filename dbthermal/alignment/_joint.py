@@ -267,14 +267,14 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
     for row in range(film.shape[2]):
         rows = slice(row * side, (row + 1) * side)
         block = counts.variable[:, :, rows]
-        block = block.where(schema.measured(block) & ~bad[rows]).astype(np.float64)
+        block = block.where(schema.measured(block) & ~bad[rows])
         # Mean level and mean change of pixels that all bands measure: a gap is no step.
-        level = block.mean("time")
+        level = block.mean("time", dtype=np.float64)
         level = level.where(level.notnull().all("band"))
-        change = (block - level).coarsen(squares, "mean", **rule)
-        number = (block - level).notnull().coarsen(squares, "sum", **rule)
+        change = block - level
+        number = change.notnull().coarsen(squares, "sum", **rule)
         pixels = level.notnull().coarsen(squares, "sum", **rule)
-        mean = change + level.coarsen(squares, "mean", **rule)
+        mean = change.coarsen(squares, "mean", **rule) + level.coarsen(squares, "mean", **rule)
         film[:, :, row] = mean.where(number > _COMMON * pixels).values[:, :, 0]
         covered[row] = pixels.values[0, 0] > 0
         release()
