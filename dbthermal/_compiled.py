@@ -201,5 +201,5 @@ def _of_code(code: CodeType, names: Mapping[str, Any], visited: dict[int, int]) 
         value = names.get(name)
         yield from _described(value, visited)
         if isinstance(value, ModuleType | type):
-            taken = (getattr(value, attribute, None) for attribute in code.co_names)
+            taken = map(vars(value).get, code.co_names)
             yield from _described([it for it in taken if isinstance(it, _USED)], visited)

@@ -259,22 +259,23 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
     counts, side = corrected["counts"], _side(corrected["counts"])
     if side == 1:
         return corrected
-    squares, rule = {"y": side, "x": side}, {"boundary": "trim"}
+    squares, films = {"y": side, "x": side}, counts.drop_vars(["y", "x"], errors="ignore")
     film = empty((*counts.shape[:2], *(size // side for size in counts.shape[2:])), np.float32)
     covered, bad = np.zeros(film.shape[2:], bool), np.zeros(counts.shape[2:], bool)
     if "status" in corrected:
         bad = (corrected["status"].values & int(schema.UNMEASURED)) != 0
     for row in range(film.shape[2]):
         rows = slice(row * side, (row + 1) * side)
-        block = counts.variable[:, :, rows]
+        block = films[:, :, rows].load()
         block = block.where(schema.measured(block) & ~bad[rows])
         # Mean level and mean change of pixels that all bands measure: a gap is no step.
         level = block.mean("time", dtype=np.float64)
         level = level.where(level.notnull().all("band"))
         change = block - level
-        number = change.notnull().coarsen(squares, "sum", **rule)
-        pixels = level.notnull().coarsen(squares, "sum", **rule)
-        mean = change.coarsen(squares, "mean", **rule) + level.coarsen(squares, "mean", **rule)
+        number = change.notnull().coarsen(squares, boundary="trim").sum()
+        pixels = level.notnull().coarsen(squares, boundary="trim").sum()
+        mean = change.coarsen(squares, boundary="trim").mean()
+        mean = mean + level.coarsen(squares, boundary="trim").mean()
         film[:, :, row] = mean.where(number > _COMMON * pixels).values[:, :, 0]
         covered[row] = pixels.values[0, 0] > 0
         release()

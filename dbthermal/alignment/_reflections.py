@@ -203,7 +203,7 @@ def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> A
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    chi = neighbour_mean(squares, resolved, _WIDE / level.factor)
+    chi = neighbour_mean(squares, resolved * 1.0, _WIDE / level.factor)
     return np.asarray(np.fmax(chi, 1.0) * field.variances(level.centres()))
 
 

@@ -257,7 +257,8 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     """Pixels whose noise differs from that around them by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logarithm = np.log(level / usual)  # minus infinity where nothing changes
-    return outlying(logarithm, np.isfinite(logarithm), threshold) | (level == 0)
+    outliers = outlying(logarithm, np.isfinite(logarithm), threshold)
+    return np.asarray(outliers | (level == 0))
 
 
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
