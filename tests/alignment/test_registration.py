@@ -185,7 +185,7 @@ def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     """The edges of two views correlate by chance: what keeps only these is no transform."""
     apart = np.eye(3)
     apart[0, 2] = 0.6 * SHAPE[1]
-    monkeypatch.setattr("dbthermal.alignment._registration._start", lambda *_: apart)
+    monkeypatch.setattr("dbthermal.alignment._registration._start", lambda *_: (0.99, apart))
     with pytest.raises(ValueError, match=r"band '9\.5': it shares 40% of the image"):
         alignment.register(views(np.eye(3)))
 
