@@ -68,7 +68,7 @@ STEPS = xr.DataArray([0.0, 0.1], {"band": BANDS}, dims="band")
 TRANSFORM = xr.DataArray(
     np.stack([np.eye(3)] * 2), {"band": BANDS}, dims=("band", "row", "column"), attrs={"units": "1"}
 )
-solve = partial(separation.solve, CAPTURE, CAMERA)
+solve: Callable[..., xr.Dataset] = partial(separation.solve, CAPTURE, CAMERA)
 calibrated = partial(solve, method="calibrated")
 completed = partial(separation.complete, RESULT, CAPTURE, CAMERA)
 Call = Callable[[], Any]

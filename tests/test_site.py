@@ -80,8 +80,8 @@ def test_formulas_are_drawn() -> None:
     to_mathml = pytest.importorskip(module, reason="the extra docs").tex2mathml
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text("utf-8"))["cells"]
-        text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
-        for formula in re.findall(r"\$\$?([^$]+)\$\$?", text):
+        prose = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+        for formula in re.findall(r"\$\$?([^$]+)\$\$?", prose):
             to_mathml(formula.strip())
     for path in sorted((ROOT / "dbthermal").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):

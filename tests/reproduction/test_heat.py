@@ -5,6 +5,7 @@ CJ is Carslaw, Jaeger (1959), Conduction of Heat in Solids, 2nd edition, Oxford.
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -204,7 +205,7 @@ def test_unevenly_spaced_times() -> None:
 TRIANGLE, FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), [[0, 1, 2]]
 
 
-def bent(vertices: Array, faces: object, thickness: float = 1e-3) -> Callable[[], object]:
+def bent(vertices: Array, faces: Any, thickness: float = 1e-3) -> Callable[[], object]:
     """Shell of some vertices and faces."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     return lambda: heat.Shell(mesh, thickness, heat.GLASS)

@@ -9,7 +9,7 @@ from captures import emissivity_of
 
 from dbthermal import schema, separation, simulation
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
-from reproduction.experiments.stress import INTERVAL
+from reproduction.experiments.scores import INTERVAL
 
 RIG: Final = simulation.Rig()
 TIME: Final = np.arange(300) / 10.0  # s

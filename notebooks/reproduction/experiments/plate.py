@@ -83,8 +83,9 @@ def recorded(
     if patch:
         reference = xr.zeros_like(calibration["bad"].isel(band=0, drop=True))
         reference[slice(*patch[:2]), slice(*patch[2:])] = True
-    options = {"time_constant": time_constant, "drift_reference": reference}
-    corrected = correction.correct_capture(capture, calibration, **options)
+    corrected = correction.correct_capture(
+        capture, calibration, time_constant=time_constant, drift_reference=reference
+    )
     # Bring both bands onto one grid and clock; find where the second sees the reflections.
     model, offset = taken["views"], 0.0 if taken["apart"] else None
     transform = alignment.register(corrected, model=model) if model else None
@@ -150,7 +151,7 @@ def scores(
     good, name = alone["status"] == 0, "object_temperature"
     usable = ~schema.has_flag(whole["status"], "dead_pixel", "invalid_samples")
     value = whole[name].where(usable)
-    sampled = np.isfinite(scene.corrected["counts"]).all("band") & usable  # that both cameras have
+    sampled = scene.corrected["counts"].notnull().all("band") & usable  # that both cameras have
     shares = {
         "good_pixels": good.mean(),
         "whole_finite": value.where(sampled).notnull().sum() / sampled.sum(),

@@ -29,8 +29,8 @@ def trial(emissivity: float, noise: float) -> Figure:
     share = xr.DataArray([emissivity, emissivity - DIFFERENCE], {"band": list(rig.bands)}, "band")
     # Simulate, observe and separate a few pixels, of which one is shown.
     time, rng = np.arange(_FRAMES) / _RATE, np.random.default_rng(_SEED)
-    pixels, ends = simulation.independent_pixels, {"start": 293.15, "stop": 333.15}  # [K]
-    scene = pixels(time, share, simulation.Background(), _PIXELS, rng, **ends)
+    pixels, background = simulation.independent_pixels, simulation.Background()
+    scene = pixels(time, share, background, _PIXELS, rng, start=293.15, stop=333.15)  # [K]
     capture = simulation.observe(scene, rig.response(), rng)
     result = separation.solve(capture, rig.response(), workers=1)
     figure = truth_and_estimate(scene, result, (0, 0))
