@@ -43,6 +43,8 @@ def as_path(path: Any) -> Path:
         raise TypeError(f"Invalid path {shown(path)}, a {kind}. Must be text or a path.")
     if "://" in os.fspath(path):
         raise FileNotFoundError(f"No file or folder '{path}', an address. Must be on this machine.")
+    if "\0" in os.fsdecode(path):
+        raise ValueError(f"Invalid path {shown(path)}. Must have no zero byte.")
     return Path(path)
 
 

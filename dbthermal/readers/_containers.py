@@ -63,7 +63,7 @@ def are_times(name: object, values: Any) -> bool:
 def attribute(values: Any, name: str) -> Any:
     """Attribute of an array, None if missing; ValueError for a list, which may take any memory."""
     attrs = getattr(values, "attrs", {})
-    if name not in attrs:
+    if (name := next((key for key in attrs if str(key).lower() == name.lower()), "")) == "":
         return None
     if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:
         raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")

@@ -31,7 +31,9 @@ _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
 # Names of variables, which are folders on any disk; coordinates are listed, parted by spaces.
-_NAME: Final = re.compile(r"(?!__|.{61})\w([\w.()+-]| (?=[\w(]))*(?<!\.)")
+_NAME: Final = re.compile(
+    r"(?!__|.{61}|(?i:con|prn|aux|nul|(com|lpt)\d)(\.|$))\w([\w.()+-]| (?=[\w(]))*(?<!\.)"
+)
 _RESERVED: Final = {integrity.GROUP, integrity.SUMS}
 
 # Attributes by which other values would be opened than are saved.
@@ -198,13 +200,14 @@ def _check(dataset: xr.Dataset) -> None:
             except (AttributeError, TypeError) as error:
                 label = f"Invalid attribute '{key}' of {owner}, of type {type(value).__name__}"
                 raise TypeError(f"{label}. Must be text, numbers, or lists of these.") from error
-    # Names and types of the variables.
+    # Names and types of the variables; some disks tell no capitals apart.
+    repeated = texts.repeated(str(name).lower() for name in dataset.variables)
     for name, variable in dataset.variables.items():
         listed = isinstance(name, str) and _NAME.fullmatch(name) and name not in _RESERVED
-        if not listed or (" " in str(name) and name in dataset.coords):
-            rule = (
-                "Must be at most 60 letters, digits, _ - + . ( ), or blanks unless of a coordinate"
-            )
+        alike = str(name).lower() in repeated
+        if not listed or alike or (" " in str(name) and name in dataset.coords):
+            rule = "Must be at most 60 letters, digits, _ - + . ( ), or blanks unless of a "
+            rule += "coordinate, of no device, and differ in more than capitals"
             raise ValueError(f"Invalid name {texts.shown(name)}. {rule}: a folder has it.")
         if not all(length >= 0 for length in variable.shape):  # NaN in arrays of dask
             rule = "Must have known sizes, as from compute_chunk_sizes() of dask"

@@ -25,7 +25,7 @@ from zarr.core.buffer import Buffer
 
 from dbthermal.schema import COORDINATES, Variable
 from dbthermal.store import _integrity as integrity
-from dbthermal.store._whole import replace, tree_to_disk, whole
+from dbthermal.store._whole import replace, take, tree_to_disk, whole
 
 Values = npt.NDArray[Any]
 
@@ -254,6 +254,7 @@ class HeldFolder:
     def __init__(self, folder: Path, path: Path | None = None) -> None:
         self._path, self._descriptor = path or folder, os.open(folder, os.O_RDONLY)
         self.close = weakref.finalize(self, os.close, self._descriptor)
+        take(self._descriptor)  # so that no output replaces it
         self._link = Path(f"/proc/self/fd/{self._descriptor}")
         self.root = self._link if self._link.exists() else self._path.absolute()
 

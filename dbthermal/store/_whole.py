@@ -48,9 +48,17 @@ def check_place(path: str | Path, suffix: str) -> Path:
     if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
         rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
         raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
-    for folder in path.resolve().parents:
-        if (folder / SUMS).is_file():
-            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{folder}'.")
+    if path.is_dir() and fcntl:
+        folder = os.open(path, os.O_RDONLY)
+        try:
+            if not take(folder, shared=True):
+                rule = "Must end first, or another output be named"
+                raise BlockingIOError(f"Busy output '{path}': a recording writes to it. {rule}.")
+        finally:
+            os.close(folder)
+    for parent in path.resolve().parents:
+        if (parent / SUMS).is_file():
+            raise ValueError(f"Invalid path '{path}', inside a store. Must be outside '{parent}'.")
     return path
 
 
@@ -157,14 +165,22 @@ def _lock(folder: Path, path: Path) -> int | None:
 
 def _lock_file(lock: int) -> str:
     """Lock an open file and empty it, or return the name that is written in it."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(lock, 0)
-    except BlockingIOError:
+    if not take(lock):
         return os.read(lock, 200).decode(errors="replace") or "another process"
+    with suppress(OSError):
+        os.ftruncate(lock, 0)
+    return ""
+
+
+def take(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open file or folder until it is closed; False if another process has done so."""
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
     except (AttributeError, OSError):  # a system, or a disk, that knows no locks
         pass
-    return ""
+    return True
 
 
 def _sign(lock: int, name: str, folder: Path) -> None:
