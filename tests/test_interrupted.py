@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -72,14 +71,13 @@ def start(
     """Command in a process of its own, which acts at a file operation of its output."""
     words = COMMANDS[command].split()
     words[-1] = output or words[-1]
-    return subprocess.Popen(
-        [sys.executable, "-c", HOOK, str(place), act, *words, "--overwrite"],
-        cwd=folder,
-        text=True,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    return started(folder, HOOK, str(place), act, *words, "--overwrite")
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """Program in a process of its own."""
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen([sys.executable, "-c", *words], cwd=folder, text=True, **pipes)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -159,44 +157,28 @@ def test_two_commands_at_one_output(folder: Path, command: str, second: str) -> 
     clean(folder)
 
 
-FIRST = """
+RECORDING = """
 import sys
-from pathlib import Path
 import numpy as np
-import xarray as xr
 from dbthermal import schema, store
-if sys.argv[1] == "cache":
-    from reproduction import cache
-    def drawn():
-        print("waiting", flush=True)
-        sys.stdin.readline()
-        return xr.Dataset({"a": ("n", np.random.default_rng().random(9))})
-    experiment = cache.kept(drawn, Path("cache"))
-    experiment()
-    print(*experiment()["a"].values)
-else:
-    made = {"counts": schema.STAGES["capture"]["counts"]}
-    options = {"sizes": {"y": 3, "x": 4}, "bands": ["a"], "chunk": 2, "attrs": {}}
-    recording = store.Recording("x.zarr", made, **options)
-    print("waiting", flush=True)
-    sys.stdin.readline()
-    recording.append("a", {"counts": np.ones((2, 3, 4), "u2")})
-    recording.commit()
-    recording.close(time=np.arange(2.0))
+options = {"sizes": {"y": 3, "x": 4}, "bands": ["a"], "chunk": 2, "attrs": {}}
+recording = store.Recording("x.zarr", {"counts": schema.STAGES["capture"]["counts"]}, **options)
+print("waiting", flush=True)
+sys.stdin.readline()
+recording.append("a", {"counts": np.ones((2, 3, 4), "u2")})
+recording.commit()
+recording.close(time=np.arange(2.0))
 """
 
 
 def test_two_processes_at_one_recording(folder: Path) -> None:
     """Neither a second recording nor an output replaces one that grows; both say why."""
-    command = [sys.executable, "-c", FIRST, "recording"]
-    pipes: dict[str, Any] = {"cwd": folder, "text": True, "stdin": subprocess.PIPE}
-    pipes |= {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    first = subprocess.Popen(command, **pipes)
+    first = started(folder, RECORDING)
     assert first.stdout is not None
     assert first.stdout.readline() == "waiting\n"
-    status, error = end(subprocess.Popen(command, **pipes))
+    status, error = end(started(folder, RECORDING))
     assert status == 1
-    assert "x.zarr" in error.splitlines()[-1]
+    assert "There is something at 'x.zarr'. Must be a new recording" in error
     status, error = end(start(folder, "correct"))
     assert status == 1
     assert "Busy output 'x.zarr': a recording writes to it. Must end first" in error
@@ -204,20 +186,6 @@ def test_two_processes_at_one_recording(folder: Path) -> None:
     assert store.open_dataset(folder / "x.zarr").sizes["time"] == 2
     assert beside(folder) == ["x.zarr"]
     clean(folder)
-
-
-def test_two_processes_at_one_cache(folder: Path) -> None:
-    """Both compute an experiment at once: each has a whole result, and one of them is kept."""
-    command = [sys.executable, "-c", FIRST, "cache"]
-    pipes: dict[str, Any] = {"cwd": folder, "text": True, "stdin": subprocess.PIPE}
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, **pipes) for _ in range(2)]
-    for process in both:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "waiting\n"
-    results = [process.communicate("\n", timeout=600)[0] for process in both]
-    assert all(len(result.split()) == 9 for result in results)
-    (kept,) = (folder / "cache").rglob("*.pkl")
-    assert not [path for path in kept.parent.iterdir() if path != kept]
 
 
 def test_control_characters_are_shown(folder: Path) -> None:

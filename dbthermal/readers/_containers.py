@@ -322,21 +322,13 @@ def _zstd(packed: bytes, size: int) -> bool:
     return width > 0 and stated + 256 * (width == 2) == size
 
 
-def _lzf(packed: bytes, size: int) -> bool:
-    """Tell whether a piece of LZF unpacks to a size; an error if to more."""
-    decode = recordings.optional("imagecodecs", "recordings").lzf_decode
-    return len(decode(packed, header=False, out=size)) == size
-
-
 def _unpacks(make: Callable[[], Any]) -> Callable[[bytes, int], bool]:
     """Test whether a piece, with no other behind it, unpacks to a size; never farther."""
-
-    def test(packed: bytes, size: int) -> bool:
-        stream = make()
-        length = len(stream.decompress(packed, size + 1))
-        return length == size and bool(stream.eof) and not stream.unused_data
-
-    return test
+    return lambda packed, size: (
+        len((stream := make()).decompress(packed, size + 1)) == size
+        and stream.eof
+        and not stream.unused_data
+    )
 
 
 # Test by compressor whether a piece unpacks to a size, beyond which it would take any memory.
@@ -346,7 +338,9 @@ _UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
     ),
     "lz4": lambda packed, size: int.from_bytes(packed[:4], "little") == size,
     "lz4 of HDF5": lambda packed, size: int.from_bytes(packed[:8]) == size,
-    "lzf": _lzf,
+    "lzf": lambda packed, size: (
+        len(import_module("imagecodecs").lzf_decode(packed, header=False, out=size)) == size
+    ),
     "zstd": _zstd,
     "gzip": _unpacks(lambda: zlib.decompressobj(31)),
     "zlib": _unpacks(zlib.decompressobj),

@@ -156,7 +156,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     name, settings = method.name, _checked_settings(method, settings)
     schema.check_corrected(corrected)
-    _check_status(corrected)
+    _check_flags(corrected)
     bands = [str(band) for band in corrected["band"].values]
     rule = "two or more" if method.any_bands else "exactly two"
     if len(bands) < 2 or (len(bands) > 2 and not method.any_bands):
@@ -172,7 +172,6 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if pool is not None and not method.pools:
         raise ValueError(f"Invalid pool for method '{name}', which does not pool.")
     capture = corrected[[variable for variable in _READ if variable in corrected]]
-    _check_segment(capture)
     if mask is not None:
         dims = ("time",), ("y", "x"), ("time", "y", "x")
         used = _selection(capture, mask, "mask", "b", *dims)
@@ -218,39 +217,21 @@ def _checked_settings(method: Method, settings: Any) -> Any:
     return settings
 
 
-def _check_status(corrected: xr.Dataset) -> None:
-    """Check the status that a capture brings along: (y, x), whole numbers of known bits."""
-    if "status" not in corrected:
-        return
-    status = corrected["status"]
-    if status.dims != ("y", "x") or status.dtype.kind not in "ui":
-        raise ValueError(
-            f"Invalid status {status.dims} of {status.dtype}. Must be ('y', 'x') of whole numbers."
-        )
-    unknown = status.values.astype(np.int64) & ~sum(Status)
-    if np.any(unknown):
-        raise ValueError(
-            f"Unknown bits {int(unknown.max())} in the status. Must be of {list(Status.bits())}."
-        )
-
-
-def _check_segment(capture: xr.Dataset) -> None:
-    """Check the number of shutter events before each frame, `segment` (time)."""
-    if "segment" not in capture:
-        return
-    segment = capture["segment"]
-    falling = segment.dtype.kind in "iu" and np.any(np.diff(segment.values.astype(int)) < 0)
-    if segment.dims != ("time",) or segment.dtype.kind not in "iu" or falling:
-        raise ValueError(
-            f"Invalid segment {segment.dims} of {segment.dtype}. Must be ('time',) of whole "
-            "numbers that do not fall."
-        )
-    events, frames = len(np.unique(segment)) - 1, segment.size
-    if events > frames // 4:
-        raise ValueError(
-            f"Invalid segment: {events} shutter events in {frames} frames. "
-            "Must be at most one in four."
-        )
+def _check_flags(corrected: xr.Dataset) -> None:
+    """Check the bits of `status`, and the shutter events before each frame, `segment`."""
+    if "status" in corrected:
+        unknown = corrected["status"].values.astype(np.int64) & ~sum(Status)
+        if np.any(unknown):
+            rule = f"Must be of {list(Status.bits())}"
+            raise ValueError(f"Unknown bits {int(unknown.max())} in the status. {rule}.")
+    if "segment" in corrected:
+        segment = corrected["segment"].values.astype(int)
+        if np.any(np.diff(segment) < 0):
+            raise ValueError("Invalid segment, which falls. Must be whole numbers that do not.")
+        events = len(np.unique(segment)) - 1
+        if events > segment.size // 4:
+            label = f"{events} shutter events in {segment.size} frames"
+            raise ValueError(f"Invalid segment: {label}. Must be at most one in four.")
 
 
 def _selection(
@@ -325,7 +306,6 @@ def _noise_factor(capture: xr.Dataset) -> Array | float:
     """Noise (band) [1] over that before the alignment, 1 without a variable `noise_factor`."""
     if "noise_factor" not in capture:
         return 1.0
-    schema.check_variable(capture["noise_factor"], schema.NOISE_FACTOR, "'noise_factor'")
     factor = capture["noise_factor"].values.astype(np.float64)
     return planck.require_positive("noise_factor of the corrected", factor)
 
@@ -334,7 +314,6 @@ def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
     """Deviation (band) [K] of a residual fixed pattern, None without a variable `pattern_std`."""
     if "pattern_std" not in capture:
         return None
-    schema.check_variable(capture["pattern_std"], schema.PATTERN_STD, "'pattern_std'")
     counts = capture["pattern_std"].values.astype(np.float64)
     if not np.all((counts >= 0) & schema.measured(counts)):
         values = counts.tolist()

@@ -157,7 +157,8 @@ def samples(rng: Rng) -> Attack:
     what, spoilt = hurt(rng, _SPOILS, made.counts()[band])
     made.capture = made.put(band, spoilt)
     method, what = any_method(rng, bands), f"{what} in band {band}"
-    return solving(what, made, None, method, "counts|frame|sample|noise")
+    limit = "counts cut to coarse steps look like rounded ones" if "coarse" in what else ""
+    return replace(solving(what, made, None, method, "counts|frame|sample|noise"), limit=limit)
 
 
 def clocks(rng: Rng) -> Attack:

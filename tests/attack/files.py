@@ -172,7 +172,17 @@ def shards(rng: Rng) -> Attack:
 
 
 _CHARACTERS: Final = "aZ_9.-+() /\\\n\r\x00\x1b\u202e\u00e9\u0301\ud800:*\"'%#~"
-_WORDS: Final = ("counts", "zarr.json", "checksums.sfv", "c", "c/0", "..", "", "__x", "a" * 300)
+_WORDS: Final = (
+    "counts",
+    "zarr.json",
+    "checksums.sfv",
+    "c/0",
+    "..",
+    "",
+    "__x",
+    "com1.x",
+    "a" * 300,
+)
 
 
 def names(rng: Rng) -> Attack:
@@ -181,6 +191,8 @@ def names(rng: Rng) -> Attack:
     name, path = pick(rng, [*_WORDS, *[random] * 20]), Path(_workplace().name) / "names.zarr"
     time, values = pick(rng, ["time", name]), np.arange(3.0)
     given = xr.Dataset({"a": ("time", values)}).assign_coords({name: (time, values)})
+    if alike := bool(rng.random() < 0.1):  # on some disks
+        given = given.assign({name.swapcase(): ("time", values)})
     given = given if rng.random() < 0.5 else given.reset_coords(drop=False)
 
     def act() -> xr.Dataset:
@@ -189,10 +201,11 @@ def names(rng: Rng) -> Attack:
         return store.open_dataset(path).load()
 
     def judge(opened: xr.Dataset) -> Verdict:
-        return wrong("other names", where=not opened.drop_attrs().identical(given))
+        twice = alike and name.swapcase() != name
+        return wrong("other names", where=twice or not opened.drop_attrs().identical(given))
 
     plain = re.fullmatch(r"[a-zA-Z][\w-]*", name, re.ASCII) and len(name) <= 60
-    return Attack(f"name {name!r}", act, judge, ("name",), good=bool(plain))
+    return Attack(f"name {name!r}", act, judge, ("name",), good=bool(plain) and not alike)
 
 
 _OPERATIONS: Final = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")

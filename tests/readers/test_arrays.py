@@ -413,18 +413,6 @@ def test_filters_of_hdf5(tmp_path: Path) -> None:
         read(chunked(path, b"x", {1: (6,)}, chunks=(400, 1000, 1000)))
 
 
-def test_trees_of_hdf5(tmp_path: Path) -> None:
-    """Groups that are very deep, or very many objects, are refused before they are listed."""
-    path = hdf5(tmp_path / "a.h5", **{"/".join("a" * 40): 1})
-    with pytest.raises(ValueError, match=r"Invalid tree of .* objects, 33 deep"):
-        read(path)
-    with h5py.File(path, "w") as file:
-        for number in range(4100):
-            file.create_group(f"{number}")
-    with pytest.raises(ValueError, match="Invalid tree of 4097 objects"):
-        read(path)
-
-
 def test_chunks_are_not_too_many(tmp_path: Path) -> None:
     """Chunks of a few bytes, of which HDF5 takes kilobytes for each, are limited."""
     with h5py.File(path := tmp_path / "a.h5", "w") as file:
@@ -520,21 +508,6 @@ def test_time_along_another_axis_is_noticed(axis: int) -> None:
         read(counts)
         with pytest.warns(UserWarning, match=rf"Axis {axis} of 'array' may be time.* transpose"):
             read(np.moveaxis(counts, 0, axis))
-
-
-def test_a_lazy_array_is_as_it_says() -> None:
-    """Blocks of dask that are not of the type or the shape that was declared are refused."""
-    array = pytest.importorskip("dask.array")
-    frames = array.from_array(scene(), chunks=(1, 24, 32))
-    assert_array_equal(read(frames).counts, scene())
-    for change in (
-        lambda block: block - 17999.5,
-        lambda block: block.astype("i4") - 20000,
-        lambda block: block.astype("u4"),
-        lambda block: block[:, :9],
-    ):
-        with pytest.raises((TypeError, ValueError), match="Must be"):
-            read(frames.map_blocks(change, dtype="u2", meta=np.empty((0, 0, 0), "u2")))
 
 
 def test_headers_and_members_of_npz(tmp_path: Path) -> None:

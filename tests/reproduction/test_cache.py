@@ -1,6 +1,10 @@
 """Cache of experiments: a result is computed once, and again if code or file changed."""
 
+import multiprocessing
+import os
+import time
 import zlib
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +47,30 @@ def test_a_result_is_computed_once(tmp_path: Path, marks: Path) -> None:
     assert calls(marks) == 3
     experiment(str(marks), 1.0, seed=2)
     assert calls(marks) == 4
+
+
+def met(folder: str) -> xr.Dataset:
+    """Something random, once two processes are here."""
+    (Path(folder) / f"{os.getpid()}").touch()
+    while len(list(Path(folder).iterdir())) < 2:
+        time.sleep(0.01)
+    return xr.Dataset({"drawn": ("n", np.random.default_rng().random(300))})
+
+
+def result_of(folder: str) -> xr.Dataset:
+    """Result of `met`, kept beside a folder."""
+    result: xr.Dataset = cache.kept(met, Path(folder).parent / "kept")(folder)
+    return result
+
+
+def test_two_processes_at_once(tmp_path: Path, marks: Path) -> None:
+    """Each has a whole result, and one of them is kept, with nothing beside it."""
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        results = list(pool.map(result_of, [str(marks)] * 2))
+    assert not results[0].identical(results[1])
+    (kept,) = (path for path in (tmp_path / "kept").rglob("*") if path.is_file())
+    assert kept.suffix == ".pkl"
+    assert any(result_of(str(marks)).identical(result) for result in results)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed", "no pickle"])

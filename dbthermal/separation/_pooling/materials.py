@@ -258,11 +258,8 @@ def _checked(
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
         if not 0 < _numbers.real_number(name, value) < 1:
             raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
-    for name in _NEEDED:
-        if name not in result:
-            raise ValueError(f"Missing '{name}' in the result. Must be one of `solve`.")
-        label = f"'{name}' of the result"
-        schema.check_variable(result[name], schema.STAGES["separated"][name], label)
+    names = [name for name in schema.STAGES["separated"] if name in _NEEDED or name in result]
+    schema.check(result, "separated", names, "the result")
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
         raise ValueError(
             f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
