@@ -227,7 +227,7 @@ def _check_flags(corrected: xr.Dataset) -> None:
     if "segment" in corrected:
         segment = corrected["segment"].values.astype(int)
         if np.any(np.diff(segment) < 0):
-            raise ValueError("Invalid segment, which falls. Must be whole numbers that do not.")
+            raise ValueError("Invalid falling segment. Must be whole numbers that do not fall.")
         events = len(np.unique(segment)) - 1
         if events > segment.size // 4:
             label = f"{events} shutter events in {segment.size} frames"

@@ -48,7 +48,7 @@ def check_place(path: str | Path, suffix: str) -> Path:
     if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
         rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
         raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
-    if path.is_dir() and fcntl:
+    if path.is_dir() and os.name != "nt":
         folder = os.open(path, os.O_RDONLY)
         try:
             if not take(folder, shared=True):

@@ -136,7 +136,12 @@ def test_bad_input_is_a_clear_error(small: Inputs) -> None:
     wrong: list[tuple[xr.Dataset, xr.Dataset, dict[str, Any], str]] = [
         (result, capture, {"error_rate": 0.0}, r"Invalid error_rate 0\.0\. Must lie in"),
         (result, capture, {"resolution": 1.5}, r"Invalid resolution 1\.5\. Must"),
-        (result.drop_vars("reflection_ratio"), capture, {}, "Missing 'reflection_ratio' in the"),
+        (
+            result.drop_vars("reflection_ratio"),
+            capture,
+            {},
+            "Missing variable 'reflection_ratio' in the",
+        ),
         (result.isel(band=[1]), capture, {}, "Missing band '8-14' in the result"),
         (result.isel(x=slice(9)), capture, {}, "size 9 of 'x' of the result. Must be .* 64"),
         (result, turned, {}, "Invalid dims"),
