@@ -156,13 +156,14 @@ class Explorer(anywidget.AnyWidget):
         """Answer panes at a frame, and on which side of an isotherm their pixels are."""
         names, level, less = request["panes"], request["isotherm"], request.get("reference")
         frames = {name: self._frame(name, request) for name in names}
-        limits = zip(names, request["limits"], strict=True)
+        limits = [*zip(names, request["limits"], strict=True)]
         ranges = {name: limit or self._range(name) for name, limit in limits}
-        for name in (name for name in names if less is not None and self._is_film(name)):
-            reach = 0.5 * (self._range(name)[1] - self._range(name)[0])
-            ranges[name] = ranges[name] if request["limits"][names.index(name)] else (-reach, reach)
+        for name, limit in limits if less is not None else ():
+            if limit is None and self.view.panes[name].kind == "film":
+                reach = 0.5 * (self._range(name)[1] - self._range(name)[0])
+                ranges[name] = (-reach, reach)
+        level = level if less is None else None
         lined = [name for name in names if level is not None and self.view.panes[name].absolute]
-        lined = lined if less is None else []
         sides = [
             np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
             for name in lined
@@ -174,13 +175,10 @@ class Explorer(anywidget.AnyWidget):
         codes = [quantised(frames[name], *ranges[name]) for name in names]
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
-    def _is_film(self, name: str) -> bool:
-        return self.view.panes[name].kind == "film"
-
     def _frame(self, name: str, request: dict[str, Any]) -> Values:
         """Frame of a pane, of a film less that of reference if there is one."""
         frame, less = self.view.frame(name, request["index"]), request.get("reference")
-        if less is None or not self._is_film(name):
+        if less is None or self.view.panes[name].kind != "film":
             return frame
         return np.asarray(frame - self.view.frame(name, less))
 
@@ -197,16 +195,10 @@ class Explorer(anywidget.AnyWidget):
         """Answer values and flags of a pixel."""
         place = [request[name] for name in ("index", "row", "column")]
         answer = self.view.probe(request["panes"], *place)
-        if request.get("reference") is not None:  # a difference, without its deviation
-            values = {
-                name: float(self._frame(name, request)[place[1], place[2]])
-                for name in answer["values"]
-                if self._is_film(name)
-            }
-            answer["values"] |= {
-                name: (value if np.isfinite(value) else None, None)
-                for name, value in values.items()
-            }
+        for name in answer["values"] if request.get("reference") is not None else ():
+            value = float(self._frame(name, request)[place[1], place[2]])
+            if self.view.panes[name].kind == "film":  # a difference, without its deviation
+                answer["values"][name] = (value if np.isfinite(value) else None, None)
         return {**answer, "at": place}, []
 
     def _answer_curves(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
