@@ -178,6 +178,7 @@ def filled(
         fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
         level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
+    del sample  # before the blocks take memory
     lacking = empty(result[FILMS[0]].shape, np.bool_)  # samples of a result without a film
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_complete_rows, scene, result, lacking), inputs.blocks))

@@ -34,6 +34,8 @@ _FLUCTUATION: Final = 2.0
 _LEAST: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
+_MOST: Final = 2**22  # samples of a band of these, down to _FEW pixels of a long capture
+_FEW: Final = 64
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
 # Chance by which a pixel tells other emissivities than its material's: of three deviations.
@@ -93,7 +95,8 @@ class Scene:
         """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
         capture = self.inputs.capture
         numbers = np.arange(self.source.size).reshape(capture.sizes["y"], capture.sizes["x"])
-        every = slice(None, None, max(1, int(np.sqrt(self.source.size / _SAMPLE))))
+        number = min(_SAMPLE, max(_FEW, _MOST // capture.sizes["time"]))
+        every = slice(None, None, max(1, int(np.sqrt(self.source.size / number))))
         return *self.tile(capture.isel(y=every, x=every).load()), numbers[every, every].ravel()
 
 
