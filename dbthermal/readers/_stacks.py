@@ -132,7 +132,8 @@ def tiff(
     stored = sum(length for page in pages for _, length in page.spans)
     recordings.check_memory(shape, memory, name, stored)
     seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    places = recordings.numbered(paths) if np.ndim(clock) == 0 and shape[0] == len(paths) else None
+    is_rate = np.ndim(0.0 if clock is None else clock) == 0
+    places = recordings.numbered(paths) if is_rate and shape[0] == len(paths) else None
     if places is not None:
         missing = int(places[-1]) + 1 - len(paths)
         rule = "Must be all that were recorded: there are gaps in time in their place"

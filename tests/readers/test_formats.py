@@ -91,7 +91,7 @@ def test_texts_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], nam
 
 def test_zarr_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An array or group of zarr that dbthermal has not saved is a recording, with its times."""
-    zarr.save_array(tmp_path / "a.zarr", scene())
+    zarr.create_array(tmp_path / "a.zarr", data=scene())
     film = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
     moments = np.datetime64("2026-01-01", "ns") + np.arange(3) * np.timedelta64(100, "ms")
     film = film.assign_coords(time=moments)
