@@ -22,6 +22,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.separation._subspace import joining, kernels, pieces
 from dbthermal.separation._subspace.kernels import compiled
@@ -30,7 +31,6 @@ from dbthermal.separation._tiles import Whole
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**13
 _BLOCK: Final = 8
-_WITHIN: Final = 8  # levels of pieces whose costs by all axes stay in it
 
 
 class Tree(NamedTuple):
@@ -58,13 +58,13 @@ class Scratch(NamedTuple):
     fitted: Array
     axes: Array  # to start from (2, axis), and the weights of the elements of a scatter (3, axis)
     weights: Array
-    least: Array  # cost of the best division of a piece (piece, axis), of some, and of those in one
-    within: Array
-    halved: Mask  # (piece)
+    least: Array  # cost of the best division of each piece (piece, axis)
     starting: Array  # cost of the best division (axis)
     joined: joining.Scratch
     reached: Whole  # pieces whose halves may be used
-    cheapest: Array  # costs of pieces
+    axis: Array  # the same of one axis
+    weight: Array
+    cheapest: Array
     taken: Array  # axes of divisions (division, 2), costs, and the frames that pieces begin with
     costs: Array
     begins: Mask  # (division, time)
@@ -90,7 +90,7 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> l
     The second one is that of the other line, if there is one, and costs more. The axis of a
     material may be `stated` (2, pixel), NaN for others.
     """
-    tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
+    tree = _tree(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = white.shape[1:]
     count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(stated).any())
     scratch = Scratch(
@@ -102,13 +102,13 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> l
         fitted=np.empty((3, count)),
         axes=np.empty((2, axes)),
         weights=np.empty((3, axes)),
-        least=np.empty((max(1, count >> (_WITHIN - 1)), axes)),
-        within=np.empty((2**_WITHIN, axes)),
-        halved=np.empty(count, dtype=bool),
+        least=np.empty((count, axes)),
         starting=np.empty(axes),
         joined=_joining(count // 2 + 1, tree.event),
         reached=np.empty(count, np.intp),
-        cheapest=np.empty(count),
+        axis=np.empty((2, 1)),
+        weight=np.empty((3, 1)),
+        cheapest=np.empty((count, 1)),
         taken=np.empty((pieces.AXES, 2)),
         costs=np.empty(pieces.AXES),
         begins=np.empty((pieces.AXES, frames), dtype=bool),
@@ -143,32 +143,51 @@ def _joining(most: int, event: Mask) -> joining.Scratch:
 
 
 @lru_cache(maxsize=4)
-def _packed(times: bytes, events: bytes | None) -> Tree:
-    levels, time = pieces.tree(times, events), np.frombuffer(times)
-    every = [piece for level in levels for piece in level]
-    bases = [basis for _, basis, _ in every]
-    values = [_functions(bases, i) for i in range(len(bases))]
-    sizes = np.array([array.size for array in values])
-    columns = np.array([basis.shape[1] for basis in bases])
-    kept = np.where(np.arange(len(bases)) < len(bases) // 2, columns, 0)
-    begun = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
-    event = np.zeros(time.size, dtype=bool)
-    if events is not None:
-        event[1:] = np.diff(np.frombuffer(events, dtype=np.intp)) > 0
+def _tree(times: bytes, events: bytes | None) -> Tree:
+    """
+    Pieces of each level of halving, down to those whose polynomial is any curve.
+
+    From times [s] and the number of shutter events before each frame. Pieces begin beside events,
+    not at them.
+    """
+    time = np.frombuffer(times)
+    segment = np.zeros(time.size, np.intp) if events is None else np.frombuffer(events, np.intp)
+    event = np.diff(segment, prepend=segment[0]) > 0
+    levels = int(np.ceil(np.log2(time.size / smooth.PIECE_ORDER)))
+    edges = np.round(np.linspace(0, time.size, 2**levels + 1)).astype(np.intp)
+    for place in np.flatnonzero(event):
+        edges[1:-1][edges[1:-1] == place] += 1
+    bounds = [edges[:: 2 ** (levels - level)] for level in range(levels + 1)]
+    spans = np.concatenate([np.stack([bound[:-1], bound[1:]], 1) for bound in bounds])
+    every = [_functions(time[start:stop], segment[start:stop]) for start, stop in spans]
+    bases = [basis for basis, _ in every]
+    values = [_values(bases, i) for i in range(len(bases))]
+    sizes, columns = (np.array([*map(len, rows)]) for rows in (values, [b.T for b in bases]))
+    starts = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
     return Tree(
-        edges=np.array([(span.start, span.stop) for span, _, _ in every]),
+        edges=spans,
         columns=columns,
-        chosen=np.array([chosen for _, _, chosen in every]),
+        chosen=np.array([chosen for _, chosen in every]),
         places=np.cumsum(sizes) - sizes,
         values=np.concatenate(values),
-        held=np.append(0, np.cumsum(kept)),
-        starts=np.concatenate([array for array in begun if array[-1] < len(every)]),
+        held=np.append(0, np.cumsum(np.where(np.arange(len(every)) < len(every) // 2, columns, 0))),
+        starts=np.concatenate([start for start in starts if start[-1] < len(every)]),
         time=time,
         event=event,
     )
 
 
-def _functions(bases: list[Array], i: int) -> Array:
+def _functions(time: Array, segment: Whole) -> tuple[Array, int]:
+    """Functions of a piece (time, function), orthonormal, and how many are used to choose it."""
+    steps = smooth.camera_steps(segment)
+    order = max(1, min(smooth.PIECE_ORDER, time.size - len(steps)))
+    basis = smooth.polynomial_basis(time, order)
+    # Steps of the camera come first.
+    together = np.linalg.qr(np.column_stack([*steps, basis]))[0] if steps else basis
+    return together, len(steps) + (pieces.FUNCTIONS if time.size > smooth.PIECE_ORDER else order)
+
+
+def _values(bases: list[Array], i: int) -> Array:
     """Functions (time, function) of a piece, one after another, as `_scatters` takes them.
 
     On its halves they are combinations of theirs, but on the shortest.
@@ -232,58 +251,22 @@ def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
 
 
 @compiled
-def _best(tree: Tree, scratch: Scratch) -> None:
-    """Least cost of all divisions of each piece, by axis to start from."""
-    axes, weights = scratch.axes, scratch.weights
+def _best(tree: Tree, scratch: Scratch, axes: Array, weights: Array, least: Array) -> None:
+    """Cost of the best division of each piece by some axes (2, axis), in place (eq. 12)."""
     for j in range(axes.shape[1]):
         x, y = axes[0, j], axes[1, j]
         weights[0, j], weights[1, j], weights[2, j] = y * y, -2.0 * x * y, x * x
-    # The lowest levels are taken a part at a time, whose costs stay in the cache.
-    upper = max(1, (len(tree.edges) + 1) >> _WITHIN)
-    for root in range(upper - 1, 2 * upper - 1):
-        _best_within(tree, scratch, root, (len(tree.edges) + 1) // upper, scratch.within)
-        kernels.copy(scratch.within[0], scratch.least[root])
-    _best_within(tree, scratch, 0, upper, scratch.least)
-
-
-@compiled
-def _best_within(tree: Tree, scratch: Scratch, root: int, end: int, least: Array) -> None:
-    """As `_best`, of the levels from a piece downwards that have less than so many pieces."""
-    weights, inner, level = scratch.weights, len(tree.edges) // 2, end // 2
-    while level > 0:
-        for k in range(level):
-            i, place = (root + 1) * level - 1 + k, level - 1 + k
-            a, b, d = scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i]
-            price, result = pieces.COST * tree.chosen[i], least[place]
+    inner = len(tree.edges) // 2
+    for i in range(len(tree.edges) - 1, -1, -1):
+        # The piece as it is, or its halves.
+        a, b, d = scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i]
+        price, result = pieces.COST * tree.chosen[i], least[i]
+        for j in range(result.size):
+            result[j] = weights[0, j] * a + weights[1, j] * b + weights[2, j] * d + price
+        if i < inner:
+            left, right = least[2 * i + 1], least[2 * i + 2]
             for j in range(result.size):
-                result[j] = weights[0, j] * a + weights[1, j] * b + weights[2, j] * d + price
-            if i < inner:
-                left, right = least[2 * place + 1], least[2 * place + 2]
-                for j in range(result.size):
-                    result[j] = min(result[j], left[j] + right[j])
-        level //= 2
-
-
-@compiled
-def _halve(tree: Tree, scratch: Scratch, left_half: float, right_half: float) -> None:
-    """Find the pieces that are halved in the best division, by one axis."""
-    least, (a, b, d) = scratch.cheapest, scratch.scatter
-    for i in range(len(tree.edges)):
-        least[i] = (
-            right_half * right_half * a[i]
-            - 2.0 * left_half * right_half * b[i]
-            + left_half * left_half * d[i]
-        )
-        least[i] += pieces.COST * tree.chosen[i]
-    end = len(tree.edges) // 2
-    while end > 0:  # level by level
-        begin = end // 2
-        whole, below, halved = least[begin:end], least[end : 2 * end + 1], scratch.halved[begin:end]
-        for i in range(whole.size):
-            halves = below[2 * i] + below[2 * i + 1]
-            halved[i] = halves < whole[i] + pieces.TIE
-            whole[i] = min(halves, whole[i])
-        end = begin
+                result[j] = min(result[j], left[j] + right[j])
 
 
 @compiled
@@ -293,10 +276,13 @@ def _chosen(tree: Tree, scratch: Scratch, begins: Mask) -> tuple[float, float, f
     a, b, d = 0.0, 0.0, 0.0
     reached, count = scratch.reached, 1
     reached[0] = 0
-    inner, n = len(tree.edges) // 2, 0
+    inner, n, (p, q, r) = len(tree.edges) // 2, 0, scratch.weight[:, 0]
     while n < count:
         i = reached[n]
-        if i < inner and scratch.halved[i]:
+        # Halves that cost the same may be joined.
+        whole = p * scratch.scatter[0, i] + q * scratch.scatter[1, i] + r * scratch.scatter[2, i]
+        whole += pieces.COST * tree.chosen[i] + pieces.TIE
+        if i < inner and scratch.cheapest[2 * i + 1, 0] + scratch.cheapest[2 * i + 2, 0] < whole:
             reached[count], reached[count + 1] = 2 * i + 1, 2 * i + 2
             count += 2
         else:
@@ -315,7 +301,8 @@ def _refine(
     """Axis and division in turns: the axis, and the energy along it."""
     energy = 0.0
     for _ in range(pieces.ROUNDS):
-        _halve(tree, scratch, x, y)
+        scratch.axis[0, 0], scratch.axis[1, 0] = x, y
+        _best(tree, scratch, scratch.axis, scratch.weight, scratch.cheapest)
         x, y, energy = _axis(*_chosen(tree, scratch, begins))
     return x, y, energy
 
@@ -332,7 +319,7 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
         stated = not np.isnan(axis[0])
         axes[0, -1] = axis[0] if stated else axes[0, 0]
         axes[1, -1] = axis[1] if stated else axes[1, 0]
-    _best(tree, scratch)
+    _best(tree, scratch, axes, scratch.weights, scratch.least)
     kernels.copy(scratch.least[0], scratch.starting)
     angle = 0.0
     for number in range(pieces.AXES):

@@ -1,11 +1,10 @@
-"""Pieces of time for an object that changes rapidly: trees of them, and which pixels ask for them.
+"""Pieces of time for an object that changes rapidly: which pixels ask for them, and their outcome.
 
 Which are best is found in `division`.
 """
 
 from collections.abc import Iterable
 from functools import lru_cache
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -36,10 +35,6 @@ TIE: Final = 1e-6
 # Standard deviations between two axes that are told apart.
 APART: Final = 6.0
 
-Piece = tuple[slice, Array, int]
-"""Frames of a piece, its functions, orthonormal, and how many of them are used to choose."""
-
-
 # Time in which a sudden step is so large a share of the object's change [s].
 _AROUND: Final = 1.0
 _MOST: Final = 2.0 / 3.0
@@ -47,59 +42,6 @@ _MOST: Final = 2.0 / 3.0
 # returns.
 _PARTS: Final = 24
 _RETURNED: Final = 1.7
-
-
-@lru_cache(maxsize=4)
-def tree(time: bytes, segment: bytes | None) -> list[list[Piece]]:
-    """
-    Pieces of each level of halving.
-
-    From times [s] and the number of shutter events before each frame. Pieces begin beside events,
-    not at them; the steps of these come first among a piece's functions.
-    """
-    times = np.frombuffer(time)
-    events = None if segment is None else np.frombuffer(segment, dtype=np.intp)
-    # The polynomial of the shortest pieces is any curve.
-    levels = int(np.ceil(np.log2(times.size / smooth.PIECE_ORDER)))
-    edges = np.round(np.linspace(0, times.size, 2**levels + 1)).astype(np.intp)
-    for event in [] if events is None else np.flatnonzero(np.diff(events)) + 1:
-        edges[1:-1][edges[1:-1] == event] += 1
-    halved: list[list[Piece]] = []
-    for level in range(levels + 1):
-        bounds = edges[:: 2 ** (levels - level)]
-        halved.append([])
-        for (start, stop), basis in zip(pairwise(bounds), _bases(times, bounds), strict=True):
-            span, segments = slice(start, stop), None if events is None else events[start:stop]
-            if segments is not None and segments[0] < segments[-1]:
-                halved[-1].append((span, *functions(times[span].tobytes(), segments.tobytes())))
-            else:
-                chosen = FUNCTIONS if len(basis) > smooth.PIECE_ORDER else basis.shape[1]
-                halved[-1].append((span, basis, chosen))
-    return halved
-
-
-def _bases(times: Array, bounds: Whole) -> list[Array]:
-    """Polynomials (time, function) of each piece; those of one length at once."""
-    lengths, bases = np.diff(bounds), [np.empty((0, 0))] * (bounds.size - 1)
-    for length in np.unique(lengths):
-        places = np.flatnonzero(lengths == length)
-        order = min(smooth.PIECE_ORDER, int(length))
-        together = times[bounds[places, np.newaxis] + np.arange(length)]
-        for place, basis in zip(places, smooth.polynomial_basis(together, order), strict=True):
-            bases[place] = basis
-    return bases
-
-
-@lru_cache(maxsize=4096)
-def functions(time: bytes, segment: bytes | None) -> tuple[Array, int]:
-    """Functions of a piece (time, function), orthonormal, and how many are used to choose it."""
-    times = np.frombuffer(time)
-    steps = [] if segment is None else smooth.camera_steps(np.frombuffer(segment, dtype=np.intp))
-    order = max(1, min(smooth.PIECE_ORDER, times.size - len(steps)))
-    # Steps of the camera come first.
-    columns = [*steps, smooth.polynomial_basis(times, order)]
-    chosen = FUNCTIONS if times.size > smooth.PIECE_ORDER else order
-    return np.linalg.qr(np.column_stack(columns))[0], len(steps) + chosen
 
 
 @lru_cache(maxsize=16)
@@ -126,12 +68,11 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     mean = left + curve / (length * deviation)
     least = halves = cost = np.full((2, 1), np.inf)
     for level in range(levels - 2, -1, -1):
+        # Energy outside the functions of each piece of this level, and their cost.
         sums = mean.reshape(1 << level, -1, mean.shape[1])
-        suspect = [functions(total.tobytes(), None) for total in places.reshape(len(sums), -1)]
-        chosen = suspect[0][1]
-        held = np.stack([basis[:, :chosen] for basis, _ in suspect]).mT @ sums
+        held = smooth.polynomial_basis(places.reshape(len(sums), -1), FUNCTIONS).mT @ sums
         energy = np.einsum("itp,itp->ip", sums, sums) - np.einsum("ijp,ijp->ip", held, held)
-        cost = energy + COST * chosen
+        cost = energy + COST * FUNCTIONS
         halves = least[::2] + least[1::2] if level < levels - 2 else np.full_like(cost, np.inf)
         least = np.minimum(halves, cost)
     smoothly = (left**2).sum(axis=0) + COST * used
