@@ -1,7 +1,7 @@
 """Variances of the outputs of one pixel (eq. 8, 10), and if its residual is noise; compiled."""
 
 from math import log, sqrt
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import ndtri
@@ -9,7 +9,7 @@ from scipy.special import ndtri
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import kernels, regression, residuals
 from dbthermal.separation._subspace.kernels import inlined
-from dbthermal.separation._subspace.pixel import Line, Model, Ratio, Work, combined
+from dbthermal.separation._subspace.pixel import Line, Model, Work, combined
 
 # The background counts as resting within so many standard deviations, in that share of frames.
 WITHIN: Final = 3.0
@@ -19,15 +19,6 @@ RESTING: Final = 0.3
 OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
 # Bound of a 95 % interval of the normal distribution.
 NORMAL95: Final = float(ndtri(0.975))
-
-
-class Bars(NamedTuple):
-    """Variances of one pixel; those over time are in the work space."""
-
-    epsilon: float  # of the error of the null combination's ratios [1]
-    noise_variance: float
-    drift_variance: float
-    restless: bool
 
 
 @inlined
@@ -72,36 +63,32 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 
 @inlined
-def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
+def _linear(model: Model, record: Any, line: Line, limit: float, work: Work) -> float:
     r"""
     Variance [1] of the slope by a linear drift of size d, seen with a variance v.
 
     :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
     Weighted twice, for a large drift takes the weight from the frames that tell it best.
     """
-    drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
+    drift, frames, count = model.rising[0], work.first.size, record.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
-    slope, level, _ = regression.moments(emitted, drift, weights)
-    size, length = 0.0, 0.0
-    for t in range(frames):
-        part = weights[t] * (drift[t] - level - slope * emitted[t])
-        length += part * drift[t]
-        size += part * residual[t]
-    size /= length
-    # Once more, with the weights of the residual less that drift.
     inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
-    for t in range(frames):
-        off = residual[t] - size * (drift[t] - level - slope * emitted[t])
-        kept[t] = regression.bisquare(off * inverse)
-    slope, level, _ = regression.moments(emitted, drift, kept)
-    size, length = 0.0, 0.0
-    for t in range(frames):
-        kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
-        length += kernel[t] * drift[t]
-        size += kernel[t] * residual[t]
-    size /= length
+    kernels.copy(weights, kept)
+    slope, level, size, length = 0.0, 0.0, 0.0, 1.0
+    for turn in range(2):
+        # Once more with the weights of the residual less that drift.
+        for t in range(frames if turn > 0 else 0):
+            off = residual[t] - size * (drift[t] - level - slope * emitted[t])
+            kept[t] = regression.bisquare(off * inverse)
+        slope, level, _ = regression.moments(emitted, drift, kept)
+        size, length = 0.0, 0.0
+        for t in range(frames):
+            kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
+            length += kernel[t] * drift[t]
+            size += kernel[t] * residual[t]
+        size /= length
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
-    curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
+    curve = _curve_variance(model, kernel, count, record.null_variance, work)
     variance = (variance + work.emissivity[0] ** 2 * curve) / length**2
     before = max((limit / model.spread) ** 2, size**2 + variance)
     share = before / (before + variance)
@@ -109,7 +96,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
 
 
 @inlined
-def _propagate(model: Model, ratios: Ratio, epsilon: float, work: Work) -> bool:
+def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
     r"""
     Variance of the object, in place, and whether the background hardly rests.
 
@@ -118,7 +105,7 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, work: Work) -> bool:
     the width of its 95 % interval by Fieller's theorem (1954),
     doi:10.1111/j.2517-6161.1954.tb00159.x
     """
-    count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
+    count, null, noise = record.order + model.steps, record.null_variance, model.noise[0]
     sensitivity, smooth_variance, curve = work.sensitivity, work.smooth_variance, work.rapid
     first, frames, total, factors = work.emissivity[0], work.first.size, 0.0, work.factors
     kernels.combined(model.object_part, model.spans, work.coefficients[0], count, curve)
@@ -136,12 +123,12 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, work: Work) -> bool:
             sensitivity[t] += factor * emitted[t]
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times. The residual of a frame of rest holds both.
-    resting, more, leverage = 0.0, 1.0 + log(frames) / count, model.leverage
+    resting, more, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
     beside = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
     for t in range(frames):
         flat = 1.0 / work.steepness[t]
         sensitivity[t] *= flat
-        smooth_variance[t] = leverage[ratios.order - 1, t] * null * flat**2
+        smooth_variance[t] = leverage[t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
         resting += 1.0 if work.residual[t] ** 2 < WITHIN**2 * expected else 0.0
@@ -150,10 +137,10 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, work: Work) -> bool:
 
 
 @inlined
-def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -> Bars:
+def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> None:
     """Variances of emissivities, object and background, in place."""
     z, emitted, weights, kernel = work.first, work.emitted, work.weights, work.kernel
-    count, null, w = ratios.order + model.steps, ratios.null_variance, work.null_weights
+    count, null, w = record.order + model.steps, record.null_variance, work.null_weights
     # Kernel of the slope, sum k z; its variance, of the ordinate's noise and the abscissa's.
     total, product, reflected = 0.0, 0.0, 0.0
     for t in range(z.size):
@@ -167,7 +154,7 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -
     noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
     walk, upper = _walk(model, first**2 * null, count, work)
     limit = (1.0 - first) * model.drift
-    linear = _linear(model, ratios, line, limit, work)
+    linear = _linear(model, record, line, limit, work)
     drift_variance = (limit / kernels.range_of(emitted)) ** 2 + max(upper, linear)
     if line.known:
         noise_variance, drift_variance = work.material[2], work.material[3]
@@ -179,16 +166,17 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work, covariance: Any) -
     for m in range(w.size):
         work.level[m] = level * work.ratio[m] * model.rates[m]
         by_level += w[m] * work.level[m]
-    epsilon = ratios.inverse_energy * null + by_level**2
-    restless = _propagate(model, ratios, epsilon, work)
-    _background(model, ratios, epsilon, noise_variance + drift_variance, work)
-    _covariance(model, ratios, noise_variance + drift_variance, work, covariance)
-    return Bars(epsilon, noise_variance, drift_variance, restless)
+    epsilon = record.inverse_energy * null + by_level**2
+    record.restless = _propagate(model, record, epsilon, work)
+    _background(model, record, epsilon, noise_variance + drift_variance, work)
+    _covariance(model, record, noise_variance + drift_variance, work, covariance)
+    record.epsilon_variance = epsilon
+    record.noise_variance, record.drift_variance = noise_variance, drift_variance
 
 
 @inlined
 def _covariance(
-    model: Model, ratios: Ratio, slope_variance: float, work: Work, covariance: Any
+    model: Model, record: Any, slope_variance: float, work: Work, covariance: Any
 ) -> None:
     r"""
     Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
@@ -203,7 +191,7 @@ def _covariance(
         same = 1.0 if m == n else 0.0
         change[m, n] = (1.0 - first) * (first * k[m] * work.null_weights[n] + same)
         # Of the ratios (eq. 4), and through the background's level; the first one is 1.
-        error[m, n] = ratios.inverse_energy * (k[m] * k[n] * square + same * model.noise[m] ** 2)
+        error[m, n] = record.inverse_energy * (k[m] * k[n] * square + same * model.noise[m] ** 2)
         error[m, n] += work.level[m] * work.level[n]
     for m, n in np.ndindex(bands, bands):
         covariance[m, n] = k[m] * k[n] * slope_variance
@@ -213,7 +201,7 @@ def _covariance(
 
 
 @inlined
-def _background(model: Model, ratios: Ratio, epsilon: float, slope: float, work: Work) -> None:
+def _background(model: Model, record: Any, epsilon: float, slope: float, work: Work) -> None:
     r"""
     Variance of the background (eq. 10), in place.
 
@@ -230,8 +218,8 @@ def _background(model: Model, ratios: Ratio, epsilon: float, slope: float, work:
         length += (work.ratio[m] / noise[m]) ** 2
     # Through epsilon, (y - x) e_1 + r dx/deps; its covariance with v_1, w_1 s_1^2 sigma^2; and the
     # variance of s_1 v_1, (s_1^2 - 1 / |v|^2) sigma^2.
-    covariance = 2.0 * noise[0] ** 2 * work.null_weights[0] * ratios.inverse_energy
-    steady = (noise[0] ** 2 - 1.0 / length) * ratios.inverse_energy + slope / (1.0 - first) ** 2
+    covariance = 2.0 * noise[0] ** 2 * work.null_weights[0] * record.inverse_energy
+    steady = (noise[0] ** 2 - 1.0 / length) * record.inverse_energy + slope / (1.0 - first) ** 2
     for t in range(variance.size):
         contrast = work.background[t] - work.temperature[t]
         through = contrast * first + object_share * work.sensitivity[t]
@@ -277,10 +265,10 @@ def _pattern(model: Model, work: Work) -> None:
 
 
 @inlined
-def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
+def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
-    count, w, frames = ratios.order + model.steps, work.null_weights, work.first.size
+    count, w, frames = record.order + model.steps, work.null_weights, work.first.size
     if model.stepless:  # the smooth curves of the object are those of the signals
         kernels.copy(work.target, residual)
     else:
@@ -293,7 +281,7 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
         weight, signal = w[m], work.straight[m, :frames]
         for t in range(frames):
             residual[t] += weight * signal[t]
-    record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
+    record.correlation, record.delay, record.unexplained = _unsteady(model, record, work)
     for block in range(model.parts.size - 1):
         one, other = 0.0, 0.0
         # Whole numbers without a sign: an index from the end need not be looked for.
@@ -304,7 +292,7 @@ def judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> 
 
 
 @inlined
-def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
+def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool]:
     r"""
     Autocorrelation, delay of the bands, and whether the residual is noise.
 
@@ -317,14 +305,14 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
     Hilferty 1931, doi:10.1073/pnas.17.12.684). The delay is the largest score in magnitude.
     """
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
-    frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
+    frames, null, noise = residual.size, record.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
     lagged = 0.0
     for lag in range(1, residuals.LAGS + 1):
         lagged += kernels.dot(residual[lag:], residual[: frames - lag])
     correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
     common = work.null_weights[0] * noise**2
-    free = (frames - ratios.order - model.steps) * common
+    free = (frames - record.order - model.steps) * common
     # A matched filter with the differences between frames, of a band that is late or early.
     late, early, changes = free, -free, 0.0
     limit, steep[frames - 1] = residuals.CHANGE * sqrt(2.0) * noise, 0.0
@@ -347,12 +335,12 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
     return (
         correlation * sqrt(residuals.LAGS * frames),
         score,
-        _unexplained(model, ratios, work, common),
+        _unexplained(model, record, work, common),
     )
 
 
 @inlined
-def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
+def _unexplained(model: Model, record: Any, work: Work, common: float) -> bool:
     r"""
     Say whether the null residual r [K] is no white noise in some part of time.
 
@@ -362,7 +350,7 @@ def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool
     with :math:`h = z_1 - r \, w_1 s_1^2 / \sigma^2` of independent noise, is a chi-square variable.
     """
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
+    sums, together, share = work.sensitivity, 0.0, common / record.null_variance
     products, squares = work.kernel, work.mean
     for t in range(residual.size):
         independent = rapid[t] - share * residual[t]
@@ -376,13 +364,13 @@ def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool
             square += squares[t]
         sums[block] = total
         together += product**2 / square if square > 0 else 0.0
-    if together / ratios.null_variance > model.limits[0]:
+    if together / record.null_variance > model.limits[0]:
         return True
     edges, step = model.edges, 1
     while blocks > 1:
         for block in range(blocks):
             length = edges[(block + 1) * step] - edges[block * step]
-            if sums[block] ** 2 > model.limits[1] * ratios.null_variance * length:
+            if sums[block] ** 2 > model.limits[1] * record.null_variance * length:
                 return True
         blocks //= 2
         step *= 2

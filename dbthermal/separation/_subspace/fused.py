@@ -15,7 +15,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import inlined
-from dbthermal.separation._subspace.pixel import Model, Ratio, Work
+from dbthermal.separation._subspace.pixel import Model, Work
 from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
 
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
@@ -46,14 +46,14 @@ class Solution(Pixels):
     beyond: Mask  # temperatures outside the calibrated range (2, pixel)
     ratio: Array  # kappa: rapid change of each band over that of the first (band, pixel) [1]
     ratio_variance: Array  # (band, pixel) [1], with that through the background's level
-    inverse_energy: Array  # see `pixel.Ratio` (pixel)
+    inverse_energy: Array  # sigma^2 of eq. 4, infinite without background energy (pixel) [1/K^2]
     null_weights: Array  # w of eq. 5: no background, all of the object (band, pixel) [1]
-    null_variance: Array
-    order: Whole
+    null_variance: Array  # of its noise (pixel) [K^2]
+    order: Whole  # number of smooth functions used
     freedom: Whole  # frames less the functions of each scatter (3, pixel)
-    contrast: Array
-    reduced_chi2: Array
-    pooled: Mask
+    contrast: Array  # variance along the axis over that across it, at the largest order (pixel)
+    reduced_chi2: Array  # variance across the axis over the noise's, 1 if the model holds (pixel)
+    pooled: Mask  # the material's ratios are used, and the pixel does not contradict them
     scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at the
     # `rapid_orders` (3, band, band, pixel) [1]
     emissivity: Array  # (band, pixel) [1]
@@ -148,7 +148,9 @@ def _bent(model: Model, work: Work, frames: int) -> bool:
 
 
 @inlined
-def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, covariance: Any) -> Any:
+def _pixel(
+    model: Model, work: Work, films: Any, record: Any, vectors: Any, covariance: Any
+) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
     frames, bands = work.first.size, model.noise.size
     for m in range(bands):
@@ -156,27 +158,23 @@ def _pixel(model: Model, work: Work, films: Any, record: Any, vectors: Any, cova
         kernels.fill(work.removed[m, :frames], 0.0)
     gray, rounds = False, 0
     while True:
-        ratios = pixel.ratios(model, work)
-        line = pixel.emission(model, ratios, work, rounds)
+        pixel.ratios(model, work, record)
+        line = pixel.emission(model, record, work, rounds)
         pixel.background(model, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
         if rounds == 0:
-            gray = pixel.may_be_gray(model, ratios, work)
+            gray = pixel.may_be_gray(model, record, work)
         if rounds == pixel.BENDS or not _bent(model, work, frames):
             break
         rounds += 1
         _straighten(work, bands, frames)
-    deviations = bars.bars(model, ratios, line, work, covariance)
-    _write(model, ratios, work, record, vectors)
+    bars.bars(model, record, line, work, covariance)
+    _write(model, work, record, vectors)
     object_ = _film(work.temperature, work.variance, model, films[0], films[1])
     background = _film(work.background, work.background_variance, model, films[2], films[3])
     for i, judged in enumerate((object_, background)):
         record.lost[i], record.missing[i], record.beyond[i] = judged
-    record.gray, record.constant, record.restless = gray, line.constant, deviations.restless
-    record.epsilon_variance = deviations.epsilon
-    record.noise_variance = deviations.noise_variance
-    record.drift_variance = deviations.drift_variance
-    return ratios
+    record.gray = gray
 
 
 @inlined
@@ -191,7 +189,7 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
 
 
 @inlined
-def _scatters(model: Model, ratios: Ratio, work: Work, record: Any, matrices: Any) -> None:
+def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
     """Scatter less noise at the pixel's order and at `rapid_orders`, in place.
 
     Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
@@ -202,7 +200,7 @@ def _scatters(model: Model, ratios: Ratio, work: Work, record: Any, matrices: An
         _straighten(work, bands, frames)
         pixel.scatter(model, work)
     for place in range(3):
-        order = ratios.order
+        order = record.order
         if place > 0:
             order = max(1, orders - reflection_ratio.FEWER * (2 - place))
         for m in range(bands):
@@ -212,17 +210,14 @@ def _scatters(model: Model, ratios: Ratio, work: Work, record: Any, matrices: An
 
 
 @inlined
-def _write(model: Model, ratios: Ratio, work: Work, record: Any, vectors: Any) -> None:
-    """Ratios and emissivities, and numbers of step 1."""
+def _write(model: Model, work: Work, record: Any, vectors: Any) -> None:
+    """Ratios, their variances, null combination and emissivities, in place."""
     noise = model.noise
     for m in range(noise.size):
         vectors[0, m], vectors[2, m] = work.ratio[m], work.null_weights[m]
         vectors[3, m] = work.emissivity[m]
         error = noise[m] ** 2 + (work.ratio[m] * noise[0]) ** 2 if m > 0 else 0.0  # eq. 4
-        vectors[1, m] = ratios.inverse_energy * error + work.level[m] ** 2 if m > 0 else 0.0
-    record.inverse_energy, record.null_variance = ratios.inverse_energy, ratios.null_variance
-    record.order, record.pooled = ratios.order, ratios.pooled
-    record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
+        vectors[1, m] = record.inverse_energy * error + work.level[m] ** 2 if m > 0 else 0.0
 
 
 @inlined
@@ -266,9 +261,9 @@ def _separate(
                 kernels.copy(samples[p, m], work.signals[m])
             kernels.copy(materials[place], work.material)
             record, matrices = solved.record[place], solved.matrices[place]
-            ratios = _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
-            bars.judge(model, ratios, work, record, solved.sums[..., place])
-            _scatters(model, ratios, work, record, matrices)
+            _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
+            bars.judge(model, work, record, solved.sums[..., place])
+            _scatters(model, work, record, matrices)
         _return(outside, together, solved.films)
 
 

@@ -99,31 +99,19 @@ class Work(NamedTuple):
     outside: Any  # their films, in single precision (pixel, 4, time)
 
 
-class Ratio(NamedTuple):
-    """Reflection ratios of one pixel and how well they are known; these are in the work space."""
-
-    inverse_energy: float  # sigma^2 of eq. 4 [1/K^2]; infinite without background energy
-    null_variance: float  # noise variance of the null combination [K^2]
-    order: int  # number of smooth functions used
-    contrast: float  # variance along the axis over that across it, at the largest order [1]
-    reduced_chi2: float  # variance across the axis over the noise's, 1 if the model holds
-    pooled: bool  # the material's ratios are used, and the pixel does not contradict them
-
-
 class Line(NamedTuple):
     """Robust line of step 3 (eq. 7)."""
 
     variance: float  # of the slope
     scale: float  # of the residual [K]
     energy: float  # of the object's curve [K^2]
-    constant: bool
     known: bool  # the emissivity is the material's
 
 
 @inlined
-def ratios(model: Model, work: Work) -> Ratio:
+def ratios(model: Model, work: Work, record: Any) -> None:
     r"""
-    Step 1; coefficients, ratios and null combination in place.
+    Step 1; coefficients, ratios and null combination in place, and how well they are known.
 
     The order is that of the lowest Bayesian information criterion (Schwarz 1978,
     doi:10.1214/aos/1176344136) of the energy across the axis, **plus one**: a part of the object's
@@ -174,14 +162,10 @@ def ratios(model: Model, work: Work) -> Ratio:
     least, whole = _across(last, work, pooled), 0.0
     for m in range(bands):
         whole += last[m, m]
-    return Ratio(
-        inverse,
-        variance,
-        order + 1,
-        (whole - least) * (bands - 1.0) / least if least > 0 else np.inf,
-        null / ((bands - 1.0) * free),
-        pooled,
-    )
+    record.inverse_energy, record.null_variance = inverse, variance
+    record.order, record.pooled = order + 1, pooled
+    record.contrast = (whole - least) * (bands - 1.0) / least if least > 0 else np.inf
+    record.reduced_chi2 = null / ((bands - 1.0) * free)
 
 
 @inlined
@@ -251,7 +235,7 @@ def _order(work: Work, pooled: float, frames: int) -> int:
 
 
 @inlined
-def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
+def may_be_gray(model: Model, record: Any, work: Work) -> bool:
     r"""
     Say whether equal emissivities are not excluded by the signals as they are.
 
@@ -279,7 +263,7 @@ def may_be_gray(model: Model, ratios: Ratio, work: Work) -> bool:
             share = min(max(turned / max(step, reflection_ratio.TINY), 0.0), 1.0)
             for m in range(bands):
                 square += (before[m] + share * (off[m] - before[m])) ** 2
-            statistic = square / ratios.inverse_energy
+            statistic = square / record.inverse_energy
             nearest = min(nearest, statistic)
             chance += _chance(statistic, bands - 1) / (len(model.gray) - 1.0)
     return nearest < model.chances[1] and chance > reflection_ratio.GRAY_CHANCE
@@ -347,10 +331,10 @@ def combined(weights: Array, coefficients: Array, count: int, columns: Array) ->
 
 
 @inlined
-def emission(model: Model, ratios: Ratio, work: Work, rounds: int) -> Line:
+def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     """Steps 2 and 3 in turns: the object (eq. 5, 6) and the emissivities (eq. 7), in place."""
     z, weights, temperature = work.first, work.weights, work.temperature
-    count, material, largest = ratios.order + model.steps, work.material, 1.0
+    count, material, largest = record.order + model.steps, work.material, 1.0
     combined(work.null_weights, work.coefficients, count, work.columns)
     kernels.combined(model.object_part, model.spans, work.columns, count, work.target)
     kernels.temperature(kernels.response(model.tables, 1), work.target, temperature)
@@ -358,14 +342,14 @@ def emission(model: Model, ratios: Ratio, work: Work, rounds: int) -> Line:
     for m in range(1, work.ratio.size):
         largest = max(largest, work.ratio[m])
     middle = 0.5 * (1.0 + (largest - 1.0) / largest)
-    middle = material[1] if ratios.pooled and not np.isnan(material[1]) else middle
+    middle = material[1] if record.pooled and not np.isnan(material[1]) else middle
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     first = kernels.response(model.tables, 0)
     kernels.blackbody(first, temperature, work.emitted, work.spare)
     kernels.fill(work.lack, 1.0)
     guess = regression.moments(work.emitted, z, work.lack)[0]
     emissivity = guess if 0 < guess < 1 else middle
-    fixed = ratios.pooled and not np.isnan(material[1] + material[2])
+    fixed = record.pooled and not np.isnan(material[1] + material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     before, slope_before = np.nan, np.nan
@@ -374,7 +358,7 @@ def emission(model: Model, ratios: Ratio, work: Work, rounds: int) -> Line:
         slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, rounds + turn > 0
         )
-        constant = energy < OBJECT_TO_NOISE * count * ratios.null_variance and not fixed
+        constant = energy < OBJECT_TO_NOISE * count * record.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope
         emissivity = material[1] if fixed else middle if constant else slope
@@ -383,7 +367,8 @@ def emission(model: Model, ratios: Ratio, work: Work, rounds: int) -> Line:
     _approach(model, emissivity, work, work.at_object[0, : z.size])
     for m in range(work.ratio.size):
         work.emissivity[m] = 1.0 - work.ratio[m] * (1.0 - emissivity)
-    return Line(variance, scale, energy, constant, fixed)
+    record.constant = constant
+    return Line(variance, scale, energy, fixed)
 
 
 @inlined
