@@ -49,8 +49,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     True
     """
     schema.check_numbers(apparent, "the apparent temperature", "K")
-    if not isinstance(result, xr.Dataset):
-        raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
+    needed = ("background_temperature", "emissivity", "status")
+    schema.check(result, "separated", needed, "the result")
     if apparent.dims != ("band", "time", "y", "x"):
         rule = "Must be ('band', 'time', 'y', 'x')"
         raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
@@ -59,11 +59,6 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
             f"Invalid first band '{apparent['band'].values[0]}'. "
             f"Must be '{result['band'].values[0]}', as in the result."
         )
-    for name in ("background_temperature", "emissivity", "status"):
-        if name not in result:
-            raise ValueError(f"Missing variable '{name}' in the result. Must be one of `solve`.")
-        label = f"'{name}' of the result"
-        schema.check_variable(result[name], schema.STAGES["separated"][name], label)
     if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
         message = f"Invalid emissivities of the result, {usual:.3g} in the median"
         raise ValueError(f"{message}. Must be shares of one, not per cent.")
