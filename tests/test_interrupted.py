@@ -76,8 +76,8 @@ def start(
 
 def started(folder: Path, *words: str) -> subprocess.Popen[str]:
     """Program in a process of its own."""
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    return subprocess.Popen([sys.executable, "-c", *words], cwd=folder, text=True, **pipes)
+    command, pipe = [sys.executable, "-c", *words], subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, text=True, stdin=pipe, stdout=pipe, stderr=pipe)
 
 
 def end(process: subprocess.Popen[str]) -> tuple[int, str]:

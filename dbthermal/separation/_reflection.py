@@ -49,8 +49,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     True
     """
     schema.check_numbers(apparent, "the apparent temperature", "K")
-    needed = ("background_temperature", "emissivity", "status")
-    schema.check(result, "separated", needed, "the result")
+    if not isinstance(result, xr.Dataset):
+        raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
     if apparent.dims != ("band", "time", "y", "x"):
         rule = "Must be ('band', 'time', 'y', 'x')"
         raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
@@ -59,6 +59,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
             f"Invalid first band '{apparent['band'].values[0]}'. "
             f"Must be '{result['band'].values[0]}', as in the result."
         )
+    needed = ("background_temperature", "emissivity", "status")
+    schema.check(result, "separated", needed, "the result")
     if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
         message = f"Invalid emissivities of the result, {usual:.3g} in the median"
         raise ValueError(f"{message}. Must be shares of one, not per cent.")

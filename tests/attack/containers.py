@@ -65,8 +65,9 @@ def _hdf5_chunk(rng: Rng, path: Path) -> None:
         constant = np.full_like(COUNTS, 18000)
         with h5py.File(path, "w") as file:
             file.create_dataset("frames", data=constant, chunks=COUNTS.shape, scaleoffset=0)
-        sizes = (COUNTS.size, int(2 ** rng.uniform(12, 31)))
-        path.write_bytes(path.read_bytes().replace(*(struct.pack("<III", 2, 0, n) for n in sizes)))
+        lie = int(2 ** rng.uniform(12, 31))
+        stated, lied = (struct.pack("<III", 2, 0, size) for size in (COUNTS.size, lie))
+        path.write_bytes(path.read_bytes().replace(stated, lied))
 
 
 def _hdf5_time(rng: Rng, path: Path) -> None:
@@ -130,7 +131,8 @@ def _zarr_chunk(rng: Rng, path: Path) -> None:
 
 def _zarr_shard(rng: Rng, path: Path) -> None:
     """Chunks of one pixel in a shard, or shards in shards."""
-    number, chunk, within = int(4 ** rng.uniform(6, 9)), (1, 1, 1), BytesCodec()
+    number, chunk = int(4 ** rng.uniform(6, 9)), (1, 1, 1)
+    within: Any = BytesCodec()
     counts: Any = (18000 + np.arange(number) % 999).astype("u2").reshape(1, 1, -1)
     index = np.stack([2 * np.arange(number), np.full(number, 2)], 1).astype("<u8").tobytes()
     packed, indices = counts.tobytes(), [index]
