@@ -104,8 +104,8 @@ def _animation(result: xr.Dataset, path: Path, options: argparse.Namespace) -> d
     """Animate a variable, in degrees Celsius if it is a temperature."""
     from dbthermal.explorer import _export  # noqa: PLC0415 - optional
 
-    view = explorer.View(result)
-    _export.save_film(view, path, _export.Shown([options.variable], 0, {}, celsius=True))
+    shown = _export.Shown([options.variable], 0, {}, celsius=True)
+    _export.save_film(explorer.View(result), path, shown)
     return {"bytes": path.stat().st_size}
 
 

@@ -237,10 +237,9 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
     try:
         dataset = recording(paths, options)
     except ValueError as error:
-        unknown = options.clock is None and bool(re.match("Missing (--)?clock", str(error)))
-        if not unknown:
+        if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-        options.clock = [1.0]
+        options.clock, unknown = [1.0], True
         dataset = recording(paths, options)
     lines = summary(dataset, everything=True)
     if unknown:
@@ -251,10 +250,10 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
 
 def _is_store(path: Path) -> bool:
     """Tell whether a folder is a store of dbthermal or a part of one, not one of other programs."""
-    folders = [folder for folder in (path, path.parent) if (folder / "zarr.json").is_file()]
-    if not folders or folders[0] != path:
+    whole, part = path.parent / "zarr.json", path / "zarr.json"
+    if not part.is_file():
         return False
-    text = (folders[-1] / "zarr.json").read_text(encoding="utf-8", errors="replace")
+    text = (whole if whole.is_file() else part).read_text(encoding="utf-8", errors="replace")
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 
 

@@ -29,7 +29,7 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return _of_files(options)
     if options.command == "align" and options.offset is not None:
         return {"with --offset": "search"}
-    if options.command == "export" and options.output.suffix in {*NO_TABLES}:
+    if options.command == "export" and options.output.suffix in NO_TABLES:
         suffix = options.output.suffix
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":

@@ -76,8 +76,7 @@ def figure(view: View, shown: Shown) -> Figure:
 
 def save_film(view: View, path: Path, shown: Shown) -> None:
     """Save the films among the panes side by side, as an animated picture at their own speed."""
-    every = slice(None, None, -(-view.time.size // _FILMED))
-    panels = []
+    every, panels = slice(None, None, -(-view.time.size // _FILMED)), list[figures.FilmPanel]()
     for pane in (view.pane(name) for name in shown.names if view.pane(name).kind == "film"):
         unit, zero = pane.unit(celsius=shown.celsius)
         low, high = shown.limits.get(pane.name) or view.limits(pane.name)
@@ -89,9 +88,8 @@ def save_film(view: View, path: Path, shown: Shown) -> None:
         raise ValueError(f"Invalid film of {list(shown.names)}. Must have a picture that changes.")
     origin = drawing.provenance_note(view.data).strip(" (),") or "film"
     first, *further = map(Image.fromarray, figures.film(panels, title=origin))
-    period = float(view.time[-1] - view.time[0]) / max(len(further), 1)  # [s]
-    milliseconds = max(20, round(1000 * period))
-    first.save(path, save_all=True, append_images=further, duration=milliseconds, loop=0)
+    period = max(20, round(1000.0 * float(np.ptp(view.time)) / max(len(further), 1)))  # [ms]
+    first.save(path, save_all=True, append_images=further, duration=period, loop=0)
 
 
 def _outline(region: Region, **style: Any) -> Patch:

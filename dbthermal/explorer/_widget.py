@@ -162,8 +162,8 @@ class Explorer(anywidget.AnyWidget):
             if limit is None and self.view.panes[name].kind == "film":
                 reach = 0.5 * (self._range(name)[1] - self._range(name)[0])
                 ranges[name] = (-reach, reach)
-        level = level if less is None else None
-        lined = [name for name in names if level is not None and self.view.panes[name].absolute]
+        lined = names if level is not None and less is None else []
+        lined = [name for name in lined if self.view.panes[name].absolute]
         sides = [
             np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
             for name in lined

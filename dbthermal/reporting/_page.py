@@ -23,7 +23,6 @@ try:
 except ImportError as error:
     raise ImportError(missing_library(error.name, "report")) from error
 
-_PNG: Final = b"\x89PNG\r\n\x1a\n"  # the first bytes of a file
 _LOGO: Final = 2**20  # largest picture beside the title [byte]
 
 # The poster is the picture that is printed; the button lies below the film and hides none of it.
@@ -87,7 +86,7 @@ def save_page(  # noqa: PLR0913 - what is above the sections, by name
         File ``*.png`` beside the title, of at most 1 MB.
     """
     picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
-    if logo is not None and not picture.startswith(_PNG):
+    if logo is not None and not picture.startswith(b"\x89PNG\r\n\x1a\n"):
         raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
     environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True)
     text = resources.files("dbthermal.reporting").joinpath("page.html").read_text("utf-8")

@@ -34,8 +34,7 @@ _FLUCTUATION: Final = 2.0
 _LEAST: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
-_MOST: Final = 2**22  # samples of a band of these, down to _FEW pixels of a long capture
-_FEW: Final = 64
+_MOST, _FEW = 2**22, 64  # samples of a band of these, down to so few pixels of a long capture
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
 # Chance by which a pixel tells other emissivities than its material's: of three deviations.
