@@ -50,11 +50,13 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
     result = np.empty((len(others), *shape, count, count))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
+        # Moved movie with its slopes and rate, once for all other movies.
         signals = np.empty((count, places[0, rows].size, movie.shape[2]), movie.dtype)
         signals[:3] = sampled(movie, places[:, rows].reshape(2, -1) + EDGE)
         if rate is not None:
             np.matmul(signals[0], rate, out=signals[3])
         for other, out in zip(others, result, strict=True):
+            # Products of every pair of signals, summed over the planes.
             signals[-1] = other[rows].reshape(signals.shape[1:])
             pairs = np.einsum("ipt,jpt->pij", signals, signals)
             out[rows] = pairs.reshape(out[rows].shape)
