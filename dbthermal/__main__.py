@@ -120,6 +120,7 @@ materials text*         as listed by 'data'; all by default
 --method text           one step alone, by rows: {methods}
 --emissivity number+    of each band, for the method 'calibrated'
 --surroundings kelvin   temperature of what is reflected, as 22C
+--outdoors flag         the sky is mirrored, which is not gray: wider bars
 --prior text            material of pixels that cannot be measured, as listed by 'data'
 --workers whole=2       number of threads
 --title text            heading of the report
@@ -200,7 +201,7 @@ corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
 separate steps.separate capture response --correction --register --offset --method \
-    --emissivity --surroundings --prior --workers --output
+    --emissivity --surroundings --outdoors --prior --workers --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr

@@ -37,7 +37,7 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
     if options.correction:
         return {"with --correction": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
-    completing = {"with --method: 'dbthermal complete'": "surroundings prior workers"}
+    completing = {"with --method: 'dbthermal complete'": "surroundings outdoors prior workers"}
     return aligned | (
         completing if options.method else {"without --method calibrated": "emissivity"}
     )

@@ -40,7 +40,7 @@ _FILMS: Final = tuple(BUDGETS)[:2]
 _FRAMES: Final = 16  # of a film, at least, that give its root mean square
 # Mean of a reflection [K] below which it is the sky's, whose changes in bands from 8.5 to 12.1 um
 # are 0.62 to 1.48 times those in 8-14 um, by measured spectra (Atmospheric Radiation Measurement).
-_COLD, _SKY = 278.15, 0.4
+_COLD, SKY = 278.15, 0.4
 _SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
 _WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
 
@@ -123,7 +123,7 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     by_ratio = contrast * _combined(weights, np.where(np.isfinite(ratio_std), ratio_std, 0.0))
     # Coloured reflections are taken for another ratio; those colder than a room are of the sky.
     cold = _mean(films[1]) < _COLD
-    colour = np.nan_to_num(ratio) * np.where(cold & (accuracy.colour > 0.0), _SKY, accuracy.colour)
+    colour = np.nan_to_num(ratio) * np.where(cold & (accuracy.colour > 0.0), SKY, accuracy.colour)
     colour[reference] = 0.0
     by_colour = contrast * _combined(weights, colour)
     drift = np.where(single, 0.0, _drift(cut))

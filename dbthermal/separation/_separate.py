@@ -21,7 +21,7 @@ from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._blur import equalise
-from dbthermal.separation._budget import without_calibration
+from dbthermal.separation._budget import SKY, without_calibration
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
@@ -61,6 +61,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     materials: xr.DataArray | None = None,
     surroundings: float | xr.DataArray | None = None,
     surroundings_std: float = 2.0,
+    outdoors: bool = False,
     prior: str | xr.DataArray | xr.Dataset | None = None,
     settings: "SubspaceSettings | None" = None,
     alone: xr.Dataset | None = None,
@@ -86,6 +87,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         installed (extra "materials").
     surroundings, surroundings_std, prior
         As in `complete`. Without a prior, and of bands that no library has, nothing is completed.
+    outdoors : bool
+        The sky is mirrored, whose changes are not alike in two bands: the bars say so
+        (`background_ratio_std` 0.4). Not needed where what is mirrored is below 5 degrees Celsius.
     settings : SubspaceSettings, optional
         Options of the method "subspace".
     alone : Dataset, optional
@@ -128,6 +132,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     names = [str(band) for band in corrected["band"].values]
     completable = _completable(prior, names)
     require_workers(workers)
+    response = response.assign(background_ratio_std=SKY) if outdoors else response
     inputs = check(corrected, response, get_method("subspace"), settings=settings)
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)

@@ -26,6 +26,7 @@ from reproduction.figures.scenes import (
     separated_film,
     truth_and_estimate,
 )
+from reproduction.figures.sky import hours, sky_changes
 from reproduction.figures.twins import error_maps, thermocouples
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "error_over_bands",
     "error_over_bound",
     "error_over_noise",
+    "hours",
     "offsets",
     "parallax",
     "pooled_materials",
@@ -53,6 +55,7 @@ __all__ = [
     "reductions",
     "sensitivity",
     "separated_film",
+    "sky_changes",
     "thermocouples",
     "truth_and_estimate",
     "validity",
