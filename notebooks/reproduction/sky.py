@@ -136,14 +136,16 @@ def pane(
 
 
 def scores(result: xr.Dataset, scene: xr.Dataset) -> dict[str, Any]:
-    """Ratio, error and deviation [K] of the object, and how many of the 95 % intervals hold."""
+    """Errors of ratio and object, its deviation, and how many of the 95 % intervals hold."""
     good = result["status"] == 0
+    reflectivity = 1.0 - scene["emissivity"]
+    ratio = reflectivity[1] / reflectivity[0]
     error = (result["object_temperature"] - scene["object_temperature"]).where(good)
     std = result["object_temperature_std"].where(good)
     holds = (abs(error) < 1.96 * std).where(np.isfinite(error))
     return {
         "no flag [1]": float(good.mean()),
-        "ratio k [1]": float(result["reflection_ratio"][1].where(good).median()),
+        "error of k [1]": float((result["reflection_ratio"][1].where(good) / ratio - 1).median()),
         "error [K]": float((error**2).mean() ** 0.5),
         "stated [K]": float(std.median()),
         "intervals hold [1]": float(holds.mean()),
