@@ -30,8 +30,10 @@ def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]
     low, high = float(celsius.min()), float(celsius.max())
     for hour, words in zip(middles, flags, strict=True):
         text = words.replace(", ", "\n") or "no flag"
-        axis.text(hour, high + 0.1 * (high - low), text, ha="center", va="bottom", fontsize=7)
-    axis.set(ylim=(low - 1.0, high + 0.5 * (high - low)), xlim=(0.0, 24.0))
+        axis.text(
+            hour, high + 0.1 * (high - low), text, ha="center", va="bottom", rotation=90, fontsize=6
+        )
+    axis.set(ylim=(low - 1.0, high + 0.7 * (high - low)), xlim=(0.0, 24.0))
     axis.set_xlabel("universal time [h]")
     axis.set_ylabel("reading [°C]")
     axis.legend(loc="lower right", fontsize=7)
