@@ -21,7 +21,6 @@ from dbthermal.separation._subspace import (
     pixel,
     reflection_ratio,
     regression,
-    residuals,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
 from dbthermal.separation._tiles import Tile
@@ -499,10 +498,10 @@ def _judge(model: Model, work: Work) -> None:
     curve = model.object_part.T @ work.smoothed
     work.sums = torch.stack([_block_sums(film, model.parts) for film in (residual, curve)])
     # Mean autocorrelation over some lags, in standard deviations of white noise.
-    lags = range(1, residuals.LAGS + 1)
+    lags = range(1, bars.LAGS + 1)
     lagged = torch.stack([(residual[lag:] * residual[:-lag]).sum(dim=0) for lag in lags]).sum(0)
-    mean = _quotient(lagged, residuals.LAGS * (residual**2).sum(dim=0), 0.0)
-    work.correlation = mean * np.sqrt(residuals.LAGS * len(residual))
+    mean = _quotient(lagged, bars.LAGS * (residual**2).sum(dim=0), 0.0)
+    work.correlation = mean * np.sqrt(bars.LAGS * len(residual))
     # A matched filter with the differences between frames, of a band that is late or early.
     common, change = work.null_weights[0] * model.noise[0] ** 2, rapid.diff(dim=0)
     late = (residual[:-1] * change).sum(dim=0) + work.freedom[0] * common
@@ -511,7 +510,7 @@ def _judge(model: Model, work: Work) -> None:
     score = _quotient(torch.maximum(late.abs(), early.abs()), variance.sqrt(), 0.0)
     # Energy in the frames at a change; the cube root of a chi-square over its n degrees has the
     # mean 1 - v and the variance v.
-    steps = change.abs() > residuals.CHANGE * np.sqrt(2.0) * model.noise[0]
+    steps = change.abs() > bars.CHANGE * np.sqrt(2.0) * model.noise[0]
     at = torch.zeros_like(residual, dtype=torch.bool)
     at[1:] |= steps
     at[:-1] |= steps

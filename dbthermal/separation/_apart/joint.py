@@ -35,7 +35,7 @@ from dbthermal.separation._apart import neighbours, relaxation
 from dbthermal.separation._apart.equations import Floats, Mask, Whole
 from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._subspace import residuals
+from dbthermal.separation._subspace import regression
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
 from dbthermal.separation._tiles import USELESS, Material
 
@@ -397,7 +397,7 @@ def _emission(
     the camera in it (frame, solved).
     """
     signal = places[0].T.astype(np.float64)
-    line = residuals.regress(signal, np.asarray(band[0], np.float64), noise)
+    line = regression.lines(signal, np.asarray(band[0], np.float64), noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     steep = np.maximum(_slope(*places), 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.

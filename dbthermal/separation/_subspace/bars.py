@@ -1,15 +1,18 @@
 """Variances of the outputs of one pixel (eq. 8, 10), and if its residual is noise; compiled."""
 
+from functools import lru_cache
 from math import log, sqrt
 from typing import Any, Final
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import chdtri, ndtri
 
 from dbthermal._arrays import Array
-from dbthermal.separation._subspace import kernels, regression, residuals
+from dbthermal.separation._subspace import kernels, regression
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Line, Model, Work, combined
+from dbthermal.separation._subspace.reflection_ratio import CHANCE
+from dbthermal.separation._tiles import Whole
 
 # The background counts as resting within so many standard deviations, in that share of frames.
 WITHIN: Final = 3.0
@@ -19,6 +22,19 @@ RESTING: Final = 0.3
 OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
 # Bound of a 95 % interval of the normal distribution.
 NORMAL95: Final = float(ndtri(0.975))
+LAGS: Final = 5
+"""Frames over which a residual's mean autocorrelation is taken."""
+CHANGE: Final = 5.0
+"""Deviations of noise from which a difference between frames is a change."""
+_BLOCK: Final = 9  # frames of the shortest blocks of a residual
+
+
+@lru_cache(maxsize=16)
+def blocks(frames: int) -> tuple[Whole, tuple[float, float]]:
+    """Edges of the blocks of a residual, and limits of both statistics by which it is noise."""
+    number = 2 ** int(np.log2(frames / _BLOCK))
+    edges = np.round(np.linspace(0, frames, number + 1)).astype(np.intp)
+    return edges, (float(chdtri(number, CHANCE)), float(chdtri(1.0, CHANCE / (2 * number))))
 
 
 @inlined
@@ -308,14 +324,14 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
     frames, null, noise = residual.size, record.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
     lagged = 0.0
-    for lag in range(1, residuals.LAGS + 1):
+    for lag in range(1, LAGS + 1):
         lagged += kernels.dot(residual[lag:], residual[: frames - lag])
-    correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
+    correlation = lagged / (LAGS * energy) if energy > 0 else 0.0
     common = work.null_weights[0] * noise**2
     free = (frames - record.order - model.steps) * common
     # A matched filter with the differences between frames, of a band that is late or early.
     late, early, changes = free, -free, 0.0
-    limit, steep[frames - 1] = residuals.CHANGE * sqrt(2.0) * noise, 0.0
+    limit, steep[frames - 1] = CHANGE * sqrt(2.0) * noise, 0.0
     for t in range(frames - 1):
         change = rapid[t + 1] - rapid[t]
         late += residual[t] * change
@@ -333,7 +349,7 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
     mean = at_changes / (null * count) if count > 0 else 1.0
     score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
     return (
-        correlation * sqrt(residuals.LAGS * frames),
+        correlation * sqrt(LAGS * frames),
         score,
         _unexplained(model, record, work, common),
     )

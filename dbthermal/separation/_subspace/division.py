@@ -15,7 +15,6 @@ axes, this tells the rapid changes of the object, which lie along another line, 
 background: of two lines that explain the data the object's is the one with fewer pieces.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from math import acos, sqrt
 from typing import Final, NamedTuple
@@ -59,7 +58,6 @@ class Scratch(NamedTuple):
     axes: Array  # to start from (2, axis), and the weights of the elements of a scatter (3, axis)
     weights: Array
     least: Array  # cost of the best division of each piece (piece, axis)
-    starting: Array  # cost of the best division (axis)
     joined: joining.Scratch
     reached: Whole  # pieces whose halves may be used
     axis: Array  # the same of one axis
@@ -70,24 +68,12 @@ class Scratch(NamedTuple):
     begins: Mask  # (division, time)
 
 
-@dataclass(frozen=True)
-class Division:
-    """Division of the time of each pixel into pieces, and what it costs."""
-
-    first: Mask  # whether a piece begins with a frame (time, pixel)
-    cost: Array  # eq. 12 (pixel); infinite for none
-
-    @property
-    def functions(self) -> Whole:
-        """Number of functions by which the division is chosen (pixel)."""
-        return pieces.FUNCTIONS * self.first.sum(axis=0)
-
-
-def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> list[Division]:
+def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> tuple[Mask, Array]:
     """
     Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
 
-    The second one is that of the other line, if there is one, and costs more. The axis of a
+    Whether a piece begins with a frame (2, time, pixel), and the cost (2, pixel) (eq. 12). The
+    second one is that of the other line, and costs more, infinitely if there is none. The axis of a
     material may be `stated` (2, pixel), NaN for others.
     """
     tree = _tree(time.tobytes(), None if segment is None else segment.tobytes())
@@ -103,7 +89,6 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> l
         axes=np.empty((2, axes)),
         weights=np.empty((3, axes)),
         least=np.empty((count, axes)),
-        starting=np.empty(axes),
         joined=_joining(count // 2 + 1, tree.event),
         reached=np.empty(count, np.intp),
         axis=np.empty((2, 1)),
@@ -115,7 +100,7 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> l
     )
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
     _divide(tree, np.ascontiguousarray(white), np.ascontiguousarray(stated), scratch, first, cost)
-    return [Division(*pair) for pair in zip(first.mT, cost, strict=True)]
+    return first.mT, cost
 
 
 def _joining(most: int, event: Mask) -> joining.Scratch:
@@ -320,13 +305,12 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
         axes[0, -1] = axis[0] if stated else axes[0, 0]
         axes[1, -1] = axis[1] if stated else axes[1, 0]
     _best(tree, scratch, axes, scratch.weights, scratch.least)
-    kernels.copy(scratch.least[0], scratch.starting)
-    angle = 0.0
+    angle, starting = 0.0, scratch.least[0]
     for number in range(pieces.AXES):
         place, lowest = 0, np.inf
         for i in range(axes.shape[1]):
-            if scratch.starting[i] < lowest and not _near(axes[:, i], taken, number, angle):
-                place, lowest = i, scratch.starting[i]
+            if starting[i] < lowest and not _near(axes[:, i], taken, number, angle):
+                place, lowest = i, starting[i]
         x, y, energy = _refine(tree, scratch, axes[0, place], axes[1, place], begins[number])
         taken[number, 0], taken[number, 1] = x, y
         repeated = _near(taken[number], taken, number, angle)

@@ -13,7 +13,7 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
 from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
+from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio
 from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Model, Work
 from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
@@ -272,7 +272,7 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     curve, second_bands = tile.curves[0], len(tile.noise) - 1
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in bars.OCTAVES]
-    edges, limits = residuals.blocks(tile.time.size)
+    edges, limits = bars.blocks(tile.time.size)
     chances = reflection_ratio.CHANCE, reflection_ratio.GRAY_CHANCE
     return Model(
         **_responses(tile.curves),

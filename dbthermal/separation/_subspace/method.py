@@ -284,33 +284,27 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
         axis /= np.sqrt((axis**2).sum(axis=0))
     pooled = np.where(solution.pooled[suspect], axis, np.nan)
     energy, count = pieces.null_energy(white, functions, pooled)
-    divisions = division.divide(white, tile.time, tile.segment, axis)
+    divisions, costs = division.divide(white, tile.time, tile.segment, axis)
     # Outside the plane a function fits noise in each further band.
     further = (pieces.COST - 1.0) * (len(noise) - 2)
-    divisions = [
-        replace(candidate, cost=candidate.cost + further * candidate.functions)
-        for candidate in divisions
-    ]
+    costs += further * pieces.FUNCTIONS * divisions.sum(axis=1)
     cost = energy + (pieces.COST + further) * count  # of one smooth curve
-    lowest = np.min([cost, *(candidate.cost for candidate in divisions)], axis=0)
-    for candidate in divisions:
+    lowest = np.minimum(cost, costs.min(axis=0))
+    for divided, price in zip(divisions, costs, strict=True):
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
-        tried = (candidate.cost < cost) | (flagged & (candidate.cost < lowest + _LIKELY))
+        tried = (price < cost) | (flagged & (price < lowest + _LIKELY))
         # One piece is a smooth curve.
-        places = np.flatnonzero(tried & (candidate.first.sum(axis=0) > 1))
+        places = np.flatnonzero(tried & (divided.sum(axis=0) > 1))
         if places.size == 0:
             continue
         chosen = suspects.select_pixels(places)
-        resolved = _report(
-            chosen, _divided(chosen, candidate.first[:, places], functions, settings)
-        )
-        cheaper = candidate.cost[places] < cost[places] - _LIKELY
+        resolved = _report(chosen, _divided(chosen, divided[:, places], functions, settings))
+        cheaper = price[places] < cost[places] - _LIKELY
         better = (resolved.status == 0) | (flagged[places] & cheaper)
         places, resolved = places[better], resolved.select_pixels(better)
         best.replace_pixels(places, resolved)
-        cost[places] = candidate.cost[places]
-        first[:, places] = candidate.first[:, places]
+        cost[places], first[:, places] = price[places], divided[:, places]
     best = _finished(suspects, best, first, functions)
     # A delay of the bands asks for a piece at each change of the background, which hide it.
     asynchronous = result.status[suspect] & np.uint32(Status.BANDS_APART)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace import kernels, reflection_ratio, residuals
+from dbthermal.separation._subspace import bars, kernels, reflection_ratio
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 # Functions of a piece by which the division is chosen. One more is fitted: what the choice leaves
@@ -184,7 +184,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * _AROUND / usual))))
     step = np.abs(np.diff(curve, axis=0))
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
-    jumps = (step > residuals.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
+    jumps = (step > bars.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
     result = np.any(jumps, axis=0)
     jumping, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
     change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]

@@ -1,5 +1,6 @@
 """Robust regression, which finds a line beside outliers on one side; of one pixel, compiled."""
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -207,8 +208,35 @@ def regress(
     return slope, scale**2 / energy / independent, scale, energy
 
 
+@dataclass(frozen=True)
+class Lines:
+    """Straight lines through each pixel's points."""
+
+    slope: Array  # (pixel)
+    variance: Array  # of the slope, with the residuals' correlation in time (pixel)
+    energy: Array  # weighted sum of squares of the abscissa about its mean (pixel)
+    weights: Array  # in [0, 1] (time, pixel)
+
+    def kernel(self, abscissa: Array) -> Array:
+        """Weights k (time, pixel) of the ordinate z in the slope, sum k z."""
+        kernel = self.weights * abscissa
+        kernel -= self.weights * (kernel.sum(axis=0) / self.weights.sum(axis=0))
+        return np.asarray(kernel / self.energy)
+
+
+def lines(abscissa: Array, ordinate: Array, noise: float) -> Lines:
+    """Robust lines of an ordinate on an abscissa (time, pixel), see `regress`."""
+    frames, pixels = abscissa.shape
+    rows = [np.ascontiguousarray(values.T, np.float64) for values in (abscissa, ordinate)]
+    weights, numbers = np.empty((pixels, frames)), np.empty((pixels, 3 + frames))
+    few = np.full((5, frames), np.inf, np.float32)
+    _lines(*rows, float(noise), weights, few, numbers)
+    slope, variance, energy = numbers[:, :3].T
+    return Lines(slope, variance, energy, weights.T)
+
+
 @kernels.entered
-def lines(x: Array, y: Array, noise: float, weights: Array, few: Any, numbers: Array) -> None:
+def _lines(x: Array, y: Array, noise: float, weights: Array, few: Any, numbers: Array) -> None:
     """As `regress`, of many pixels (pixel, time), without a start; in place."""
     for p in range(len(x)):
         slope, variance, _, energy = regress(
