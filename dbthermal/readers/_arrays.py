@@ -112,7 +112,7 @@ def array(
     attributes = rules.attributes
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
-    recordings.check_present(counts, fills, label, masked=np.ma.is_masked(values))
+    recordings.check_present(counts, fills, label)
     clock = rules.seconds[0] if clock is None else clock
     return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 

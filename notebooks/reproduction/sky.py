@@ -129,7 +129,7 @@ def pane(
     rise = np.linspace(10.0, 20.0, shape[0])[:, np.newaxis]  # [K]
     warm = 290.0 + rise * (1.0 - np.exp(-time / 12.0))[:, np.newaxis, np.newaxis]
     warm = np.broadcast_to(warm, moments.shape)
-    scene = dbt.simulation.scene(time, warm, warm, emissivity)
+    scene: xr.Dataset = dbt.simulation.scene(time, warm, warm, emissivity)
     dims, attrs = ("band", "time", "y", "x"), {"units": "K"}
     skies = xr.DataArray(background, {"band": sky["band"]}, dims, attrs=attrs)
     return scene.assign(background_temperature=skies)
