@@ -352,25 +352,18 @@ def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     }
 
 
-def solve(tile: Tile, functions: smooth.Subspace, drift: float) -> Solution:
+def solve(
+    tile: Tile,
+    functions: smooth.Subspace,
+    drift: float,
+    divided: Iterable[tuple[Whole, smooth.Subspace]] | None = None,
+) -> Solution:
     """
     Steps 1 to 4, where it matters again on signals with proportional reflections.
 
-    With the limit of the background's `drift` [K].
-    """
-    every = np.arange(tile.signals.shape[2])
-    return solve_parts(tile, functions, [(every, functions)], drift)
-
-
-def solve_parts(
-    tile: Tile,
-    functions: smooth.Subspace,
-    divided: Iterable[tuple[Whole, smooth.Subspace]],
-    drift: float,
-) -> Solution:
-    """As `solve`, of all pixels in parts, each with functions of its own of the same rising ones.
-
-    One part after another is taken: of a long capture the functions of all would be much memory.
+    With the limit of the background's `drift` [K]. Of all pixels, or in parts that have functions
+    of their own, with the same rising ones; one part after another is taken: of a long capture the
+    functions of all would be much memory.
     """
     shared, material = share(tile, functions, drift), tile.material
     bands, frames, pixels = tile.signals.shape
@@ -385,7 +378,7 @@ def solve_parts(
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
     space = _work_space(frames, bands, len(shared.rising))
-    for places, of_part in divided:
+    for places, of_part in [(np.arange(pixels), functions)] if divided is None else divided:
         model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((of_part.orders, bands, bands))

@@ -365,8 +365,7 @@ def _divided(
     tile: Tile, first: Mask, functions: smooth.Subspace, settings: SubspaceSettings
 ) -> Solution:
     """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
-    parts = _parts(tile, first, functions)
-    return fused.solve_parts(tile, functions, parts, settings.background_drift)
+    return fused.solve(tile, functions, settings.background_drift, _parts(tile, first, functions))
 
 
 METHOD: Final = Method(
