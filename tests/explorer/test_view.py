@@ -313,9 +313,9 @@ def test_explorer_has_a_picture_for_who_has_no_browser() -> None:
 
 def test_without_the_extra_its_name_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """One line says what to install."""
-    monkeypatch.delitem(sys.modules, "dbthermal.explorer._widget")
+    monkeypatch.delitem(sys.modules, "dbthermal.explorer._widget", raising=False)
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    with pytest.raises(ImportError, match=r"pip install 'dbthermal\[explorer\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[explorer\]'"):
         dbthermal.explore(separated())
 
 
