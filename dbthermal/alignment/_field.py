@@ -125,21 +125,24 @@ class Spline:
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if guess is not None:
             target += matrix @ guess.nodes
-            sharp, trials = guess.sharpness, guess.penalty * _STEPS
+            steps = _STEPS[1:2] if guess.settled else _STEPS
+            sharp, trials = guess.sharpness, guess.penalty * steps
         best = -np.inf
         blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
             before = block_diag(*(trial * blocks + self.before))
             trial_factor = self.factored(matrix + before)
-            trial_nodes = self.solved(trial_factor, target)
-            logs = [np.log(array[0]).sum() for array in (self.factored(before), trial_factor)]
-            likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
+            trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
+            if trials.size > 1:
+                logs = [np.log(array[0]).sum() for array in (self.factored(before), trial_factor)]
+                likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ array) ** 2 for array in np.split(nodes, 2)])
         sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        return Field(self, nodes, factor, float(penalty), sharp)
+        settled = guess is not None and penalty == guess.penalty
+        return Field(self, nodes, factor, float(penalty), sharp, settled)
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,7 @@ class Field:
     factor: Array  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
+    settled: bool  # the penalty is the best of those near it
 
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""

@@ -15,7 +15,7 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import schema
-from dbthermal._arrays import Mask, empty, release
+from dbthermal._arrays import Mask, empty, quotient, release
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import SEARCH, check, measured_offset
@@ -259,32 +259,35 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
     counts, side = corrected["counts"], _side(corrected["counts"])
     if side == 1:
         return corrected
-    squares, films = {"y": side, "x": side}, counts.drop_vars(["y", "x"], errors="ignore")
-    film = empty((*counts.shape[:2], *(size // side for size in counts.shape[2:])), np.float32)
-    covered, bad = np.zeros(film.shape[2:], bool), np.zeros(counts.shape[2:], bool)
+    bands, frames, height, width = (*counts.shape[:2], *(n // side for n in counts.shape[2:]))
+    film = empty((bands, frames, height, width), np.float32)
+    covered, bad = np.zeros((height, width), bool), np.zeros(counts.shape[2:], bool)
     if "status" in corrected:
         bad = (corrected["status"].values & int(schema.UNMEASURED)) != 0
-    for row in range(film.shape[2]):
-        rows = slice(row * side, (row + 1) * side)
-        block = films[:, :, rows].load()
-        block = block.where(schema.measured(block) & ~bad[rows])
-        # Mean level and mean change of pixels that all bands measure: a gap is no step.
-        level = block.mean("time", dtype=np.float64)
-        level = level.where(level.notnull().all("band"))
-        change = block - level
-        number = change.notnull().coarsen(squares, boundary="trim").sum()
-        pixels = level.notnull().coarsen(squares, boundary="trim").sum()
-        mean = change.coarsen(squares, boundary="trim").mean()
-        mean = mean + level.coarsen(squares, boundary="trim").mean()
-        film[:, :, row] = mean.where(number > _COMMON * pixels).values[:, :, 0]
-        covered[row] = pixels.values[0, 0] > 0
+    for row in range(height):
+        window = slice(row * side, (row + 1) * side), slice(0, width * side)
+        values = counts[:, :, *window].values
+        valid = schema.measured(values) & ~bad[window]
+        means = np.where(valid, values, 0.0).sum(axis=1, dtype=np.float64)
+        means = quotient(means, valid.sum(axis=1), np.nan)
+        measured = np.isfinite(means).all(axis=0)  # of all bands the same pixels
+        valid &= measured
+        change = np.where(valid, values - means[:, np.newaxis], 0.0)
+        squares = (bands, -1, side, width, side)
+        number = valid.reshape(squares).sum(axis=(2, 4))
+        changes = quotient(change.reshape(squares).sum(axis=(2, 4)), number, np.nan)
+        pixels = measured.reshape(side, width, side).sum(axis=(0, 2))
+        levels = np.where(measured, means, 0.0).reshape(squares).sum(axis=(2, 4))
+        common = number > _COMMON * pixels
+        film[:, :, row] = np.where(common, changes + quotient(levels, pixels, np.nan), np.nan)
+        covered[row] = pixels > 0
         release()
     dims, attrs = counts.dims, counts.attrs
     return corrected.drop_dims(["y", "x"]).assign(
         counts=(dims, film, attrs),
         status=(dims[2:], np.where(covered, 0, Status.DEAD_PIXEL).astype(np.uint32)),
         # Neighbours that a registration made of the same pixels have their mean's noise together.
-        noise_factor=("band", np.full(len(film), 1.0 / side), schema.NOISE_FACTOR.attrs),
+        noise_factor=("band", np.full(bands, 1.0 / side), schema.NOISE_FACTOR.attrs),
     )
 
 

@@ -5,16 +5,16 @@ whole pixels that explain most, then Gauss-Newton from coarse images to fine one
 much later the others show what the first shows.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
+from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._products import (
-    EDGE,
     Movie,
     binned,
     blurred,
@@ -22,6 +22,7 @@ from dbthermal.alignment._products import (
     products,
     splines,
 )
+from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
 """Deviation of the window in which neighbours share a ratio and a whole-pixel match [pixel]."""
@@ -31,13 +32,17 @@ BLUR: Final = 1.2
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+_PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS: Final = 12
+_ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
+_USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 _PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
+_NOISE_PIXELS: Final = 256  # that tell the noise of a movie
 _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
 
 
@@ -50,7 +55,7 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # those of all changes within the period over these [1]
+    outside: float  # those of whole frames over these [1]
     factor: int  # pixels of the capture along a side of one of these
 
     @classmethod
@@ -59,23 +64,27 @@ class Movies:
         movies: list[Movie],
         valid: Mask,
         noise: Array,
-        functions: Movie,
-        *,
+        freedom: float,
         factor: int,
-        period: float,
+        whole: float = 0.0,
     ) -> "Movies":
-        """Movies along functions of time, of pixels so many times coarser than the mask's.
-
-        The functions show changes within a period [frame].
-        """
-        freedom = float(np.sum(functions**2))
+        """Movies of pixels that are so many times coarser than the mask's."""
+        mostly = binned(valid.astype(np.float64), factor) > 0.5
+        sample = tuple(
+            index[:: max(1, index.size // _NOISE_PIXELS)] for index in np.nonzero(mostly)
+        )
+        if sample[0].size:
+            # Interpolated in time, a movie holds less rapid noise than white noise of its size.
+            white = np.sqrt(freedom / movies[0].shape[2]) / factor
+            usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
+            noise = np.minimum(noise, np.array(usual) / white)
         return cls(
             splines(movies[0], BLUR),
             [blurred(movie, BLUR) for movie in movies[1:]],
-            binned(valid.astype(np.float64), factor) > 0.5,
+            mostly,
             noise / factor,
             freedom,
-            max((1.0 - 2.0 / period) * len(functions) / freedom, 1.0),
+            max(whole / freedom, 1.0),
             factor,
         )
 
@@ -121,9 +130,11 @@ def _whole_pixels(
 
 
 def inside(places: Array, valid: Mask) -> Mask:
-    """Places (2, ...) whose nearest pixel of an image is valid."""
-    near = map_coordinates(valid.astype(np.uint8), places, order=0, mode="grid-constant")
-    return np.asarray(near > 0)
+    """Places (2, ...) that lie on valid pixels of an image."""
+    near = np.rint(places)
+    result = np.all([(n >= 0) & (n < size) for n, size in zip(near, valid.shape, strict=True)], 0)
+    row, column = np.where(result, near, 0).astype(np.intp)
+    return np.asarray(result & valid[row, column])
 
 
 def _information(movies: Movies, shift: Array) -> Information:
@@ -142,12 +153,10 @@ def _information(movies: Movies, shift: Array) -> Information:
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(movies.first, movies.others, places) * used[..., np.newaxis, np.newaxis]
+    moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
-        (mm, my, mx, mh), (_, yy, yx, yh), (*_, xx, xh), (*_, hh) = np.moveaxis(
-            sums, (2, 3), (0, 1)
-        )
-        auto, terms = blurred(sums[..., 0, 0], WINDOW), blurred(sums[..., 0, 3], WINDOW)
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
+        auto, terms = np.moveaxis(blurred(sums[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
@@ -155,8 +164,8 @@ def _information(movies: Movies, shift: Array) -> Information:
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         # Of all freedom, of which that outside the planes holds noise.
-        excess = residual / (variance * _VALUE_NOISE**2 * number) - 1.0
-        misfit = np.maximum(1.0 + excess / movies.outside, 1.0)
+        excess = residual / (variance * _VALUE_NOISE**2) - number
+        misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
@@ -171,27 +180,35 @@ def _information(movies: Movies, shift: Array) -> Information:
     return Information(tensor / movies.factor**2, gradient / movies.factor)
 
 
-def _positive(tensor: Array) -> Array:
-    """Tensors (3, y, x) without their negative eigenvalues, of noise that was subtracted."""
+def eigenvalues(tensor: Array) -> tuple[Array, Array]:
+    """Larger and smaller eigenvalue (y, x) of tensors (3, y, x)."""
     down, mixed, right = tensor
     middle, root = 0.5 * (down + right), np.hypot(0.5 * (down - right), mixed)
-    low, high = middle - root, np.maximum(middle + root, 0.0)
-    share = high / np.maximum(2.0 * root, np.finfo(np.float64).tiny)
+    return middle + root, middle - root
+
+
+def _positive(tensor: Array) -> Array:
+    """Tensors (3, y, x) without their negative eigenvalues."""
+    high, low = eigenvalues(tensor)
+    share = np.maximum(high, 0.0) / np.maximum(high - low, np.finfo(np.float64).tiny)
     unit = np.array([1.0, 0.0, 1.0])[:, np.newaxis, np.newaxis]
     return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
-def start(movies: Movies, spline: Spline) -> Field | None:
-    """Field of whole-pixel matches; None without any."""
+def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
+    """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
     reach = movies.shape[0] // 3, movies.shape[1] // 3
-    # In deviations of noise; the splines of the first movie are nearly its values.
-    pictures = [
-        picture / np.float32(level * _VALUE_NOISE)
-        for picture, level in zip(
-            (movies.first[EDGE:-EDGE, EDGE:-EDGE], *movies.others), movies.noise, strict=True
-        )
-    ]
-    rough, share = _whole_pixels(pictures[0], pictures[1:], movies.freedom, reach)
+    pictures = []
+    for film, level in zip(films, movies.noise, strict=True):
+        # Changes as large as there are seldom are cut: an object's, if rapid.
+        picture = blurred(film, BLUR)
+        usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
+        picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
+        pictures.append(picture)
+    functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
+    pictures = [np.asarray(picture @ functions, np.float32) for picture in pictures]
+    freedom *= functions.shape[1] / functions.shape[0]
+    rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
     share *= movies.valid
     if not share.any():
         return None
@@ -204,11 +221,18 @@ def start(movies: Movies, spline: Spline) -> Field | None:
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
     centres, zero = movies.centres(), np.zeros_like(share)
-    return spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
+    field = spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
+    for _ in range(_ROBUST):
+        step = target - field.on(centres)
+        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
+        data = Information(np.stack([kept, zero, kept]), kept * step)
+        field = spline.fitted(data, centres, field)
+    return field
 
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
+    field = replace(field, settled=False)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
         data = _information(movies, shift)
@@ -237,8 +261,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     """
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    sums = products(movies.first, movies.others, places, rate)
-    sums *= used[..., np.newaxis, np.newaxis]
+    sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
@@ -252,7 +275,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
         seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
-        moved, common, second = windows[..., 0, 0], windows[..., 0, 4], windows[..., 4, 4]
+        moved, common, second = (windows[..., place] for place in (0, 4, 14))
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals

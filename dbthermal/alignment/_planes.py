@@ -80,8 +80,12 @@ class Scale:
         """Noise of a capture (band) [K]."""
         if self.noise is not None:
             return np.asarray(self.noise * _noise_factor(corrected))
-        scatter, _ = noise_levels(sample(corrected), clocks.exposure_times(corrected))
-        return np.asarray(scatter / self.slopes)
+        signals = sample(corrected)
+        frames = np.all(np.isfinite(signals), axis=(0, 2))
+        scaled = [
+            signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)
+        ]
+        return noises.estimate_bands(scaled, corrected["time"].values[frames])
 
 
 def _noise_factor(corrected: xr.Dataset) -> Array:
@@ -149,15 +153,10 @@ class Capture:
 
     def functions(self, signals: Movie, period: float) -> Movie:
         """Functions (time, plane) of the changes within a period [frame] that signals show most."""
-        smoothing, sample = self.smoothing(period), signals.reshape(-1, signals.shape[-1])
-
-        def rapid(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
-            """Signals (time, ...) less their mean, and what the smoother passes."""
-            changes = flat - flat.mean(axis=0)
-            return np.asarray(changes - solveh_banded(smoothing, changes))
-
-        changes = rapid(sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))].T)
-        functions = rapid(smooth.leading(changes.T, _PLANES))
+        smoothing = self.smoothing(period)
+        sample = signals.reshape(-1, signals.shape[-1])
+        sample = sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))]
+        functions = rapid(smooth.leading(rapid(sample, smoothing), _PLANES).T, smoothing).T
         return np.ascontiguousarray(functions, np.float32)
 
     def planes(self, functions: list[Movie]) -> list[list[Movie]]:
@@ -191,19 +190,45 @@ class Capture:
         return list(np.concatenate(blocks, axis=1)), valid
 
 
+def freedom(functions: Movie) -> float:
+    """Degrees of freedom of white noise along functions of time (time, plane)."""
+    return float(np.sum(functions**2))
+
+
+def white(frames: int, period: float) -> float:
+    """Degrees of freedom of white noise that a smoother leaves, see `Capture.smoothing`."""
+    frequency = np.pi * (np.arange(frames) + 0.5) / frames
+    ratio = (np.sin(0.5 * frequency) / np.sin(np.pi / period)) ** 6
+    return float(np.sum((ratio / (1.0 + ratio)) ** 2))
+
+
 def bridged(film: Movie) -> tuple[Movie, Array]:
     """Film (time, pixel) with missing samples on the line between those before and after.
 
     Second, the share of samples (pixel) that are measured; a pixel without any is zero.
     """
-    measured, frame = schema.measured(film), np.arange(len(film))
+    measured = schema.measured(film)
     pixels = np.flatnonzero(~measured.all(axis=0))
-    result = film.copy() if pixels.size else film
-    for pixel in pixels:  # before the first and after the last sample their values go on
-        (present,) = np.nonzero(measured[:, pixel])
-        line = np.interp(frame, present, film[present, pixel]) if present.size else 0.0
-        result[:, pixel] = line
+    if not pixels.size:
+        return film, np.ones(film.shape[1])
+    present, frame = measured[:, pixels], np.arange(len(film))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(present, frame, -1), axis=0)
+    after = np.minimum.accumulate(np.where(present, frame, frame.size)[::-1], axis=0)[::-1]
+    # Before the first and after the last sample their values go on.
+    first, last = after[0] % frame.size, before[-1].clip(0)
+    before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
+    weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
+    result, samples = film.copy(), np.where(present, film[:, pixels], np.float32(0.0))
+    low, high = (np.take_along_axis(samples, place, 0) for place in (before, after))
+    result[:, pixels] = low + weight * (high - low)
     return result, measured.mean(axis=0)
+
+
+def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:
+    """Signal (y, x, time) less what a smoother passes."""
+    flat = signal.reshape(-1, signal.shape[-1]).T
+    flat = flat - flat.mean(axis=0)
+    return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
 
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
@@ -318,8 +343,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     for windows, rate in zip(sums, rates, strict=True):
         squares = np.array([len(rate), len(rate) * slope, len(rate) * slope, np.sum(rate**2)])
         squares *= side**2 * level
-        strong = [window for window in windows if window[0, 0] > (_STRONG + 1.0) * squares[0]]
-        result.append(normal_equations(np.reshape(strong, (-1, 5, 5)), squares))
+        strong = [window for window in windows if window[0] > (_STRONG + 1.0) * squares[0]]
+        result.append(normal_equations(np.reshape(strong, (-1, 15)), squares))
     return result
 
 

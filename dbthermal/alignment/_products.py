@@ -13,8 +13,7 @@ Movie = npt.NDArray[np.float32]
 Image = TypeVar("Image", bound=npt.NDArray[Any])
 
 _ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
-EDGE: Final = 3
-"""Pixels by which an image on splines is mirrored at its border."""
+_EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 
 
@@ -26,8 +25,12 @@ def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
 
 
 def blurred(image: Image, width: float) -> Image:
-    """Image (y, x, ...) blurred by a Gaussian of a width [pixel], mirrored at the border."""
-    result: Image = gaussian_filter(image, width, axes=(0, 1))
+    """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
+    impulse = np.zeros(2 * int(4.0 * width + 0.5) + 1)
+    impulse[impulse.size // 2] = 1.0
+    weights = gaussian_filter(impulse, width).astype(image.dtype)
+    lines = np.ascontiguousarray(image).reshape(1, len(image), -1)
+    result: Image = _blurred(_blurred(lines, weights).reshape(image.shape), weights)
     return result
 
 
@@ -37,48 +40,67 @@ def splines(movie: Movie, width: float) -> Movie:
     A B-spline blurs as well: so these are blurred by less, and no filter undoes it.
     """
     part = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
-    return np.pad(part, ((EDGE, EDGE), (EDGE, EDGE), (0, 0)), mode="symmetric")
+    return np.pad(part, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
 
 
 def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
-    """Sums over planes (other, y, x, signal, signal) of products of signals at places (2, y, x).
+    """Sums over planes (other, y, x, pair) of the products of signals at places (2, y, x).
 
-    Signals are the moved movie, of `splines`, its slopes down and right, with a matrix (plane,
-    plane) of the rate of change its rate, and last another movie.
+    Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
+    with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
+    the rate follows the slopes: 15 pairs.
     """
-    shape, count = places.shape[1:], 4 if rate is None else 5
-    result = np.empty((len(others), *shape, count, count))
+    shape, planes = places.shape[1:], movie.shape[2]
+    count = 4 if rate is None else 5
+    result = np.zeros((len(others), *shape, count * (count + 1) // 2))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
-        # Moved movie with its slopes and rate, once for all other movies.
-        signals = np.empty((count, places[0, rows].size, movie.shape[2]), movie.dtype)
-        signals[:3] = sampled(movie, places[:, rows].reshape(2, -1) + EDGE)
+        signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
         if rate is not None:
-            np.matmul(signals[0], rate, out=signals[3])
+            signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
         for other, out in zip(others, result, strict=True):
-            # Products of every pair of signals, summed over the planes.
-            signals[-1] = other[rows].reshape(signals.shape[1:])
-            pairs = np.einsum("ipt,jpt->pij", signals, signals)
-            out[rows] = pairs.reshape(out[rows].shape)
+            _sum_pairs(
+                signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2])
+            )
     return result
 
 
 def normal_equations(sums: Array, noise: Array) -> Array:
     """Normal equations A d = g (..., 4, 3) of steps down, right and in time, see `products`.
 
-    Of sums (..., 5, 5) over pixels, with a rate; the noise's part of the squares of the moved movie
+    Of sums (..., 15) over pixels, with a rate; the noise's part of the squares of the moved movie
     and of its changes (..., 4) is subtracted, half of them at most. The other movie is a ratio of
     the moved one, which is eliminated.
     """
-    full, places = sums.copy(), np.arange(4)
-    full[..., places, places] -= np.minimum(noise, 0.5 * sums[..., places, places])
+    rows, columns = np.triu_indices(5)
+    full = np.zeros((*sums.shape[:-1], 5, 5))
+    full[..., rows, columns] = full[..., columns, rows] = sums
+    places = np.arange(4)
+    squares = full[..., places, places]
+    full[..., places, places] -= np.minimum(noise, 0.5 * squares)
     size, cross = full[..., :1, :1], full[..., :1, 1:4]
     size = np.maximum(size, np.finfo(np.float64).tiny)
-    # Ratio k = m h / m m; A = k^2 (g g - g m m g / m m), and its right side.
     ratio = full[..., :1, 4:] / size
     tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
-    residual = ratio * (full[..., 4:, 1:4] - ratio * cross)
-    return np.concatenate([tensor, residual], axis=-2)
+    rest = ratio * (full[..., 4:, 1:4] - ratio * cross)
+    return np.concatenate([tensor, rest], axis=-2)
+
+
+@compiled
+def _blurred(movie: Any, weights: Any) -> Any:
+    """Image (line, place, plane) with weighted means over the places of each line."""
+    lines, size, planes = movie.shape
+    reach, result = weights.size // 2, np.zeros_like(movie)
+    for line, place in np.ndindex(lines, size):
+        out = result[line, place]
+        for i in range(weights.size):
+            # A place beyond an end is mirrored, as often as needed.
+            near = (place + i - reach) % (2 * size)
+            part = movie[line, min(near, 2 * size - 1 - near)]
+            weight = weights[i]
+            for t in range(planes):
+                out[t] += weight * part[t]
+    return result
 
 
 @compiled
@@ -118,3 +140,19 @@ def _cubic(away: float) -> float:
     """Cubic B-spline at a distance from its middle [pixel]."""
     far = abs(away)
     return (max(2.0 - far, 0.0) ** 3 - 4.0 * max(1.0 - far, 0.0) ** 3) / 6.0
+
+
+@compiled
+def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
+    """Sums over planes (pixel, pair) of the products of signals, in place."""
+    count, pixels, planes = signals.shape
+    for p in range(pixels):
+        place = 0
+        for i in range(count + 1):
+            first = signals[i, p] if i < count else last[p]
+            for j in range(i, count + 1):
+                second, total = signals[j, p] if j < count else last[p], np.float32(0.0)
+                for t in range(planes):
+                    total += first[t] * second[t]
+                out[p, place] = total
+                place += 1

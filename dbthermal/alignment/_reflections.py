@@ -5,13 +5,13 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._samples import neighbour_mean
 from dbthermal.alignment import _matching as matching
+from dbthermal.alignment import _planes as planes
 from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._planes import Capture, Scale
@@ -19,6 +19,7 @@ from dbthermal.alignment._products import Movie, binned
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _FEW: Final = 64  # functions of time on the coarsest image
+_START: Final = 20  # the same of the image on which whole pixels are matched
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
 # shorter one is known, and a chi-square by the shorter one's data below so much: of people before
@@ -95,13 +96,13 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     # more than noise.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
-    movies = capture.planes(functions)
+    movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
 
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
-        fine, noise = capture.valid, capture.noise
-        return Movies.blurred(pictures, fine, noise, functions[place], factor=factor, period=period)
+        freedom = planes.freedom(functions[place])
+        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
@@ -145,14 +146,23 @@ def _coarse(
             break
         tried[period] = capture.functions(signals[0], period)
         functions = tried[period][:, :_FEW]
+        white, freedom = planes.white(frames, period), planes.freedom(functions)
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(
-            pictures, valid, capture.noise, functions, factor=factor, period=period
-        )
+        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
+            # Whole frames, of which what is rare in a pixel's time is cut.
+            half = 2 if min(level.shape) >= 2 * _START else 1
+            rough = replace(
+                level,
+                valid=binned(level.valid * 1.0, half) > 0.5,
+                noise=level.noise / half,
+                factor=factor * half,
+            )
+            smoothing = capture.smoothing(period)
+            films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
-                begin = matching.start(level, spline)
+                begin = matching.start(rough, films, white, spline)
             except ValueError as error:  # slower changes may tell more
                 refusal = error
         if begin is None:
@@ -177,23 +187,18 @@ def _coarse(
     return result
 
 
-def _windows(data: Information, factor: int) -> tuple[Array, Array]:
-    """Information (y, x, 2, 2) and gradient (2, y, x) of the data of a window alone."""
-    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
-    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
-    return tensor, area * data.gradient
-
-
 def _resolved(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
-    return np.asarray(np.linalg.eigvalsh(_windows(data, factor)[0])[..., 1] > 1.0 / _KNOWN**2)
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
 
 
 def _squares(data: Information, factor: int = 1) -> Array:
     """Squares (2, y, x) of the steps that windows ask for, over their variances [1]."""
-    tensor, gradient = _windows(data, factor)
+    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
+    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
     inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
-    steps = np.einsum("yxij,jyx->iyx", inverse, gradient)
+    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
     return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
 
 
@@ -203,8 +208,12 @@ def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> A
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    chi = neighbour_mean(squares, resolved * 1.0, _WIDE / level.factor)
-    return np.asarray(np.fmax(chi, 1.0) * field.variances(level.centres()))
+    sums = [
+        gaussian_filter(array * resolved, _WIDE / level.factor, axes=(-2, -1))
+        for array in (squares, np.ones(resolved.shape))
+    ]
+    chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
+    return np.asarray(chi * field.variances(level.centres()))
 
 
 def _result(
