@@ -422,7 +422,7 @@ def check(
             ]
             nearest = max(fitting, key=lambda stage_name: len(STAGES[stage_name]), default="")
             present = f"{sorted(map(str, dataset))}" + (f", as has a {nearest}" if nearest else "")
-            raise ValueError(f"Missing variable '{name}' in {label}. Has {present}.")
+            raise ValueError(f"Missing variable '{name}' in {label}: {present}. Must be there.")
         variable = STAGES[stage].get(name) or OPTIONAL[stage][name]
         check_variable(dataset[name], variable, f"'{name}' of {label}")
     return dataset

@@ -67,12 +67,11 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
-    bands = [str(band) for band in result["band"].values]
     for entry in listed:
-        numbers_by_band = zip(bands, *(entry[key].values() for key in _EMISSIVITIES), strict=True)
+        columns = (entry[key].values() for key in _EMISSIVITIES)
         values = ", ".join(
             f"{value:.3f} +- {std:.2g} ({band}; +- {steady:.2g} if no surroundings drift)"
-            for band, value, std, steady in numbers_by_band
+            for band, value, std, steady in zip(entry["emissivity"], *columns, strict=True)
         )
         name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
         sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")

@@ -296,6 +296,9 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
+    if "drift_std" in completed:  # in the deviation of a completed emissivity as a whole
+        drift = completed["drift_std"].values
+        drift[y, x] = np.nan_to_num(drift[y, x])
     if source in _BITS:
         completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
     completed["status"].values[y, x] |= beyond * np.uint32(Status.OUTSIDE_RESPONSE)
