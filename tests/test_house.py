@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3730, 19),
     "_cli": (1190, 8),
-    "alignment": (2910, 13),
+    "alignment": (3010, 13),
     "calibration": (850, 3),
     "correction": (1920, 8),
     "emissivity": (510, 3),
@@ -22,11 +22,11 @@ BUDGET = {
     "limits": (730, 4),
     "readers": (2640, 10),
     "reporting": (710, 4),
-    "separation": (12880, 55),
+    "separation": (12840, 54),
     "simulation": (640, 3),
     "store": (1510, 7),
 }
-INSTALLED = 38_180  # lines of all rooms
+INSTALLED = 38_240  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
