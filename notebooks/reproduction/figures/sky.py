@@ -33,7 +33,7 @@ def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]
         axis.text(
             hour, high + 0.1 * (high - low), text, ha="center", va="bottom", rotation=90, fontsize=6
         )
-    axis.set(ylim=(low - 1.0, high + 0.7 * (high - low)), xlim=(0.0, 24.0))
+    axis.set(ylim=(low - 1.0, high + 0.9 * (high - low)), xlim=(0.0, 24.0))
     axis.set_xlabel("universal time [h]")
     axis.set_ylabel("reading [°C]")
     axis.legend(loc="lower right", fontsize=7)
