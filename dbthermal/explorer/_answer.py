@@ -17,7 +17,7 @@ _VAGUE: Final = 0.15  # deviation from which most is alike: the demonstration's 
 _RANGE: Final = (1.0, 99.0)  # percentiles of the temperatures that are said
 _ROWS, _TIMES = 64, 60  # of the image and the film that are looked at, at most
 _COMMON: Final = 0.02  # share of the pixels from which a material is listed
-# Of a material by band: with its deviation, and with that before surroundings that do not drift.
+# Of a material by band: with its deviation, and with that in steady surroundings.
 _EMISSIVITIES: Final = ("emissivity", "emissivity_std", "emissivity_steady_std")
 _DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
 
@@ -70,7 +70,7 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     for entry in listed:
         columns = (entry[key].values() for key in _EMISSIVITIES)
         values = ", ".join(
-            f"{value:.3f} +- {std:.2g} ({band}; +- {steady:.2g} if no surroundings drift)"
+            f"{value:.3f} +- {std:.2g} ({band}; +- {steady:.2g} in steady surroundings)"
             for band, value, std, steady in zip(entry["emissivity"], *columns, strict=True)
         )
         name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
