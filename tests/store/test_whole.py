@@ -25,6 +25,7 @@ RANDOM = np.random.default_rng(1).random((40, 2**17))
 WRITER = """
 import os, signal, sys, time
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored behind a shell
 from dbthermal import store
 with store.whole(sys.argv[1], ".md") as draft:
     draft.write_text("half")
