@@ -1,6 +1,7 @@
 """Emulated time: the same bytes whatever the computer does, and a clock that waits for nobody."""
 
 import hashlib
+import multiprocessing
 import os
 import threading
 from collections.abc import Iterator
@@ -49,6 +50,27 @@ def recorded(folder: Path) -> dict[str, str]:
     return {**files, "previews": str(order)}
 
 
+def spin() -> None:
+    """Keep a core busy."""
+    while True:
+        pass
+
+
+@contextmanager
+def load(processes: int) -> Iterator[None]:
+    """Keep the computer busy with some processes."""
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=spin, daemon=True) for _ in range(processes)]
+    for process in busy:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.join()
+
+
 @contextmanager
 def single_core() -> Iterator[None]:
     """Run on one core, where the system can tell a process so."""
@@ -62,13 +84,15 @@ def single_core() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def test_a_recording_has_the_same_bytes_on_one_core(tmp_path: Path) -> None:
-    """Every file of a sweep and of a scene is the same, however the threads are scheduled."""
+def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Path) -> None:
+    """Every file of a sweep and of a scene is the same, at rest, under load and on one core."""
     first = recorded(tmp_path / "rest")
     assert len(first) > 100
+    with load(2):
+        assert recorded(tmp_path / "load") == first
     with single_core():
         assert recorded(tmp_path / "core") == first
-    capture = open_capture(tmp_path / "core" / "scene.zarr")
+    capture = open_capture(tmp_path / "load" / "scene.zarr")
     assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
     totals = capture.attrs["totals"]
     assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}

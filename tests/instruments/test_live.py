@@ -2,17 +2,19 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import BANDS
+from rig_session import LEVELS, QUICK, from_yaml, rig, scene_text
 
 from dbthermal import schema, simulation
 from dbthermal.figures import Panel
 from dbthermal.figures import live as draw
-from dbthermal.instruments import live
+from dbthermal.instruments import live, protocols
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
 from dbthermal.instruments.recording import Preview
 from dbthermal.separation import Stream
@@ -271,3 +273,16 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     assert view.figure is not None
     titles = [axis.get_title() for axis in view.figure.axes]
     assert titles[2:4] == ["object", "background"]
+
+
+def test_recording_without_a_notebook(tmp_path: Path) -> None:
+    """Two emulated cameras are watched from within a recording, each by its own frames."""
+    view = live.View(title="test", is_simulated=True)
+    with rig(from_yaml(scene_text().replace("0.15", "1.5"))) as devices:
+        devices.prepare()
+        protocols.record_scene(devices, tmp_path / "a.zarr", limits=QUICK, preview=view)
+    for band, sample in view.status.items():
+        assert (sample.lowest, sample.highest) == (LEVELS[band] + 2962, LEVELS[band] + 2963)
+        np.testing.assert_allclose(sample.fpa_temperature, 308.15, rtol=0, atol=0.06)
+        assert (sample.ffc, sample.lost) == ("complete", 0)
+    assert texts(view)[-1].startswith(f"blackbody 23.0 {DEGREE}, plate 56.9 {DEGREE}")

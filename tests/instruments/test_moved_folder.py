@@ -1,5 +1,6 @@
 """A recording whose folder is moved goes on in it whole; one that loses a part ends and says so."""
 
+import os
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -184,6 +185,27 @@ def test_a_recorder_follows_its_folder(tmp_path: Path, monkeypatch: pytest.Monke
         np.testing.assert_array_equal(np.diff(numbers), 1)
         assert numbers.size > 30
     assert list(tmp_path.glob("**/*.zarr")) == [summary.path]
+
+
+def test_a_folder_that_is_moved_while_it_is_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Moved just after its new place was read, it is found at the next one."""
+    (tmp_path / "a").mkdir()
+    folder, places = store.HeldFolder(tmp_path / "a"), [tmp_path / name for name in "abcd"]
+    read = os.path.realpath
+
+    def moving(path: Path) -> str:
+        place = read(path)
+        if len(places) > 1:
+            places.pop(0).rename(places[0])
+        return place
+
+    monkeypatch.setattr(os.path, "realpath", moving)
+    assert folder.place() == tmp_path / "d"
+    (tmp_path / "d").rmdir()
+    with pytest.raises(FileNotFoundError, match="was deleted"):
+        folder.place()
 
 
 def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:

@@ -127,8 +127,8 @@ def test_importing_the_instruments_is_light() -> None:
     """No library is loaded before its use, of devices by the drivers, of figures by the watch."""
     code = (
         "import sys; from dbthermal import instruments as all\n"
-        "print({'serial', 'numpy'} & {*sys.modules})\n"
-        "all.tc08.CHANNELS; print({'serial'} & {*sys.modules})\n"
+        "print({'serial', 'usb', 'numpy'} & {*sys.modules})\n"
+        "all.tc08.CHANNELS; print({'serial', 'usb'} & {*sys.modules})\n"
         "all.live.Watch; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
