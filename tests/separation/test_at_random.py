@@ -52,7 +52,6 @@ def at_random(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.* of the pixels with moving reflections do not show the same")
-@pytest.mark.filterwarnings("ignore:The image moved from frame to frame")  # seed 0, of 0.1 pixel
 def test_hardly_a_pixel_is_wrong_without_a_flag() -> None:
     """Of eight scenes: pixels beyond five deviations, and the intervals of all, in each way."""
     counted = dict.fromkeys(("without a flag", "completed"), np.zeros(3))
