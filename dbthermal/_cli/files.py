@@ -16,7 +16,7 @@ from dbthermal._arrays import on_disk, release
 from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal._warnings import warned
 from dbthermal.explorer._answer import answer
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _formats as formats
 
 _MADE_BY = {
     "capture": "import",
@@ -67,13 +67,13 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
 
 def kind_of(path: Path, options: argparse.Namespace) -> str:
     """Kind of a recording's file: by its first bytes, its suffix, or a shape that is stated."""
-    reader, suffix, raw = recordings.reader_of(path), path.suffix.lower(), options.shape is not None
+    reader, suffix, raw = formats.reader_of(path), path.suffix.lower(), options.shape is not None
     kinds = [kind for kind, (function, _) in READERS.items() if function.__name__ == reader]
     kinds += [kind for kind, (_, suffixes) in READERS.items() if suffix in suffixes]
     if not reader and raw:  # of any suffix but those of TIFF and arrays
         kinds = [*(kind for kind in kinds if kind != "FLIR"), "raw files"]
     if not kinds:
-        recordings.refuse_text(path)  # a file that is missing has no format
+        formats.refuse_text(path)  # a file that is missing has no format
         label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
         rule = "Must be a recording; bare numbers need --shape and --byte-order"
         raise ValueError(f"{label}. {rule}.")
@@ -85,7 +85,7 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     kind = kind_of(paths[0], options)
     reader, _ = READERS[kind]
     if kind != "raw files":
-        recordings.refuse_text(paths[0])  # of a suffix that promises more
+        formats.refuse_text(paths[0])  # of a suffix that promises more
     stated = _arguments(reader, options, paths[0].name, camera)
     selected = {"time": frames_of(options), "y": _rows_of(options)} if "rows" in options else {}
     if stated.pop("frames", None) and selected and "frames" in signature(reader).parameters:
@@ -168,8 +168,8 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: float | None
 def _room(options: argparse.Namespace) -> Path:
     """Folder for films on disk: beside the output, or that of the system."""
     output: Path | None = vars(options).get("output")
-    beside = output.absolute().parent if output else Path(gettempdir())
-    return beside if beside.is_dir() else Path(gettempdir())
+    folder = output.absolute().parent if output else Path(gettempdir())
+    return folder if folder.is_dir() else Path(gettempdir())
 
 
 def make_capture(options: argparse.Namespace) -> dict[str, Any]:
@@ -250,10 +250,10 @@ def info(options: argparse.Namespace) -> dict[str, Any]:
 
 def _is_store(path: Path) -> bool:
     """Tell whether a folder is a store of dbthermal or a part of one, not one of other programs."""
-    whole, part = path.parent / "zarr.json", path / "zarr.json"
-    if not part.is_file():
+    group, member = path.parent / "zarr.json", path / "zarr.json"
+    if not member.is_file():
         return False
-    text = (whole if whole.is_file() else part).read_text(encoding="utf-8", errors="replace")
+    text = (group if group.is_file() else member).read_text(encoding="utf-8", errors="replace")
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 
 

@@ -106,9 +106,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     stds = np.zeros(counts.sizes["band"])
     if "pattern_std" in corrected:
         stds = np.nan_to_num(corrected["pattern_std"].values)
-    reach, time = _REACH_FRAMES, counts["time"].values.astype(np.float64)
-    if time.size >= MINIMUM_FRAMES:
-        reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
+    reach = _reach(counts["time"].values.astype(np.float64))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
@@ -251,6 +249,13 @@ def _samples(movie: xr.DataArray, rows: slice) -> Single:
     """Counts of a block of rows, NaN where they are no measurement."""
     counts = movie.isel(y=rows).values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
+
+
+def _reach(time: Array) -> int:
+    """Frames within which a neighbour may change as well: those of 0.2 s, or five if more."""
+    if time.size < MINIMUM_FRAMES:
+        return _REACH_FRAMES
+    return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:

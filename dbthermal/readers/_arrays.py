@@ -17,6 +17,7 @@ import xarray as xr
 from dbthermal import schema
 from dbthermal._arrays import Array, empty, parts
 from dbthermal.readers import _containers as containers
+from dbthermal.readers import _formats as formats
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock
 
@@ -86,7 +87,7 @@ def array(
 
     stored, path = np.inf, Path()
     if isinstance(source, str | Path):
-        (path,) = recordings.files([source], "array")
+        (path,) = formats.files([source], "array")
         inside = path.rglob("*") if path.is_dir() else [path]
         stored = sum(file.lstat().st_size for file in inside)
     rules = _Rules(label, unit, clock, memory, stored, {}, [])
@@ -98,7 +99,7 @@ def array(
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             listed = (axis for axis in coords if containers.are_times(axis.name, axis))
             rules.compare(next(listed, None))
-        elif (kind := recordings.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
+        elif (kind := formats.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
             values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
             values = _numpy_file(path, name, rules, stack)

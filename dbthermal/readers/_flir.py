@@ -17,9 +17,11 @@ from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal._warnings import warned
 from dbthermal.readers import _flir_records as container
+from dbthermal.readers import _formats as formats
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._flir_records import Content, Frame
-from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag, Paths
+from dbthermal.readers._formats import Paths
+from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
 
 # Place in the camera's record [byte], type, and limits beyond which a value is implausible.
 _FIELDS: Final = {
@@ -127,7 +129,7 @@ def flir(
     Traceback (most recent call last):
     ValueError: Refused 'recording.ravi': export its counts as 16-bit TIFF with the maker's program and use readers.tiff.
     """  # noqa: E501
-    paths = recordings.files(path, "flir")
+    paths = formats.files(path, "flir")
     name = recordings.label(paths)
     recordings.check_number(memory, "memory")
     wanted = slice(None) if frames is None else frames
@@ -203,7 +205,7 @@ def _image(content: Content, records: Frame, place: str) -> _Image:
     width, height = struct.unpack_from(f"{order}HH", head, 2)
     image = _Image((height, width), order, "none", body)
     stated = (height, width, 16)
-    if body[:8] == recordings.PNG:
+    if body[:8] == formats.PNG:
         image = image._replace(order="", codec="png")
         stated = recordings.png_size(body, place)
     elif body[:2] == b"\xff\xd8":

@@ -1,4 +1,4 @@
-"""Parts that all readers of recordings share: files, byte order, clock, and the Dataset made."""
+"""Parts that all readers of recordings share: byte order, clock, and the Dataset made."""
 
 import lzma
 import re
@@ -20,53 +20,14 @@ from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array, empty, made_on_disk, parts
 from dbthermal._warnings import warned
+from dbthermal.readers._formats import PNG
 
 Counts = npt.NDArray[np.uint16]
 
-Paths = str | Path | Sequence[str | Path]
 Clock = float | npt.ArrayLike
 
-# First bytes of a format: place, bytes, and its name.
-_MAGIC: Final = (
-    *((0, mark, "FLIR") for mark in (b"FFF\0", b"AFF\0")),
-    *((0, mark, "TIFF") for mark in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
-    *((0, mark, "NetCDF") for mark in (b"CDF\1", b"CDF\2", b"CDF\5")),
-    *((0, mark, "film") for mark in (b"\x1aE\xdf\xa3", b"GIF8")),
-    *((8, b"AVI ", "film"), (4, b"ftyp", "film"), (8, b"WEBP", "picture"), (0, b"BM", "picture")),
-    *((0, b"\xff\xd8\xff", "JPEG"), (0, b"\x89PNG\r\n\x1a\n", "PNG")),
-    *((0, b"\x93NUMPY", "NumPy"), (0, b"PK\3\4", "zip"), (0, b"MATLAB 5.0", "MATLAB 5")),
-    *((0, b"\x0e\x03\x13\x01", "HDF4"), (0, b"SIMPLE  =", "FITS"), (4, b"jP  ", "JPEG 2000")),
-    *((0, b"\x1f\x8b\x08", "gzip"), (0, b"P5\n", "PGM"), (0, b"P5 ", "PGM")),
-    *((0, b"\x80\4\x95", "pickle"), (0, b"\x80\5\x95", "pickle")),
-)
-PNG: Final = b"\x89PNG\r\n\x1a\n"
-_HDF5: Final = b"\x89HDF\r\n\x1a\n"  # at 0, 512, 1024, ...: what precedes is the user's
-_READER: Final = {
-    **dict.fromkeys(("FLIR", "JPEG"), "flir"),
-    **dict.fromkeys(("TIFF", "PNG"), "tiff"),
-    **dict.fromkeys(("NumPy", "zip", "HDF5", "NetCDF", "zarr"), "array"),
-}
-_EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
-_DRAWN: Final = (
-    "most have 8 bits that are drawn, not measured: record 16-bit counts; one of 16-bit counts is "
-    "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
-)
-_FOREIGN: Final = {
-    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".hcc"), _EXPORT),
-    ".sfmov": f"{_EXPORT}, or readers.raw with header=, up to the line of DATA",
-    **dict.fromkeys(("film", "picture"), _DRAWN),
-    "MATLAB 5": "save it anew by save(..., '-v7.3') and use readers.array",
-    "HDF4": "convert it by h4toh5 and use readers.array",
-    **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
-    "gzip": "unpack it by gunzip",
-    **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
-    "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",
-}
-"""What to do with a format that no reader opens, by suffix or first bytes."""
 MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default [byte]
-_LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _FASTEST: Final = 1e6  # frame rate of a camera [Hz]
-_TEXT: Final = 512  # bytes at the beginning of a file, without a control character
 _STEPS: Final = (1e-3, 1.0)  # between frames whose times have no unit and are seconds [s]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
 # What the libraries of the formats raise for files that are damaged.
@@ -106,65 +67,6 @@ class FileFlag(schema.Flags):
     TIME_STANDS = 2, "the time does not rise, or is not known"
     PADDED = 4, "no frame: the band has fewer than another, and its last one is repeated"
     NUMBERS_DIFFER = 8, "image and time are of frames of different numbers"
-
-
-def format_of(path: Path) -> str:
-    """Format of a file by its first bytes, empty if unknown; of a folder zarr."""
-    if path.is_dir():
-        return "zarr"
-    size = texts.regular_file(path, _LARGEST).stat().st_size
-    with path.open("rb") as stream:
-        start, place = stream.read(16), 0
-        while place < size:
-            stream.seek(place)
-            if stream.read(8) == _HDF5:
-                return "HDF5"
-            place = 2 * place or 512
-    return next((name for at, mark, name in _MAGIC if start[at:].startswith(mark)), "")
-
-
-def refuse_text(path: Path) -> None:
-    """Raise ValueError for a file that begins as a text; bare numbers hardly ever do."""
-    if format_of(path):
-        return
-    with path.open("rb") as stream:
-        start = stream.read(_TEXT)
-    if start and not re.search(rb"[^\t\r\n -~\x80-\xff]", start):
-        raise ValueError(f"Refused '{path.name}', a text: {_FOREIGN['text']}.")
-
-
-def reader_of(path: Path) -> str:
-    """Reader of a file by its first bytes, empty if unknown; ValueError for a foreign format."""
-    form, suffix = format_of(path) if path.exists() else "", path.suffix.lower()
-    if suffix in _FOREIGN and form in {"", "film", "picture", "zip"}:
-        raise ValueError(f"Refused '{path.name}': {_FOREIGN[suffix]}.")
-    if form in _FOREIGN:
-        raise ValueError(f"Refused '{path.name}', a {form}: {_FOREIGN[form]}.")
-    return _READER.get(form, "")
-
-
-def files(path: Paths, reader: str) -> list[Path]:
-    """Regular files of a recording, in the order of time; ValueError by what to do instead."""
-    listed = path if isinstance(path, list | tuple) else [path]
-    paths = [texts.as_path(file) for file in listed]
-    if not paths:
-        raise ValueError("Empty list of files. Must name at least one.")
-    numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
-    for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):
-        if len(before) == len(after) and after <= before:
-            rule = (
-                "Must rise, not in the order of text, frame1, frame10, frame2: $(ls -v frame*.png)"
-            )
-            raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
-    for file in paths:
-        actual = "" if reader == "raw" else reader_of(file)
-        if actual not in {"", reader}:
-            label = f"Invalid '{file.name}' for readers.{reader}, by its first bytes"
-            raise ValueError(f"{label}. Must be read by readers.{actual}.")
-        is_store = actual == "array" and file.is_dir()
-        if not is_store and texts.regular_file(file, _LARGEST).stat().st_size == 0:
-            raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
-    return paths
 
 
 def numbered(paths: Sequence[Path]) -> Array | None:
@@ -241,12 +143,12 @@ def film(values: Any) -> Counts:
     """
     counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
     for frames in parts(counts):
-        part, place = values[frames], counts[frames]
-        part = part.compute() if hasattr(part, "compute") else part  # NumPy alone loses a mask
-        part = part.data if isinstance(part, xr.DataArray) else part
-        if np.ma.is_masked(part):
+        block, place = values[frames], counts[frames]
+        block = block.compute() if hasattr(block, "compute") else block  # NumPy alone loses a mask
+        block = block.data if isinstance(block, xr.DataArray) else block
+        if np.ma.is_masked(block):
             raise ValueError("Missing counts in 'array': masked. Must all be there.")
-        actual = np.asarray(part)
+        actual = np.asarray(block)
         if (actual.dtype, actual.shape) != (values.dtype, place.shape):
             label = f"{actual.dtype} {actual.shape} of frames from {frames.start} on"
             raise ValueError(f"Invalid {label}. Must be {values.dtype} {place.shape}, as declared.")

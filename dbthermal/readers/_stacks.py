@@ -14,8 +14,10 @@ import numpy as np
 import xarray as xr
 
 from dbthermal._arrays import Array, empty, release
+from dbthermal.readers import _formats as formats
 from dbthermal.readers import _recording as recordings
-from dbthermal.readers._recording import MEMORY, Clock, Counts, Paths
+from dbthermal.readers._formats import Paths
+from dbthermal.readers._recording import MEMORY, Clock, Counts
 
 # What a page must say: the attribute of tifffile's page, or the tag, which is 1 where it is
 # missing; its name in messages, and the value.
@@ -119,7 +121,7 @@ def tiff(
     >>> bool((capture.counts == frames).all()), capture.time.values.round(3).tolist()  # [s]
     (True, [0.0, 0.033])
     """
-    paths = recordings.files(path, "tiff")
+    paths = formats.files(path, "tiff")
     name = recordings.label(paths)
     recordings.check_unit(unit, name)
     # Pages of one size, and the memory that they take.
@@ -195,7 +197,7 @@ def raw(
     >>> bool((capture.counts == frames).all())
     True
     """
-    (file,) = recordings.files([path], "raw")
+    (file,) = formats.files([path], "raw")
     name = file.name
     recordings.check_unit(unit, name)
     # Form, as stated.
@@ -309,7 +311,7 @@ def _values(page: _Page) -> Iterator[Counts]:
 
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
-    if recordings.format_of(path) == "PNG":
+    if formats.format_of(path) == "PNG":
         with path.open("rb") as stream:
             rows, columns, _ = recordings.png_size(stream.read(32), f"'{path.name}'")
         return [_Page(path, (rows, columns), 1, ">", [(0, path.stat().st_size)], [], "png")]

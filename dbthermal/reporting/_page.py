@@ -39,19 +39,10 @@ _FILM: Final = Markup("""{
 
 @dataclass(frozen=True)
 class Section:
-    """Part of a page under one heading.
-
-    Attributes
-    ----------
-    title : str
-        Heading.
-    body : sequence of str or Markup
-        Paragraphs; a plain string is text, and is shown as it is written. `table`, `image_tag` and
-        `film_tag` make Markup.
-    """
+    """Part of a page under one heading."""
 
     title: str
-    body: Sequence[str]
+    body: Sequence[str]  # paragraphs: Markup, or plain text that is shown as it is written
 
 
 def save_page(  # noqa: PLR0913 - what is above the sections, by name
@@ -66,24 +57,9 @@ def save_page(  # noqa: PLR0913 - what is above the sections, by name
     answer: Sequence[str] = (),
     logo: str | Path | None = None,
 ) -> None:
-    """Save sections as one HTML file that asks for nothing else.
+    """Save sections as one HTML file that asks for nothing else, with its numbers as JSON in it.
 
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.html``. Its parents are made.
-    title, origin : str
-        Title, and beside it what the data are: "measured", "simulated", "emulated".
-    sections : iterable of Section
-        In their order.
-    numbers, provenance : mapping
-        Numbers, kept in the page as JSON in the element ``numbers``; from `store.provenance`.
-    about : str
-        Author, date and files, beside the origin.
-    answer : sequence of str
-        Sentences above the sections.
-    logo : str or Path, optional
-        File ``*.png`` beside the title, of at most 1 MB.
+    Above the sections: title, logo, origin of the data, author and files, sentences of the answer.
     """
     picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
     if logo is not None and not picture.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -106,17 +82,7 @@ def save_page(  # noqa: PLR0913 - what is above the sections, by name
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, names: int = 1) -> Markup:
-    """Table of text and numbers.
-
-    Parameters
-    ----------
-    head : sequence of str
-        Headings of the columns.
-    rows : iterable of sequence
-        Cells, each shown as its text.
-    names : int
-        Columns of names, to the left; the others are numbers, to the right.
-    """
+    """Table with columns of names, to the left, and of numbers, to the right."""
 
     def cells(row: Sequence[object], tag: str) -> Markup:
         kinds = ("name" if index < names else "number" for index in range(len(row)))
@@ -132,49 +98,26 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, names: int =
     )
 
 
-def image_tag(image: Figure | str | Path, text: str) -> Markup:
-    """Figure as a picture within the page: a matplotlib figure as vectors, a PNG file as it is.
-
-    Parameters
-    ----------
-    image : Figure, str or Path
-        A figure, or a file ``*.png``.
-    text : str
-        What it shows, for whoever cannot see it; the caption.
-    """
-    if isinstance(image, Figure):
-        buffer = io.BytesIO()
-        with mpl.rc_context({"svg.hashsalt": "dbthermal", "svg.fonttype": "path"}):
-            image.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
-        kind, content = "svg+xml", buffer.getvalue()
-    else:
-        kind, content = "png", Path(image).read_bytes()
-    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+def image_tag(image: Figure, text: str) -> Markup:
+    """Figure as a picture of vectors within the page, with its caption."""
+    buffer = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "dbthermal", "svg.fonttype": "path"}):
+        image.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
+    source = f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode()}"
     return Markup('<figure><img src="{}" alt="{}"><figcaption>{}</figcaption></figure>').format(
         source, text, text
     )
 
 
-def film_tag(path: str | Path, text: str, poster: str | Path | None = None) -> Markup:
-    """Film within the page.
-
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.mp4``, as from `store.save_video`.
-    text : str
-        Caption.
-    poster : str or Path, optional
-        File ``*.png`` that is shown before it plays; its first frame if not given.
-    """
-    content = base64.b64encode(Path(path).read_bytes()).decode()
-    still = base64.b64encode(Path(poster).read_bytes()).decode() if poster else ""
+def film_tag(path: Path, text: str, poster: Path) -> Markup:
+    """Film ``*.mp4`` within the page, with its caption, and a picture ``*.png`` before it plays."""
+    content, still = (base64.b64encode(file.read_bytes()).decode() for file in (path, poster))
     picture = Markup('<img src="data:image/png;base64,{}" alt="{}">').format(still, text)
     return Markup(
         '<figure class="film">{}<video loop muted playsinline src="data:video/mp4;base64,{}">'
         '</video><figcaption><button type="button">Play the film</button> {}</figcaption>'
         "<script>{}</script></figure>"
-    ).format(picture if still else "", content, text, _FILM)
+    ).format(picture, content, text, _FILM)
 
 
 def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:

@@ -134,13 +134,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     }
     table_ = emissivity.embedded_table() if materials is None else materials
     # Numbers of the scene, which the page holds as JSON.
-    (rows, columns), frames = view.shape, int(view.time.size)
-    seconds = float(view.time[-1] - view.time[0])
-    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
-    if "method" in result.attrs:
-        sentence += f"; separated by the method '{result.attrs['method']}'"
+    sentence, extent = _extent(view)
     numbers: dict[str, Any] = {
-        "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
+        "scene": extent,
         "validity": _validity(view),
         "uncertainty": _budget(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
@@ -172,6 +168,16 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
             for sentence in sentences
         ],
     )
+
+
+def _extent(view: View) -> tuple[str, dict[str, Any]]:
+    """Size and duration of a scene, as a sentence with its method, and as numbers."""
+    (rows, columns), frames = view.shape, int(view.time.size)
+    seconds = float(view.time[-1] - view.time[0])
+    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
+    if "method" in view.data.attrs:
+        sentence += f"; separated by the method '{view.data.attrs['method']}'"
+    return sentence, {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds}
 
 
 def _regions(

@@ -297,10 +297,12 @@ def hold(
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
-    local = np.where(common, _around(square, common), 0.0)
+    local = np.where(common, _neighbour_mean(square, common), 0.0)
     more = common & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
-    constant = np.where(valid & ~sound, _around(square * variance, common | (stay & sound)), 0.0)
+    constant = np.where(
+        valid & ~sound, _neighbour_mean(square * variance, common | (stay & sound)), 0.0
+    )
     factor, film = square * common, pooled["object_temperature_std"].values
     maps = [
         (pooled[name].values, variable.values)
@@ -333,7 +335,7 @@ def _border(labels: Array) -> Mask:
     return np.asarray(minimum_filter(whole, size) < maximum_filter(whole, size))
 
 
-def _around(values: Array, counted: Mask) -> Array:
+def _neighbour_mean(values: Array, counted: Mask) -> Array:
     """Mean (y, x) of the known pixels around."""
     sums = [
         gaussian_filter(array, _AROUND) for array in (np.where(counted, values, 0.0), counted * 1.0)

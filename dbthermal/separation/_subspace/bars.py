@@ -40,9 +40,9 @@ def blocks(frames: int) -> tuple[Whole, tuple[float, float]]:
 @inlined
 def _curve_variance(model: Model, kernel: Array, count: int, variance: float, work: Work) -> float:
     """Variance of a kernel's sum over the object's smoothed noise."""
-    part = work.columns[:count]
-    kernels.projected(model.object_part, model.spans, count, kernel, part)
-    return float(variance * kernels.dot(part, part))
+    projection = work.columns[:count]
+    kernels.projected(model.object_part, model.spans, count, kernel, projection)
+    return float(variance * kernels.dot(projection, projection))
 
 
 @inlined
@@ -140,7 +140,7 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times. The residual of a frame of rest holds both.
     resting, more, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
-    beside = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
+    widening = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
     for t in range(frames):
         flat = 1.0 / work.steepness[t]
         sensitivity[t] *= flat
@@ -148,7 +148,7 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
         resting += 1.0 if work.residual[t] ** 2 < WITHIN**2 * expected else 0.0
-        work.variance[t] = square * beside + smooth_variance[t]
+        work.variance[t] = square * widening + smooth_variance[t]
     return resting < RESTING * frames
 
 
@@ -274,9 +274,9 @@ def _pattern(model: Model, work: Work) -> None:
     for m in range(work.share.size):
         direct, square = work.share[m] / (1.0 - work.emissivity[m]), model.pattern[m] ** 2
         for t in range(slope.size):
-            part = work.null_weights[m] / steepness[t]
-            work.variance[t] += square * part**2
-            off = (direct - through[t] * part) / slope[t]
+            share = work.null_weights[m] / steepness[t]
+            work.variance[t] += square * share**2
+            off = (direct - through[t] * share) / slope[t]
             work.background_variance[t] += square * off**2
 
 
@@ -299,12 +299,12 @@ def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
             residual[t] += weight * signal[t]
     record.correlation, record.delay, record.unexplained = _unsteady(model, record, work)
     for block in range(model.parts.size - 1):
-        one, other = 0.0, 0.0
+        residual_sum, curve_sum = 0.0, 0.0
         # Whole numbers without a sign: an index from the end need not be looked for.
         for t in range(np.uintp(model.parts[block]), np.uintp(model.parts[block + 1])):
-            one += residual[t]
-            other += work.target[t]
-        sums[0, block], sums[1, block] = one, other
+            residual_sum += residual[t]
+            curve_sum += work.target[t]
+        sums[0, block], sums[1, block] = residual_sum, curve_sum
 
 
 @inlined

@@ -181,8 +181,8 @@ def _values(bases: list[Array], i: int) -> Array:
     if i >= inner and basis.shape[0] == basis.shape[1]:  # any curve
         return np.empty(0)
     if 2 * i + 1 < inner:
-        left, right = bases[2 * i + 1 : 2 * i + 3]
-        basis = np.concatenate([left.T @ basis[: len(left)], right.T @ basis[len(left) :]])
+        earlier, later = bases[2 * i + 1 : 2 * i + 3]
+        basis = np.concatenate([earlier.T @ basis[: len(earlier)], later.T @ basis[len(earlier) :]])
     return basis.T.ravel()
 
 
@@ -249,9 +249,9 @@ def _best(tree: Tree, scratch: Scratch, axes: Array, weights: Array, least: Arra
         for j in range(result.size):
             result[j] = weights[0, j] * a + weights[1, j] * b + weights[2, j] * d + price
         if i < inner:
-            left, right = least[2 * i + 1], least[2 * i + 2]
+            earlier, later = least[2 * i + 1], least[2 * i + 2]
             for j in range(result.size):
-                result[j] = min(result[j], left[j] + right[j])
+                result[j] = min(result[j], earlier[j] + later[j])
 
 
 @compiled
