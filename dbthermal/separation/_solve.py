@@ -351,8 +351,8 @@ def _separate(
             estimates.append((frames, pixels, estimate))
             if estimate.survey is not None:
                 # Whitened by one noise for all, not by that of the tile.
-                scale = np.array(tile.noise) / inputs.noise[inputs.bands]
-                scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
+                scale = tile.pixel_noise / inputs.noise[inputs.bands][:, np.newaxis]
+                scatter = estimate.survey.scatter * scale * scale[:, np.newaxis]
                 section = replace(estimate.survey, scatter=scatter)
                 survey.replace_pixels(cut.places[pixels], section)
         if result is not None:
@@ -406,14 +406,14 @@ def _write(
     The tile's bands have these places in the capture. What has no estimate becomes NaN.
     """
     order, shape = np.argsort(bands), tuple(span.stop - span.start for span in cut.window)
-    unestimated = np.ones(cut.status.size, dtype=bool)
+    unestimated, complete = np.ones(cut.status.size, dtype=bool), bool(np.all(cut.valid))
     for _, pixels, _ in estimates:
         unestimated &= ~pixels
     for name in map(str, result.data_vars):
         target, dims = result.variables[name].values[..., *cut.window], result.variables[name].dims
         if name == "status":
             target[...] = cut.status.reshape(shape)
-        else:
+        elif unestimated.any():
             target[..., unestimated.reshape(shape)] = np.nan
         for frames, pixels, estimate in estimates:
             values, places = getattr(estimate, name), pixels.reshape(shape)
@@ -423,7 +423,7 @@ def _write(
                 target[places] |= values
             elif "time" not in dims:
                 target[..., places] = values[np.ix_(*[order] * (values.ndim - 1))]
-            elif np.all(frames) and np.all(pixels) and np.all(cut.valid):
+            elif complete and np.all(frames) and np.all(pixels):
                 target[...] = values.reshape(target.shape)
             else:
                 values, places = np.asarray(values, np.float32), np.flatnonzero(pixels)

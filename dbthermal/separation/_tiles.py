@@ -136,6 +136,7 @@ class Tile:
     noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
+    gain: Array | None = None  # noise of each pixel's bands over `noise` (band, pixel) [1]
     pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
@@ -148,6 +149,12 @@ class Tile:
     def reference(self) -> float:
         """Reference temperature [K] that the signals are relative to."""
         return self.curves[0].reference
+
+    @property
+    def pixel_noise(self) -> Array:
+        """Standard deviation of the signals' noise in each pixel (band, pixel) [K]."""
+        gain = np.ones((len(self.noise), self.signals.shape[2])) if self.gain is None else self.gain
+        return np.asarray(np.array(self.noise)[:, np.newaxis] * gain)
 
     def blackbody(self, band: int, temperature: Array) -> Array:
         """Signal of a blackbody at a temperature [K] in a band, relative to the reference [K]."""
@@ -178,7 +185,7 @@ class Tile:
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         arrays: dict[str, Any] = {
             name: None if getattr(self, name) is None else select(getattr(self, name), selected)
-            for name in ("emissivity", "emissivity_covariance", "division")
+            for name in ("emissivity", "emissivity_covariance", "division", "gain")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = select(self.signals, selected)
@@ -297,7 +304,7 @@ class Cut:
     places: Whole  # numbers of the pixels in the image (pixel)
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
-    parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
+    parts: list["Section"]
 
 
 def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
@@ -364,14 +371,14 @@ def cut(
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
 
-    @cache  # and never read where all that is wanted of it is kept
+    @cache
     def load() -> tuple[xr.Dataset, list[Grain]]:
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
-        gain = np.ones((2, places.size))
+        gain = None
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
@@ -382,8 +389,10 @@ def cut(
             counts, usable = quality.bridge(counts, valid, time)
         else:
             counts, usable, valid, status, gain = displaced.paired(
-                load, displacement, window[0], source, selected, method.minimum_frames
+                *(block, inputs.noise * slopes, displacement, window[0], source, selected),
+                method.minimum_frames,
             )
+            gain = gain[[0] + [1] * (len(counts) - 1)]
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
@@ -391,11 +400,11 @@ def cut(
         tile = _tile(inputs, counts, time, window, segment, selected)
         needed = displacement is None or wanted is not None
         division = _unpacked(inputs.division[:, places], time.size)
-        tile = replace(tile, surveyed=needed, division=division)
+        tile = replace(tile, surveyed=needed, division=division, gain=gain)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(window[0], selected)
+            tile.signals[1:] -= inputs.difference(places)
         sections = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
@@ -404,9 +413,8 @@ def cut(
                 (frames, pixels, piece if np.all(frames) else piece.select_frames(frames))
             )
         if displacement is not None:
-            sections = [
-                piece for section in sections for piece in of_one_noise(*section, gain, most)
-            ]
+            split = in_parts if method.compiled else of_one_noise
+            sections = [piece for section in sections for piece in split(*section, most)]
         yield Cut(window, places, status, valid, sections)
 
 
@@ -420,14 +428,14 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
-    grains = quality.grains(block, inputs.noise * slopes)
     if displacement is None:
+        grains = quality.grains(block, inputs.noise * slopes)
         counts, valid, status = quality.read(block, fewest, grains)
         counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
         gain = np.ones((2, status.size))
     else:
         counts, usable, _, status, gain = displaced.paired(
-            lambda: (block, grains), displacement, rows, source, slice(None), fewest
+            block, inputs.noise * slopes, displacement, rows, source, slice(None), fewest
         )
     sets = quality.common_frames(counts, usable, status, fewest)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
@@ -480,25 +488,32 @@ def _tile(
     )
 
 
-def of_one_noise(
-    frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
-) -> Iterator[tuple[Mask, Mask, Tile]]:
-    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
+Section = tuple[Mask, Mask, Tile]
+"""Frames (time) and pixels (pixel) of a window, and the tile of these."""
+
+
+def in_parts(frames: Mask, pixels: Mask, tile: Tile, most: int) -> Iterator[Section]:
+    """Yield parts of a tile, of at most so many pixels."""
+    places = np.flatnonzero(pixels)
+    for start in range(0, places.size, most):
+        group = np.zeros_like(pixels)
+        group[places[start : start + most]] = True
+        yield frames, group, tile.select_pixels(np.arange(start, min(start + most, places.size)))
+
+
+def of_one_noise(frames: Mask, pixels: Mask, tile: Tile, most: int) -> Iterator[Section]:
+    """Yield parts of a tile, of at most so many pixels whose bands have one noise each.
 
     A residual pattern is independent from pixel to pixel, and is scaled like the noise.
     """
-    order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
+    order = np.rint(np.log(tile.pixel_noise[-1]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
-        alike = np.flatnonzero(order == level)
-        for start in range(0, alike.size, most):
-            chosen = alike[start : start + most]
-            group = np.zeros_like(pixels)
-            group[np.flatnonzero(pixels)[chosen]] = True
-            factor = np.exp(np.log(gain[:, group]).mean(axis=1))
-            factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
-            single = replace(
-                tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist())
-            )
+        alike = np.zeros_like(pixels)
+        alike[np.flatnonzero(pixels)[order == level]] = True
+        for _, group, piece in in_parts(frames, alike, tile.select_pixels(order == level), most):
+            mean = np.exp(np.log(piece.pixel_noise).mean(axis=1))
+            single = replace(piece, gain=None, noise=tuple(mean.tolist()))
             if tile.pattern is not None:
-                single = replace(single, pattern=tuple((factors * tile.pattern).tolist()))
+                pattern = mean / tile.noise * tile.pattern
+                single = replace(single, pattern=tuple(pattern.tolist()))
             yield frames, group, single

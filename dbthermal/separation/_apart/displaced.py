@@ -9,7 +9,6 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.sparse import csr_array
 from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, select
+from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -42,11 +42,14 @@ _FEW: Final = 0.5
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
+_BLOCK: Final = 128  # pixels that are resampled together
 
 
 T = TypeVar("T")
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
 """Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
+Kept: TypeAlias = tuple[npt.NDArray[np.float32], tuple[Mask, Mask] | None, Bits, Array]
+"""The same, in single precision; of the second camera alone, without masks, if all are valid."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
-    read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
+    read: dict[Hashable, Kept] = field(default_factory=dict)  # see `paired`
 
     def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
@@ -193,7 +196,8 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
 
 
 def paired(
-    load: Callable[[], tuple[xr.Dataset, list[samples.Grain]]],
+    block: xr.Dataset,
+    noise: Array,
     displacement: Displacement,
     rows: slice,
     source: slice,
@@ -202,31 +206,48 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    The source is read if they are not kept; only those of a small capture are.
+    Of the rows of the source, and the noise (band) [count]. Kept are those of a small capture, of
+    the second camera alone where no sample is missing.
     """
-    films, key = displacement.read, (rows.start, rows.stop)
-    every, chosen = (
-        (*key, None),
-        (*key, None if isinstance(selected, slice) else selected.tobytes()),
-    )
-    if chosen not in films:
-        reading = films.get(every)
-        if reading is None:
-            block, grains = load()
-            counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
-            counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-            reading = counts, usable, valid, status, gain
-        share = (rows.stop - rows.start) / displacement.shape[0]
+    films, every = displacement.read, (rows.start, rows.stop, b"")
+    chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
+    reading = films.get(chosen) or films.get(every)
+    share = (rows.stop - rows.start) / displacement.shape[0]
+    if reading is None:
+        loaded = block.load()
+        grains = quality.grains(loaded, noise)
+        counts, valid, status, gain = read(loaded, displacement, rows, source, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+        complete = bool(valid.all())
+        needed = counts[displacement.others] if complete else counts
+        reading = needed.astype(np.float32), None if complete else (usable, valid), status, gain
         if chosen != every:
-            share, reading = 1.0, tuple(select(film, selected) for film in reading)
-        size, held = (
-            sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
-        )
-        if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
-            return reading
-        films[chosen] = reading
-    counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
-    return counts.copy(), usable, valid, status.copy(), gain
+            share, reading = 1.0, _chosen(reading, selected)
+        size, held = reading[0].nbytes, sum(film[0].nbytes for film in films.values())
+        if size <= share * _KEPT and size + held <= _KEPT:
+            films[chosen] = reading
+    elif chosen not in films:
+        reading = _chosen(reading, selected)
+    kept, masks, status, gain = reading
+    if masks is not None:
+        return kept.astype(np.float64), *masks, status.copy(), gain
+    # The first camera's samples are those of the capture.
+    within = slice(rows.start - source.start, rows.stop - source.start)
+    first = block["counts"][displacement.reference, :, within].values
+    counts = np.empty((1 + len(kept), *kept.shape[1:]))
+    counts[displacement.reference] = first.reshape(len(first), -1)[:, selected]
+    counts[displacement.others] = kept
+    counts[:, :, quality.unusable(status)] = 0.0
+    whole = np.ones(counts.shape[1:], dtype=bool)
+    return counts, whole, whole, status.copy(), gain
+
+
+def _chosen(reading: Kept, selected: Any) -> Kept:
+    """Some pixels of those that are kept."""
+    counts, masks, status, gain = reading
+    if masks is not None:
+        masks = select(masks[0], selected), select(masks[1], selected)
+    return select(counts, selected), masks, select(status, selected), select(gain, selected)
 
 
 def read(
@@ -256,10 +277,11 @@ def read(
     seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
     bad = np.zeros(weights.shape[1], dtype=bool)
     bad[used] = quality.unusable(flags)
-    weights = without(weights, bad, displacement.shape[1])[:, used]
-    counts = np.stack([counts[0]] * (len(second_bands) + 1))
+    weights = without(weights, bad, displacement.shape[1])
+    weights = weights if isinstance(used, slice) else weights[:, used]
+    counts = np.repeat(counts, len(second_bands) + 1, axis=0)
     for band, signal in zip(second_bands, seen, strict=True):
-        counts[band] = (weights @ signal.T).T
+        resample(weights.indptr, weights.indices, weights.data, signal, counts[band])
     share = abs(weights)
     if not measured.all():  # a sample that was bridged does not count where its weight is small
         valid = valid & ((share @ ~usable.T).T <= 0.0)
@@ -290,6 +312,19 @@ def read(
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 
+@compiled
+def resample(start: Any, places: Any, weights: Array, film: Array, result: Array) -> None:
+    """Film (time, pixel) at the rows of a sparse matrix of weights, in place."""
+    rows = len(start) - 1
+    for first in range(0, rows, _BLOCK):  # whose weights stay in the cache
+        for t in range(len(film)):
+            for row in range(first, min(first + _BLOCK, rows)):
+                value = 0.0
+                for entry in range(start[row], start[row + 1]):
+                    value += weights[entry] * film[t, places[entry]]
+                result[t, row] = value
+
+
 def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
     """Pixels of some rows that have a weight, if few; and the places of those that are read."""
     used, pixels = np.unique(weights.indices), weights.shape[1]
@@ -311,13 +346,19 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
     if rows.size == 0:
         return weights
     weights = weights.copy()
-    for row in rows:
-        entries = slice(weights.indptr[row], weights.indptr[row + 1])
-        pixels, values = weights.indices[entries], weights.data[entries]
-        plane = np.stack([np.ones(pixels.size), *np.divmod(pixels, width)])
-        plane[1:] -= plane[1:] @ np.abs(values)[:, np.newaxis] / np.abs(values).sum()
-        off = bad[pixels]
-        # The smallest change of the others with the same sums over the plane.
-        values[~off] += np.linalg.lstsq(plane[:, ~off], plane[:, off] @ values[off], rcond=None)[0]
-        values[off] = 0.0
+    # Entries of these rows, of which there are up to so many, one beside another.
+    first, count = weights.indptr[rows], np.diff(weights.indptr)[rows]
+    entry = np.minimum(first[:, np.newaxis] + np.arange(count.max()), weights.nnz - 1)
+    used = np.arange(count.max()) < count[:, np.newaxis]
+    pixels, values = weights.indices[entry], np.where(used, weights.data[entry], 0.0)
+    off, size = used & bad[pixels], np.abs(values)
+    plane = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)], axis=1)
+    center = (plane[:, 1:] * size[:, np.newaxis]).sum(axis=2) / size.sum(axis=1, keepdims=True)
+    plane[:, 1:] -= center[..., np.newaxis]
+    # The smallest change of the others with the same sums over the plane.
+    others = np.where(used & ~off, 1.0, 0.0)[:, np.newaxis] * plane
+    lacking = plane @ np.where(off, values, 0.0)[..., np.newaxis]
+    change = others.mT @ (np.linalg.pinv(others @ others.mT, hermitian=True) @ lacking)
+    values = np.where(off, 0.0, values + change[..., 0])
+    weights.data[entry[used]] = values[used]
     return weights

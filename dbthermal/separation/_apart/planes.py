@@ -167,14 +167,12 @@ def project(
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
-                    more = inputs.difference(cut.window[0], slice(None))[:, frames]
-                    index = np.searchsorted(cut.places, places)
-                    for band, changes in enumerate(more, 1):
-                        straight[band][:, places] += inverse @ changes[:, index]
+                    for band, changes in enumerate(inputs.difference(places)[:, frames], 1):
+                        straight[band][:, places] += inverse @ changes
                 _without_object(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = quick.T @ signal
-                noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
+                noise[0][:, row, column] = tile.pixel_noise
                 freedom[row, column] = np.sum(quick**2, dtype=np.float64)
                 usable[row, column] = True
         release()

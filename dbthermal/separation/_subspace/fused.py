@@ -245,11 +245,12 @@ def _separate(
     model: Model,
     signals: Array,
     places: Whole,
+    noises: Array,
     materials: Array,
     work: Work,
     solved: Solved,
 ) -> None:
-    """Steps of some pixels of a tile."""
+    """Steps of some pixels of a tile, whose noise and pattern are in the model for the time."""
     samples, outside, pixels = work.inside, work.outside, places.size
     block = len(samples)
     for start in range(0, pixels, block):
@@ -259,6 +260,8 @@ def _separate(
             place = np.uintp(together[p])
             for m in range(model.noise.size):
                 kernels.copy(samples[p, m], work.signals[m])
+            kernels.copy(noises[place, 0], model.noise)
+            kernels.copy(noises[place, 1], model.pattern)
             kernels.copy(materials[place], work.material)
             record, matrices = solved.record[place], solved.matrices[place]
             _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
@@ -280,8 +283,8 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        noise=np.array(tile.noise),
-        pattern=np.array(tile.pattern or np.zeros(second_bands + 1)),
+        noise=np.empty(second_bands + 1),
+        pattern=np.empty(second_bands + 1),
         drift=drift / np.sqrt(3.0),
         chances=(float(chdtri(second_bands, chances[0])), float(chdtri(second_bands, chances[1]))),
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
@@ -372,6 +375,10 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
+    noise, pattern = tile.pixel_noise, np.array(tile.pattern or np.zeros(bands))
+    # A residual pattern is independent from pixel to pixel, and is resampled like the noise.
+    pattern = noise * (pattern / np.array(tile.noise))[:, np.newaxis]
+    noises = np.ascontiguousarray(np.stack([noise, pattern]).transpose(2, 0, 1))
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
@@ -382,7 +389,7 @@ def solve(
         model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((of_part.orders, bands, bands))
-        _separate(model, signals, places, materials, Work(**space), solved)
+        _separate(model, signals, places, noises, materials, Work(**space), solved)
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }
