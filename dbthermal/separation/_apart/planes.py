@@ -33,7 +33,7 @@ TAIL: Final = 3.0
 """Deviations of the blur beyond which it has no weight."""
 
 # Functions of the rapid changes, pixels that make them, and degree of the responses' polynomials.
-_PLANES, _SAMPLE = 128, 1024
+_PLANES, _SAMPLE = 96, 1024
 _DEGREE: Final = 7
 # Share of a neighbourhood without which a blurred pixel is none [1].
 _LEAST_SHARE: Final = 1e-3
