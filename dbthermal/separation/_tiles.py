@@ -42,7 +42,6 @@ SAMPLES: Final = 2**19
 _COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
-_NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
 RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 
@@ -153,8 +152,17 @@ class Tile:
     @property
     def pixel_noise(self) -> Array:
         """Standard deviation of the signals' noise in each pixel (band, pixel) [K]."""
+        return self._resampled(self.noise)
+
+    @property
+    def pixel_pattern(self) -> Array:
+        """Residual fixed pattern, independent from pixel to pixel (band, pixel) [K]."""
+        return self._resampled(self.pattern or np.zeros(len(self.noise)))
+
+    def _resampled(self, deviation: npt.ArrayLike) -> Array:
+        """Deviations (band, pixel) of what has one (band) before the bands were resampled."""
         gain = np.ones((len(self.noise), self.signals.shape[2])) if self.gain is None else self.gain
-        return np.asarray(np.array(self.noise)[:, np.newaxis] * gain)
+        return np.asarray(np.asarray(deviation)[:, np.newaxis] * gain)
 
     def blackbody(self, band: int, temperature: Array) -> Array:
         """Signal of a blackbody at a temperature [K] in a band, relative to the reference [K]."""
@@ -304,7 +312,7 @@ class Cut:
     places: Whole  # numbers of the pixels in the image (pixel)
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
-    parts: list["Section"]
+    parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
 
 
 def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
@@ -392,7 +400,6 @@ def cut(
                 *(block, inputs.noise * slopes, displacement, window[0], source, selected),
                 method.minimum_frames,
             )
-            gain = gain[[0] + [1] * (len(counts) - 1)]
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
@@ -405,16 +412,16 @@ def cut(
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(places)
-        sections = []
+        sections, step = [], status.size if displacement is None else most
         for frames, pixels in sets:  # of which there may be many, each of few pixels
-            whole = method.whole_image or np.all(pixels)
-            piece = tile if whole else tile.select_pixels(pixels)
-            sections.append(
-                (frames, pixels, piece if np.all(frames) else piece.select_frames(frames))
-            )
-        if displacement is not None:
-            split = in_parts if method.compiled else of_one_noise
-            sections = [piece for section in sections for piece in split(*section, most)]
+            numbered = np.flatnonzero(pixels)
+            for start in range(0, numbered.size, step):
+                group = np.zeros_like(pixels)
+                group[numbered[start : start + step]] = True
+                whole = method.whole_image or np.all(group)
+                piece = tile if whole else tile.select_pixels(group)
+                piece = piece if np.all(frames) else piece.select_frames(frames)
+                sections.append((frames, group, piece))
         yield Cut(window, places, status, valid, sections)
 
 
@@ -432,7 +439,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
         grains = quality.grains(block, inputs.noise * slopes)
         counts, valid, status = quality.read(block, fewest, grains)
         counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-        gain = np.ones((2, status.size))
+        gain = np.ones((len(counts), status.size))
     else:
         counts, usable, _, status, gain = displaced.paired(
             block, inputs.noise * slopes, displacement, rows, source, slice(None), fewest
@@ -441,7 +448,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
     window = rows, slice(0, inputs.capture.sizes["x"])
     signals = _tile(inputs, counts, block["time"].values, window, None, slice(None)).signals
-    return signals[:, frames], frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
+    return signals[:, frames], frames, pixels, gain
 
 
 def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:
@@ -486,34 +493,3 @@ def _tile(
         emissivity=emissivity,
         emissivity_covariance=covariance,
     )
-
-
-Section = tuple[Mask, Mask, Tile]
-"""Frames (time) and pixels (pixel) of a window, and the tile of these."""
-
-
-def in_parts(frames: Mask, pixels: Mask, tile: Tile, most: int) -> Iterator[Section]:
-    """Yield parts of a tile, of at most so many pixels."""
-    places = np.flatnonzero(pixels)
-    for start in range(0, places.size, most):
-        group = np.zeros_like(pixels)
-        group[places[start : start + most]] = True
-        yield frames, group, tile.select_pixels(np.arange(start, min(start + most, places.size)))
-
-
-def of_one_noise(frames: Mask, pixels: Mask, tile: Tile, most: int) -> Iterator[Section]:
-    """Yield parts of a tile, of at most so many pixels whose bands have one noise each.
-
-    A residual pattern is independent from pixel to pixel, and is scaled like the noise.
-    """
-    order = np.rint(np.log(tile.pixel_noise[-1]) / _NOISE_STEP).astype(np.intp)
-    for level in np.unique(order):
-        alike = np.zeros_like(pixels)
-        alike[np.flatnonzero(pixels)[order == level]] = True
-        for _, group, piece in in_parts(frames, alike, tile.select_pixels(order == level), most):
-            mean = np.exp(np.log(piece.pixel_noise).mean(axis=1))
-            single = replace(piece, gain=None, noise=tuple(mean.tolist()))
-            if tile.pattern is not None:
-                pattern = mean / tile.noise * tile.pattern
-                single = replace(single, pattern=tuple(pattern.tolist()))
-            yield frames, group, single

@@ -35,9 +35,6 @@ _UNSOLVED: Final = 1e-2
 _OUTSIDE: Final = 0.2
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
-# Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
-# an image is high leaves most of them without a weight [1].
-_FEW: Final = 0.5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some nine times [byte].
@@ -48,8 +45,6 @@ _BLOCK: Final = 128  # pixels that are resampled together
 T = TypeVar("T")
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
 """Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
-Kept: TypeAlias = tuple[npt.NDArray[np.float32], tuple[Mask, Mask] | None, Bits, Array]
-"""The same, in single precision; of the second camera alone, without masks, if all are valid."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,7 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
-    read: dict[Hashable, Kept] = field(default_factory=dict)  # see `paired`
+    read: dict[int, Any] = field(default_factory=dict)  # see `paired`, by the first row
 
     def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
@@ -209,10 +204,8 @@ def paired(
     Of the rows of the source, and the noise (band) [count]. Kept are those of a small capture, of
     the second camera alone where no sample is missing.
     """
-    films, every = displacement.read, (rows.start, rows.stop, b"")
-    chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
-    reading = films.get(chosen) or films.get(every)
-    share = (rows.stop - rows.start) / displacement.shape[0]
+    films, start = displacement.read, rows.start
+    reading = films.get(start)
     if reading is None:
         loaded = block.load()
         grains = quality.grains(loaded, noise)
@@ -220,19 +213,17 @@ def paired(
         counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
         complete = bool(valid.all())
         needed = counts[displacement.others] if complete else counts
-        reading = needed.astype(np.float32), None if complete else (usable, valid), status, gain
-        if chosen != every:
-            share, reading = 1.0, _chosen(reading, selected)
-        size, held = reading[0].nbytes, sum(film[0].nbytes for film in films.values())
-        if size <= share * _KEPT and size + held <= _KEPT:
-            films[chosen] = reading
-    elif chosen not in films:
-        reading = _chosen(reading, selected)
-    kept, masks, status, gain = reading
-    if masks is not None:
-        return kept.astype(np.float64), *masks, status.copy(), gain
+        masks = (None, None) if complete else (usable, valid)
+        reading = needed.astype(np.float32), *masks, status, gain
+        if reading[0].nbytes <= (rows.stop - start) / displacement.shape[0] * _KEPT:
+            films[start] = reading
+    if not isinstance(selected, slice):
+        reading = tuple(None if film is None else select(film, selected) for film in reading)
+    kept, usable, valid, status, gain = reading
+    if valid is not None:
+        return kept.astype(np.float64), usable, valid, status.copy(), gain
     # The first camera's samples are those of the capture.
-    within = slice(rows.start - source.start, rows.stop - source.start)
+    within = slice(start - source.start, rows.stop - source.start)
     first = block["counts"][displacement.reference, :, within].values
     counts = np.empty((1 + len(kept), *kept.shape[1:]))
     counts[displacement.reference] = first.reshape(len(first), -1)[:, selected]
@@ -240,14 +231,6 @@ def paired(
     counts[:, :, quality.unusable(status)] = 0.0
     whole = np.ones(counts.shape[1:], dtype=bool)
     return counts, whole, whole, status.copy(), gain
-
-
-def _chosen(reading: Kept, selected: Any) -> Kept:
-    """Some pixels of those that are kept."""
-    counts, masks, status, gain = reading
-    if masks is not None:
-        masks = select(masks[0], selected), select(masks[1], selected)
-    return select(counts, selected), masks, select(status, selected), select(gain, selected)
 
 
 def read(
@@ -262,7 +245,7 @@ def read(
     Read some rows of the reference band, and what the others show of the same reflections.
 
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
-    `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
+    `quality.read`; and the noise (band, pixel) [1] over that of a sample, the reference first.
     """
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
@@ -270,15 +253,13 @@ def read(
         band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
     )
     weights = displacement.weights(rows, needed)
-    used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
+    place = slice(needed.start - source.start, needed.stop - source.start)
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
-    second = block.isel(band=second_bands, **place)
+    second = block.isel(band=second_bands, y=place)
     seen, measured, flags = quality.read(second, fewest, [grains[band] for band in second_bands])
     seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
-    bad = np.zeros(weights.shape[1], dtype=bool)
-    bad[used] = quality.unusable(flags)
+    bad = quality.unusable(flags)
     weights = without(weights, bad, displacement.shape[1])
-    weights = weights if isinstance(used, slice) else weights[:, used]
     counts = np.repeat(counts, len(second_bands) + 1, axis=0)
     for band, signal in zip(second_bands, seen, strict=True):
         resample(weights.indptr, weights.indices, weights.data, signal, counts[band])
@@ -299,17 +280,20 @@ def read(
             status[share @ holds > _NO_WEIGHT] |= np.uint32(bit)
     counts[:, :, quality.unusable(status)] = 0.0
     gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
-    good = ~quality.unusable(flags)
-    if "noise_factor" in block and np.any(block["noise_factor"][second_bands] < 1.0) and good.any():
+    if (
+        "noise_factor" in block
+        and np.any(block["noise_factor"][second_bands] < 1.0)
+        and not bad.all()
+    ):
         # Neighbours that a registration has interpolated share noise: measured, not computed.
         key = (rows.start, rows.stop, source.start, source.stop)
         gain *= displacement.once(
             key,
             lambda: samples.resampled_noise(
-                seen[:, :, good], counts[second_bands], gain, displacement.shape[1]
+                seen[:, :, ~bad], counts[second_bands], gain, displacement.shape[1]
             ),
         )
-    return counts, valid, status, np.stack([np.ones_like(gain), gain])
+    return counts, valid, status, np.stack([np.ones_like(gain), *[gain] * len(second_bands)])
 
 
 @compiled
@@ -323,16 +307,6 @@ def resample(start: Any, places: Any, weights: Array, film: Array, result: Array
                 for entry in range(start[row], start[row + 1]):
                     value += weights[entry] * film[t, places[entry]]
                 result[t, row] = value
-
-
-def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
-    """Pixels of some rows that have a weight, if few; and the places of those that are read."""
-    used, pixels = np.unique(weights.indices), weights.shape[1]
-    if used.size > _FEW * pixels:
-        return slice(None), {"y": rows}
-    y, x = np.divmod(used, pixels // (rows.stop - rows.start))
-    places = {"y": y + rows.start, "x": x}
-    return used, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:

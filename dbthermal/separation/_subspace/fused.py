@@ -283,8 +283,8 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        noise=np.empty(second_bands + 1),
-        pattern=np.empty(second_bands + 1),
+        noise=np.array(tile.noise),
+        pattern=np.array(tile.pattern or np.zeros(second_bands + 1)),
         drift=drift / np.sqrt(3.0),
         chances=(float(chdtri(second_bands, chances[0])), float(chdtri(second_bands, chances[1]))),
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
@@ -375,10 +375,8 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
-    noise, pattern = tile.pixel_noise, np.array(tile.pattern or np.zeros(bands))
-    # A residual pattern is independent from pixel to pixel, and is resampled like the noise.
-    pattern = noise * (pattern / np.array(tile.noise))[:, np.newaxis]
-    noises = np.ascontiguousarray(np.stack([noise, pattern]).transpose(2, 0, 1))
+    noises = np.stack([tile.pixel_noise, tile.pixel_pattern])
+    noises = np.ascontiguousarray(noises.transpose(2, 0, 1))
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
