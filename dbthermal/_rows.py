@@ -46,6 +46,7 @@ class _Rows(BackendArray):
                 for axis, index in enumerate((*leading, rows[wanted] - first, columns)):
                     values = values[(slice(None),) * axis + (_even(index),)]
                 result[..., _even(wanted), :] = values
+                release()
         whole = (slice(None) if place.ndim else 0 for place in places)
         return np.asarray(result[tuple(whole)])
 
@@ -66,6 +67,15 @@ def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
         yield slice(top, min(top + rows, height))
 
 
+def windows(shape: tuple[int, ...], samples: int = 0) -> Iterator[tuple[slice, slice]]:
+    """Yield rows and columns of an array (..., y, x), as `blocks`; parts of a row that has more."""
+    column = int(np.prod(shape)) // max(1, shape[-2] * shape[-1])
+    for rows in blocks(shape, samples):
+        pixels = max(1, (samples or _BLOCK) // max(1, column * (rows.stop - rows.start)))
+        for left in range(0, shape[-1], pixels):
+            yield rows, slice(left, min(left + pixels, shape[-1]))
+
+
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
     """Array with the coordinates and attributes of another, computed by rows, on disk only once."""
     array = _Rows(_once(compute, like.shape) if made_on_disk() else compute, like.shape)
@@ -80,9 +90,4 @@ def _once(compute: Callable[[slice], Values], shape: tuple[int, ...]) -> Callabl
         film[..., rows, :] = compute(rows)
         release()
 
-    def read(rows: slice) -> Values:
-        values = film[..., rows, :].copy()
-        release()
-        return values
-
-    return read
+    return lambda rows: film[..., rows, :]
