@@ -176,7 +176,7 @@ video.seq
 a.tif --clock 30
 
 import files.make_capture files --bands --offset {_FORM} --frames --every --rows --output
-make a capture of two cameras' files: FLIR, TIFF, raw, NumPy, HDF5, NetCDF, zarr
+make a capture of two cameras' files: FLIR, Telops, TIFF, raw, NumPy, HDF5, MATLAB, NetCDF, zarr
 a.tif b.tif --bands 8-14 9.5 --clock 30 --offset 0 -o scene.zarr
 a*.tif + b*.tif --bands 8-14 9.5 --clock 12 10 --offset 0 -o scene.zarr
 wide.seq narrow.seq --bands 8-14 9.5 --frames 0 3000 --every 3 -o scene.zarr

@@ -27,7 +27,8 @@ _MADE_BY = {
 }
 READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
     "TIFF": (readers.tiff, (".tif", ".tiff", ".btf", ".png")),
-    "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr")),
+    "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".mat", ".zarr")),
+    "sequences": (readers.sequence, (".sfmov", ".hcc")),
     "FLIR": (readers.flir, (".fff", ".seq", ".csq", ".jpg", ".jpeg")),
     "raw files": (readers.raw, ()),
 }

@@ -76,7 +76,7 @@ def test_recordings(tmp_path: Path, form: str, number: int) -> None:
     assert fewer <= at_most(0.001 if form in hostile.TIFF else 0, number) or form in FRAMEWISE
 
 
-FRAMEWISE = {"seq", "fff", "csq", "raw"}
+FRAMEWISE = {"seq", "fff", "csq", "raw", "hcc"}
 """Forms whose frames follow one another, without a number of them."""
 
 

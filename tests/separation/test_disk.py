@@ -79,10 +79,11 @@ def test_columns_of_a_row_are_the_whole_row(path: Path, tmp_path: Path) -> None:
     capture = capture.isel(y=slice(2, 5)).assign_coords(x=100 + np.arange(24))
     store.save(capture, tmp_path / "rows.zarr", {})
     known = xr.DataArray(rng.uniform(0.7, 0.87, (3, 24)), dims=("y", "x"))
-    known = xr.concat([known + 0.1, known], xr.IndexVariable("band", list(RIG.bands)))
+    known = xr.concat([known + 0.1, known], "band").assign_coords(band=list(RIG.bands))
     mask = xr.DataArray(rng.random((3, 24)) < 0.9, dims=("y", "x"))
     memory = _run.BASE + 2 * 7 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64
-    for method, options in (("subspace", {}), ("calibrated", {"emissivity": known, "mask": mask})):
+    given: dict[str, Any] = {"emissivity": known, "mask": mask}
+    for method, options in (("subspace", dict[str, Any]()), ("calibrated", given)):
         for source in (tmp_path / "rows.zarr", capture):
             target, response = tmp_path / "result.zarr", RIG.response()
             separation.run(source, target, response, method, memory=memory, **options)

@@ -1,0 +1,144 @@
+"""Recordings of other makers' cameras, frames behind a header: FLIR .sfmov and Telops .hcc.
+
+An .sfmov begins with lines of names and values, up to ``DATA``; its frame rate is in an .inc beside
+it. In an .hcc each frame has a header of its own, with its time.
+"""
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal._arrays import Array
+from dbthermal.readers import _formats as formats
+from dbthermal.readers import _recording as recordings
+from dbthermal.readers._recording import MEMORY, Clock, Counts
+
+_LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
+_HEADER: Final[dict[str, tuple[str, int]]] = {
+    "signature": ("S2", 0),
+    "length": ("<u2", 4),  # of the header [byte]
+    "mode": ("u1", 28),
+    "columns": ("<u2", 32),
+    "rows": ("<u2", 34),
+    "rate": ("<u4", 44),  # [mHz]
+    "seconds": ("<u4", 100),
+    "fraction": ("<u4", 104),  # [100 ns]
+}
+"""Field of a Telops header -> its type and place."""
+_SHORTEST: Final = 108  # of such a header [byte]
+_MODES: Final = {0: "raw", 1: "corrected", 5: "raw"}  # of the numbers; others are no counts
+
+
+def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
+    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
+
+    Parameters
+    ----------
+    path : str or Path
+        File; the .inc of an .sfmov lies beside it.
+    clock, memory
+        As for `tiff`; the file's times, to half a frame, must agree with a clock. Without one they
+        are taken.
+
+    Returns
+    -------
+    Dataset
+        As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If the file is of another format, truncated or damaged, or its numbers are no counts of 16
+        bits, but temperatures or radiances; as `tiff` for clock, memory and 8 bits.
+    """
+    recordings.check_number(memory, "memory")
+    (path,) = formats.files([path], "sequence")
+    with recordings.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
+        read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
+        counts, times = read(path, memory)
+    if recordings.smoother(counts) < 0:
+        label = f"Invalid counts of '{path.name}': rougher than with bytes swapped"
+        raise ValueError(f"{label}. Must be little-endian, behind their header.")
+    if times is not None:
+        clock = recordings.check_times(times, "s", clock, path.name)
+    kind = path.suffix.lower().strip(".")
+    return recordings.clocked(counts, clock, path.name, format=kind)  # type: ignore[arg-type]
+
+
+def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
+    """Counts behind the lines of a header, and their times, if an .inc tells the rate."""
+    with path.open("rb") as stream:
+        content = stream.read(_LONGEST)
+    header, mark, _ = content.partition(b"\nDATA")
+    lines = _lines(header)
+    names = ("NumDPs", "yPixls", "xPixls")
+    if not mark or not all(lines.get(name, "").isdecimal() for name in names):
+        rule = f"Must have {', '.join(names)} and DATA within {_LONGEST} bytes"
+        raise ValueError(f"Invalid header of '{path.name}'. {rule}.")
+    if re.search("fl|32|64|8", kind := lines.get("DaType", ""), re.IGNORECASE):
+        rule = "Must be of 16-bit counts: record or export those"
+        raise ValueError(f"Invalid DaType '{kind}' of '{path.name}'. {rule}.")
+    frames, rows, columns = (int(lines[name]) for name in names)
+    size, behind = path.stat().st_size, len(header) + len(mark)
+    recordings.check_memory((frames, rows, columns), memory, path.name, size)
+    # The frames end with the file; blanks, if any, and the end of the line lie before them.
+    start = size - 2 * frames * rows * columns
+    if not re.fullmatch(rb"[ \0]*\r?\n?", content[behind : max(start, 0)]) or start < behind:
+        label = f"{size - behind} bytes behind DATA of '{path.name}'"
+        rule = f"Must be {frames} frames of {rows} x {columns}, or be read by readers.raw"
+        raise ValueError(f"Truncated or damaged: {label}. {rule} with header=.")
+    counts = np.memmap(path, "<u2", "r", start, (frames, rows, columns))
+    beside = path.with_suffix(".inc")
+    rate = 0.0
+    if beside.is_file() and beside.stat().st_size <= _LONGEST:
+        rate = float(_lines(beside.read_bytes()).get("FRate_0", 0.0))
+    return recordings.film(counts), np.arange(frames) / rate if rate > 0.0 else None
+
+
+def _lines(header: bytes) -> dict[str, str]:
+    """Values by name of the lines of a text."""
+    pairs = [line.split(maxsplit=1) for line in header.decode("latin-1").splitlines()]
+    return {pair[0]: pair[1].strip() for pair in pairs if len(pair) == 2}
+
+
+def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
+    """Counts of frames that have a header each, and their times, which may be those of a rate."""
+    size = path.stat().st_size
+    form: Any = {
+        "names": [*_HEADER, "counts"],
+        "formats": [*(kind for kind, _ in _HEADER.values()), "<u2"],
+        "offsets": [*(place for _, place in _HEADER.values()), _SHORTEST],
+    }
+    first = np.fromfile(path, np.dtype(form), 1)
+    if not first.size or first["signature"][0] != b"TC" or first["length"][0] < _SHORTEST:
+        raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")
+    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
+    whole = length + 2 * rows * columns
+    recordings.check_memory((size // whole, rows, columns), memory, path.name, size)
+    if size % whole:
+        label = f"{size} bytes of '{path.name}' in frames of {whole}"
+        raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
+    # All frames by their headers, which must be alike.
+    form["formats"][-1] = ("<u2", (rows, columns))
+    form["offsets"][-1] = length
+    dtype: Any = np.dtype(form | {"itemsize": whole})
+    frames = np.memmap(path, dtype, "r")
+    for name in ("signature", "length", "rows", "columns", "mode"):
+        if (frames[name] != frames[name][0]).any():
+            number = int(np.argmax(frames[name] != frames[name][0]))
+            rule = "Must be as of the first frame"
+            raise ValueError(f"Damaged '{path.name}': {name} of frame {number}. {rule}.")
+    if int(first["mode"][0]) not in _MODES:
+        label = f"calibration mode {first['mode'][0]} of '{path.name}'"
+        rule = "Must be raw counts, or counts corrected for gain and offset (NUC)"
+        raise ValueError(f"Invalid {label}, temperatures or radiances. {rule}.")
+    times = frames["seconds"].astype(np.float64) - float(first["seconds"][0])
+    times += 1e-7 * frames["fraction"]
+    if not np.ptp(times) and (rate := 1e-3 * float(first["rate"][0])) > 0.0:
+        times = np.arange(len(frames)) / rate
+    return recordings.film(frames["counts"]), times if np.ptp(times) else None
