@@ -17,14 +17,14 @@ BUDGET = {
     "correction": (1925, 8),
     "emissivity": (510, 3),
     "explorer": (1360, 7),
-    "figures": (750, 7),
+    "figures": (665, 6),
     "instruments": (5900, 23),
     "limits": (730, 4),
-    "readers": (2660, 11),
+    "readers": (2795, 13),
     "reporting": (660, 4),
-    "separation": (12840, 54),
+    "separation": (12880, 54),
     "simulation": (640, 3),
-    "store": (1510, 7),
+    "store": (1530, 7),
 }
 INSTALLED = 38_210  # lines of all rooms
 

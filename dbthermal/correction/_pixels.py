@@ -273,18 +273,14 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
     jumping = np.zeros(limit.shape, dtype=bool)
     for window in _rows.windows(movie.shape, _BLOCK):
         # Include neighbours on every side.
-        wide = tuple(
-            slice(max(places.start - 1, 0), min(places.stop + 1, size))
-            for places, size in zip(window, limit.shape, strict=True)
-        )
-        inner = tuple(
-            slice(places.start - around.start, places.stop - around.start)
-            for places, around in zip(window, wide, strict=True)
-        )
+        (top, left), (bottom, right) = zip(*((it.start, it.stop) for it in window), strict=True)
+        wide = slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1)
+        inner = np.s_[top - wide[0].start :, left - wide[1].start :]
         changes = _changes(_samples(movie, *wide), stepped)
         for sign in (1.0, -1.0):
             change, total = (np.float32(sign) * difference for difference in changes)
-            jumping[window] |= _alone(change, total, limit[wide], reach)[inner]
+            alone = _alone(change, total, limit[wide], reach)[inner]
+            jumping[window] |= alone[: bottom - top, : right - left]
     return jumping
 
 

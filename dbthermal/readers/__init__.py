@@ -8,7 +8,7 @@ from dbthermal._text import read_yaml
 from dbthermal.readers._arrays import array
 from dbthermal.readers._flir import flir
 from dbthermal.readers._sequences import sequence
-from dbthermal.readers._spectra import ecostress, slum, ucsb
+from dbthermal.readers._spectra import ecostress
 from dbthermal.readers._stacks import raw, tiff
 from dbthermal.readers._two_bands import two_bands
 
@@ -19,9 +19,7 @@ __all__ = [
     "raw",
     "read_yaml",
     "sequence",
-    "slum",
     "tiff",
     "two_bands",
-    "ucsb",
 ]
 __dir__ = __all__.copy

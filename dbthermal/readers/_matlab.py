@@ -15,10 +15,11 @@ from typing import Any, Final
 
 import numpy as np
 
-_STORED: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
-_STORED.update({12: "i8", 13: "u8"})
-_CLASSES: Final = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
-_CLASSES.update({14: "i8", 15: "u8"})
+# Types of numbers as they are stored, and as MATLAB has them.
+_STORED: Final = dict(
+    enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4", "-", "f8", "-", "-", "i8", "u8"], 1)
+)
+_CLASSES: Final = dict(enumerate(["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"], 6))
 _MATRIX, _PACKED = 14, 15  # kinds of variables
 _COMPLEX: Final = 0x800  # flag
 _BEGIN: Final = 128  # header of a file [byte]
@@ -38,15 +39,8 @@ class Numbers:
     begin: int  # of the numbers in the variable, as it is unpacked [byte]
     whole: int  # length of the variable, unpacked [byte]; 0 if it is not packed
 
-    @property
-    def ndim(self) -> int:
-        """Number of dims."""
-        return len(self.shape)
-
-    @property
-    def size(self) -> int:
-        """Number of numbers."""
-        return math.prod(self.shape)
+    ndim = property(lambda self: len(self.shape))
+    size = property(lambda self: math.prod(self.shape))
 
     def __getitem__(self, place: Any) -> Any:
         """Numbers at a place."""

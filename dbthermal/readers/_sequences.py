@@ -29,7 +29,7 @@ _HEADER: Final[dict[str, tuple[str, int]]] = {
 }
 """Field of a Telops header -> its type and place."""
 _SHORTEST: Final = 108  # of such a header [byte]
-_MODES: Final = {0: "raw", 1: "corrected", 5: "raw"}  # of the numbers; others are no counts
+_COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
@@ -40,8 +40,7 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
     path : str or Path
         File; the .inc of an .sfmov lies beside it.
     clock, memory
-        As for `tiff`; the file's times, to half a frame, must agree with a clock. Without one they
-        are taken.
+        As for `array`.
 
     Returns
     -------
@@ -50,11 +49,8 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the file is of another format, truncated or damaged, or its numbers are no counts of 16
-        bits, but temperatures or radiances; as `tiff` for clock, memory and 8 bits.
+    FileNotFoundError, ValueError
+        As `array`, and if the numbers are temperatures or radiances.
     """
     recordings.check_number(memory, "memory")
     (path,) = formats.files([path], "sequence")
@@ -124,19 +120,16 @@ def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
         label = f"{size} bytes of '{path.name}' in frames of {whole}"
         raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
     # All frames by their headers, which must be alike.
-    form["formats"][-1] = ("<u2", (rows, columns))
-    form["offsets"][-1] = length
+    form["formats"][-1], form["offsets"][-1] = ("<u2", (rows, columns)), length
     dtype: Any = np.dtype(form | {"itemsize": whole})
     frames = np.memmap(path, dtype, "r")
     for name in ("signature", "length", "rows", "columns", "mode"):
-        if (frames[name] != frames[name][0]).any():
-            number = int(np.argmax(frames[name] != frames[name][0]))
-            rule = "Must be as of the first frame"
-            raise ValueError(f"Damaged '{path.name}': {name} of frame {number}. {rule}.")
-    if int(first["mode"][0]) not in _MODES:
-        label = f"calibration mode {first['mode'][0]} of '{path.name}'"
-        rule = "Must be raw counts, or counts corrected for gain and offset (NUC)"
-        raise ValueError(f"Invalid {label}, temperatures or radiances. {rule}.")
+        for number in np.flatnonzero(frames[name] != frames[name][0]):
+            label = f"Damaged '{path.name}': {name} of frame {number}"
+            raise ValueError(f"{label}. Must be as of the first frame.")
+    if (mode := int(first["mode"][0])) not in _COUNTS:
+        label = f"calibration mode {mode} of '{path.name}', temperatures or radiances"
+        raise ValueError(f"Invalid {label}. Must be of counts, raw or corrected (NUC).")
     times = frames["seconds"].astype(np.float64) - float(first["seconds"][0])
     times += 1e-7 * frames["fraction"]
     if not np.ptp(times) and (rate := 1e-3 * float(first["rate"][0])) > 0.0:

@@ -291,8 +291,9 @@ def _share(
     """Threads of a process, rows and columns of a block, as `solve` reads or fewer, rows read."""
     counts, columns = capture["counts"], capture.sizes["x"]
     column, lazy = counts[..., 0, 0].size, counts.chunksizes.get("y", ())
+    stored = counts.encoding.get("preferred_chunks", {})
     chunk, chunk_width = (
-        max(counts.chunksizes.get(dim, ()), default=_stored(counts).get(dim, 1)) for dim in "yx"
+        max(counts.chunksizes.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx"
     )
     sample = _TILE if method.compiled else _TILE * _TIMES
     tile = sample * largest(method, settings, capture) * column
@@ -330,12 +331,6 @@ def _share(
     fit = [height for height in range(1, highest + 1) if need(height) <= free]
     height = max([rows for rows in fit if 2 * rows > fit[-1] and read(rows)[1]] or fit)
     return threads, (height, columns), read(height)[0]
-
-
-def _stored(counts: xr.DataArray) -> Mapping[str, int]:
-    """Chunks of a store, by dim."""
-    chunks: Mapping[str, int] = counts.encoding.get("preferred_chunks", {})
-    return chunks
 
 
 def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
