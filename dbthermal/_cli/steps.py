@@ -82,7 +82,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        still = files.capture(paths, options, offset=0.0)  # nothing moves: any offset will do
+        # Nothing moves: any offset will do.
+        still = files.capture(paths, options, offset=[0.0] * (len(options.bands or "ab") - 1))
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
@@ -123,10 +124,22 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
     (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
-    named = {**accepted(alignment.align, options), "clock": options.reference}
+    named = {**_aligning(options, corrected), "clock": options.reference}
     if options.register != "none":
         named["transform"] = alignment.register(corrected, model=options.register)
     return files.saved(alignment.align(corrected, lazy=True, **named), options)
+
+
+def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any]:
+    """Options of an alignment, with the offset of each band."""
+    named = accepted(alignment.align, options)
+    if "offset" in named:
+        bands, offsets = capture["band"].values.tolist(), [0.0, *named["offset"]]
+        if len(offsets) != len(bands):
+            rule = f"Must be {len(bands) - 1}, one for each of the bands {bands[1:]}"
+            raise ValueError(f"Invalid --offset {named['offset']}. {rule}.")
+        named["offset"] = xr.DataArray(offsets, {"band": bands}, "band")
+    return named
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
@@ -145,7 +158,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             fitted[0].load(),
             response,
             registration=None if options.register == "none" else options.register,
-            aligning=accepted(alignment.align, options),
+            aligning=_aligning(options, source),
             separating=accepted(separation.separate, options) | progress,
             target=options.output,
             provenance=files.provenance(options),
