@@ -4,6 +4,7 @@ import argparse
 import re
 from collections.abc import Callable
 from inspect import Parameter, signature
+from itertools import groupby
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
@@ -147,13 +148,10 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.D
     if len(paths) == 1 and paths[0].is_dir():
         return opened(paths[0])
     number = len(options.bands or "ab")
-    cameras: list[list[Path]] = [[]]
-    for path in paths:
-        cameras += [[]] if path == PLUS else []
-        cameras[-1] += [] if path == PLUS else [path]
+    cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
     if PLUS not in paths and len(paths) in {2, number}:
         cameras = [[path] for path in paths]
-    if len(cameras) < 2 or not all(cameras):
+    if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
         raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:

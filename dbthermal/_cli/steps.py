@@ -82,8 +82,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        # Nothing moves: any offset will do.
-        still = files.capture(paths, options, offset=[0.0] * (len(options.bands or "ab") - 1))
+        offset = [0.0] * (len(options.bands or "ab") - 1)  # nothing moves: any will do
+        still = files.capture(paths, options, offset)
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
@@ -134,11 +134,11 @@ def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any
     """Options of an alignment, with the offset of each band."""
     named = accepted(alignment.align, options)
     if "offset" in named:
-        bands, offsets = capture["band"].values.tolist(), [0.0, *named["offset"]]
-        if len(offsets) != len(bands):
-            rule = f"Must be {len(bands) - 1}, one for each of the bands {bands[1:]}"
+        first, *bands = capture["band"].values.tolist()
+        if len(named["offset"]) != len(bands):
+            rule = f"Must be {len(bands)}, one for each of the bands {bands}"
             raise ValueError(f"Invalid --offset {named['offset']}. {rule}.")
-        named["offset"] = xr.DataArray(offsets, {"band": bands}, "band")
+        named["offset"] = xr.DataArray([0.0, *named["offset"]], {"band": [first, *bands]}, "band")
     return named
 
 

@@ -17,18 +17,14 @@ from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
-_HEADER: Final[dict[str, tuple[str, int]]] = {
-    "signature": ("S2", 0),
-    "length": ("<u2", 4),  # of the header [byte]
-    "mode": ("u1", 28),
-    "columns": ("<u2", 32),
-    "rows": ("<u2", 34),
-    "rate": ("<u4", 44),  # [mHz]
-    "seconds": ("<u4", 100),
-    "fraction": ("<u4", 104),  # [100 ns]
-}
-"""Field of a Telops header -> its type and place."""
-_SHORTEST: Final = 108  # of such a header [byte]
+# Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
+_HEADER: Final[np.dtype[Any]] = np.dtype(
+    {
+        "names": ["signature", "length", "mode", "columns", "rows", "rate", "seconds", "fraction"],
+        "formats": ["S2", "<u2", "u1", "<u2", "<u2", "<u4", "<u4", "<u4"],
+        "offsets": [0, 4, 28, 32, 34, 44, 100, 104],
+    }
+)
 _COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
 
 
@@ -58,12 +54,11 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
         read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
         counts, times = read(path, memory)
     if recordings.smoother(counts) < 0:
-        label = f"Invalid counts of '{path.name}': rougher than with bytes swapped"
-        raise ValueError(f"{label}. Must be little-endian, behind their header.")
+        raise ValueError(f"Invalid counts of '{path.name}', bytes swapped. Must be little-endian.")
     if times is not None:
         clock = recordings.check_times(times, "s", clock, path.name)
-    kind = path.suffix.lower().strip(".")
-    return recordings.clocked(counts, clock, path.name, format=kind)  # type: ignore[arg-type]
+    kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
+    return recordings.clocked(counts, name=path.name, **kind)
 
 
 def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
@@ -90,9 +85,8 @@ def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
         raise ValueError(f"Truncated or damaged: {label}. {rule} with header=.")
     counts = np.memmap(path, "<u2", "r", start, (frames, rows, columns))
     beside = path.with_suffix(".inc")
-    rate = 0.0
-    if beside.is_file() and beside.stat().st_size <= _LONGEST:
-        rate = float(_lines(beside.read_bytes()).get("FRate_0", 0.0))
+    is_short = beside.is_file() and beside.stat().st_size <= _LONGEST
+    rate = float(_lines(beside.read_bytes()).get("FRate_0", 0.0)) if is_short else 0.0
     return recordings.film(counts), np.arange(frames) / rate if rate > 0.0 else None
 
 
@@ -104,14 +98,8 @@ def _lines(header: bytes) -> dict[str, str]:
 
 def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts of frames that have a header each, and their times, which may be those of a rate."""
-    size = path.stat().st_size
-    form: Any = {
-        "names": [*_HEADER, "counts"],
-        "formats": [*(kind for kind, _ in _HEADER.values()), "<u2"],
-        "offsets": [*(place for _, place in _HEADER.values()), _SHORTEST],
-    }
-    first = np.fromfile(path, np.dtype(form), 1)
-    if not first.size or first["signature"][0] != b"TC" or first["length"][0] < _SHORTEST:
+    size, first = path.stat().st_size, np.fromfile(path, _HEADER, 1)
+    if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
         raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")
     length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
     whole = length + 2 * rows * columns
@@ -120,18 +108,18 @@ def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
         label = f"{size} bytes of '{path.name}' in frames of {whole}"
         raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
     # All frames by their headers, which must be alike.
-    form["formats"][-1], form["offsets"][-1] = ("<u2", (rows, columns)), length
-    dtype: Any = np.dtype(form | {"itemsize": whole})
-    frames = np.memmap(path, dtype, "r")
+    between = ("more", f"V{length - _HEADER.itemsize}")
+    form: Any = [("header", _HEADER), between, ("counts", "<u2", (rows, columns))]
+    frames = np.memmap(path, form, "r")
+    headers = frames["header"]
     for name in ("signature", "length", "rows", "columns", "mode"):
-        for number in np.flatnonzero(frames[name] != frames[name][0]):
+        for number in np.flatnonzero(headers[name] != headers[name][0]):
             label = f"Damaged '{path.name}': {name} of frame {number}"
             raise ValueError(f"{label}. Must be as of the first frame.")
     if (mode := int(first["mode"][0])) not in _COUNTS:
         label = f"calibration mode {mode} of '{path.name}', temperatures or radiances"
         raise ValueError(f"Invalid {label}. Must be of counts, raw or corrected (NUC).")
-    times = frames["seconds"].astype(np.float64) - float(first["seconds"][0])
-    times += 1e-7 * frames["fraction"]
+    times = headers["seconds"] - float(first["seconds"][0]) + 1e-7 * headers["fraction"]
     if not np.ptp(times) and (rate := 1e-3 * float(first["rate"][0])) > 0.0:
         times = np.arange(len(frames)) / rate
     return recordings.film(frames["counts"]), times if np.ptp(times) else None

@@ -80,13 +80,10 @@ def two_bands(
     names = _names(bands, len(cameras))
     for name, recording in zip(names, cameras, strict=True):
         _check(recording, name)
-    shape = (first.sizes["y"], first.sizes["x"])
-    for name, recording in zip(names, cameras, strict=True):
-        if (other := (recording.sizes["y"], recording.sizes["x"])) != shape:
-            raise ValueError(
-                f"Different sizes {shape} and {other} pixels of the bands {[names[0], name]}. Must "
-                "be equal: resample one of the recordings, or crop the other."
-            )
+    shape, *others = [(recording.sizes["y"], recording.sizes["x"]) for recording in cameras]
+    if unlike := {*others} - {shape}:
+        label = f"Different sizes {shape} and {unlike.pop()} pixels of the bands {names}"
+        raise ValueError(f"{label}. Must be equal: resample recordings, or crop the others.")
     # Offsets of the clocks, by which they must overlap.
     shifts = [0.0, *_offsets(cameras, offset)]
     starts, stops = ([recording["time"].values[n] for recording in cameras] for n in (0, -1))
@@ -101,10 +98,8 @@ def two_bands(
     overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
     for film, other_film in combinations(overlapping, 2):
         if all(np.array_equal(film[at], other_film[at]) for at in parts(film)):
-            raise ValueError(
-                f"Same counts in both recordings, of the bands {names}. Must be those of two "
-                "cameras: is one file named twice?"
-            )
+            label = f"Same counts in both recordings, of the bands {names}"
+            raise ValueError(f"{label}. Must be those of two cameras: is one file named twice?")
     # Frames of all; shorter recordings are filled up, and flagged.
     counts = empty((len(names), max(lengths), *shape), np.uint16)
     times = np.full(counts.shape[:2], np.nan)

@@ -1,7 +1,4 @@
-"""Separation of captures of any size, from disk to disk, by rows that processes share out.
-
-A row that does not fit in the memory is separated by columns.
-"""
+"""Separation of captures of any size, from disk to disk, by rows that processes share out."""
 
 import hashlib
 import json

@@ -392,10 +392,8 @@ def _linked_chunks(
 ) -> dict[str, str]:
     """Link the chunks of an array of a part behind those of the whole; checksums by file."""
     sums = dict[str, str]()
-    end, rows = (
-        metadata["shape"][axis],
-        metadata["chunk_grid"]["configuration"]["chunk_shape"][axis],
-    )
+    end = metadata["shape"][axis]
+    rows = metadata["chunk_grid"]["configuration"]["chunk_shape"][axis]
     if end % rows:
         label = f"Invalid part '{source}' after {end} rows or columns in chunks of {rows}"
         raise ValueError(f"{label}. Must follow whole chunks.")
