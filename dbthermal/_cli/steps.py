@@ -218,7 +218,6 @@ def foreseen(
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
-        # By rows, of which one at least is in memory; a single method by parts of one, too.
         row = BASE + scene.ROW * math.prod(sizes.get(dim, 0) for dim in ("time", "x"))
         most = max(3e9, row) if options.correction else 2e9 if options.method else math.inf
         summary["memory_at_most_GB"] = round(min(memory, most) / 1e9, 1)

@@ -1,7 +1,6 @@
 """Numeric arrays of MATLAB's files of versions 5 to 7, on disk, with their axes in reverse.
 
-Variables follow one another, each packed by zlib or not: flags, dims, name, numbers. From the
-maker's "MAT-File Format". SciPy's reader is none for files of others: damaged ones crash it.
+From the maker's "MAT-File Format". SciPy's reader crashes on damaged files.
 """
 
 import math

@@ -1,8 +1,4 @@
-"""Recordings of other makers' cameras, frames behind a header: FLIR .sfmov and Telops .hcc.
-
-An .sfmov begins with lines of names and values, up to ``DATA``; its frame rate is in an .inc beside
-it. In an .hcc each frame has a header of its own, with its time.
-"""
+"""Recordings of frames behind headers: FLIR .sfmov, whose rate is in an .inc, and Telops .hcc."""
 
 import re
 from pathlib import Path
