@@ -22,7 +22,6 @@ __all__ = [
     "figures",
     "instruments",
     "limits",
-    "metrics",
     "mixing",
     "noise",
     "planck",

@@ -84,7 +84,7 @@ materials text*         as listed by 'data'; all by default
 --dry-run flag          only say what would be read, with sizes, and written
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
---bands text+           names of both bands: 8-14 9.5
+--bands text+           names of the bands: 8-14 9.5
 --unit text             of the numbers in TIFF, raw files and arrays: 'count' if not stated
 --clock number+         frame rate [Hz], of each camera if they differ; FLIR's files have times
 --shape whole2          rows and columns of raw files [pixel]
@@ -93,7 +93,7 @@ materials text*         as listed by 'data'; all by default
 --frame-header whole=0  before each frame of raw files [byte]
 --simulated flag        no camera has recorded it: all that is made of it says so
 --variable text         name of an array in a file of several, or in a result
---offset number         start of the second camera after the first's [s]; else found
+--offset number+        start of each other camera after the first's [s]; else found
 --simulate flag         use emulated devices
 --side-by-side flag     cameras side by side, in place of one window for both
 --at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
@@ -106,9 +106,9 @@ materials text*         as listed by 'data'; all by default
 --blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
 --blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
 --room-temperature kelvin  of that room, as 22C
---offset-std number2    drift of the level of each camera since [K] (0.5)
---gain-std number2      error of the gain of each camera (0.01)
---pattern-std number2   drift of the pixels of each camera since [K] (0.1)
+--offset-std number+    drift of the level of each camera since [K] (0.5)
+--gain-std number+      error of the gain of each camera (0.01)
+--pattern-std number+   drift of the pixels of each camera since [K] (0.1)
 --background-ratio-std number  colour of what surfaces mirror, about gray (0.02)
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
@@ -176,7 +176,7 @@ video.seq
 a.tif --clock 30
 
 import files.make_capture files --bands --offset {_FORM} --frames --every --rows --output
-make a capture of two cameras' files: FLIR, TIFF, raw, NumPy, HDF5, NetCDF, zarr
+make a capture of two cameras' files: FLIR, Telops, TIFF, raw, NumPy, HDF5, MATLAB, NetCDF, zarr
 a.tif b.tif --bands 8-14 9.5 --clock 30 --offset 0 -o scene.zarr
 a*.tif + b*.tif --bands 8-14 9.5 --clock 12 10 --offset 0 -o scene.zarr
 wide.seq narrow.seq --bands 8-14 9.5 --frames 0 3000 --every 3 -o scene.zarr

@@ -21,11 +21,11 @@ _BLOCK: Final = 2**24  # samples of a block that is computed at once
 
 
 class _Rows(BackendArray):
-    """Array (..., y, x) of float32 by a function of some rows."""
+    """Array (..., y, x) of float32 by a function of some rows, and columns."""
 
     dtype = np.dtype("float32")
 
-    def __init__(self, compute: Callable[[slice], Values], shape: tuple[int, ...]) -> None:
+    def __init__(self, compute: Callable[[slice, slice], Values], shape: tuple[int, ...]) -> None:
         self._compute, self.shape = compute, shape
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Values:
@@ -42,10 +42,12 @@ class _Rows(BackendArray):
             (wanted,) = np.nonzero((rows >= block.start) & (rows < block.stop))
             if wanted.size:
                 first, last = rows[wanted].min(), rows[wanted].max()
-                values = self._compute(slice(int(first), int(last) + 1))
-                for axis, index in enumerate((*leading, rows[wanted] - first, columns)):
+                left, right = (int(end(columns)) if columns.size else 0 for end in (np.min, np.max))
+                values = self._compute(slice(int(first), int(last) + 1), slice(left, right + 1))
+                for axis, index in enumerate((*leading, rows[wanted] - first, columns - left)):
                     values = values[(slice(None),) * axis + (_even(index),)]
                 result[..., _even(wanted), :] = values
+                release()
         whole = (slice(None) if place.ndim else 0 for place in places)
         return np.asarray(result[tuple(whole)])
 
@@ -66,23 +68,32 @@ def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
         yield slice(top, min(top + rows, height))
 
 
+def windows(shape: tuple[int, ...], samples: int = 0) -> Iterator[tuple[slice, slice]]:
+    """Yield rows and columns of an array (..., y, x), as `blocks`; parts of a row that has more."""
+    column = int(np.prod(shape)) // max(1, shape[-2] * shape[-1])
+    for rows in blocks(shape, samples):
+        pixels = max(1, (samples or _BLOCK) // max(1, column * (rows.stop - rows.start)))
+        for left in range(0, shape[-1], pixels):
+            yield rows, slice(left, min(left + pixels, shape[-1]))
+
+
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
     """Array with the coordinates and attributes of another, computed by rows, on disk only once."""
+    return by_pixels(lambda rows, columns: compute(rows)[..., columns], like)
+
+
+def by_pixels(compute: Callable[[slice, slice], Values], like: xr.DataArray) -> xr.DataArray:
+    """As `lazy`, by a function of rows and columns, that needs no others."""
     array = _Rows(_once(compute, like.shape) if made_on_disk() else compute, like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)
 
 
-def _once(compute: Callable[[slice], Values], shape: tuple[int, ...]) -> Callable[[slice], Values]:
-    """Compute all rows once, into a film; return the function that reads rows of it."""
+def _once(compute: Callable[[slice, slice], Values], shape: tuple[int, ...]) -> Any:
+    """Compute all rows once, into a film; return the function that reads some of it."""
     film = empty(shape, _Rows.dtype)
     for rows in blocks(shape):
-        film[..., rows, :] = compute(rows)
+        film[..., rows, :] = compute(rows, slice(None))
         release()
 
-    def read(rows: slice) -> Values:
-        values = film[..., rows, :].copy()
-        release()
-        return values
-
-    return read
+    return lambda rows, columns: film[..., rows, columns]

@@ -29,6 +29,8 @@ __dir__ = __all__.copy
 _STEPS: Final[tuple[Callable[..., Any], ...]] = (correct_capture, align, separate)
 SAMPLE: Final = 220
 """Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
+ROW: Final = 75
+"""The same of a sample of a row, of which two threads have one each, where it is by rows [byte]."""
 
 
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name

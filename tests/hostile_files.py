@@ -18,6 +18,7 @@ import xarray as xr
 import zarr
 from matplotlib import colormaps
 from numpy.typing import NDArray
+from scipy.io import savemat
 
 from dbthermal import readers
 
@@ -30,7 +31,8 @@ TIFF: Final[dict[str, dict[str, Any]]] = {
     "64.tif": {"bigtiff": True},
 }
 STORES: Final = {"zarr2": 2, "zarr3": 3}
-FILES: Final = (*FLIR, *TIFF, "raw", "npy", "npz", "nc", "h5")
+SEQUENCES: Final = ("sfmov", "hcc")
+FILES: Final = (*FLIR, *TIFF, *SEQUENCES, "raw", "npy", "npz", "nc", "h5", "mat")
 """Forms of a recording in a single file."""
 
 
@@ -50,6 +52,10 @@ def write(path: Path, form: str) -> Path:
         tifffile.imwrite(path, COUNTS, photometric="minisblack", **TIFF[form])
     elif form == "raw":
         COUNTS.tofile(path)
+    elif form in SEQUENCES:
+        path.write_bytes(sfmov(COUNTS) if form == "sfmov" else hcc(COUNTS))
+    elif form == "mat":
+        savemat(path, {"frames": np.moveaxis(COUNTS, 0, 2)}, do_compression=True)
     elif form in {"npy", "npz"}:
         with path.open("wb") as file:
             (np.save if form == "npy" else np.savez_compressed)(file, COUNTS)
@@ -73,9 +79,35 @@ def read(path: Path, form: str) -> xr.Dataset:
         return readers.flir(path)
     if form in TIFF:
         return readers.tiff(path, **options)
+    if form in SEQUENCES:
+        return readers.sequence(path, clock=10.0)
     if form == "raw":
         return readers.raw(path, COUNTS.shape[1:], byte_order="little", **options)
     return readers.array(path, **options)
+
+
+def sfmov(counts: NDArray[np.uint16], ending: str = "\r\n", kind: str = "Int16u") -> bytes:
+    """Recording of FLIR: lines of names and values, a line of DATA, and the frames."""
+    frames, rows, columns = counts.shape
+    names = {"xPixls": columns, "yPixls": rows, "DaType": kind, "NumDPs": frames}
+    lines = "".join(f"{name} {value}\r\n" for name, value in names.items())
+    text = f"{lines}Camera None\r\nsaf_padding {'x' * 400}\r\nDATA{ending}"
+    return text.encode() + counts.astype("<u2").tobytes()
+
+
+def hcc(
+    counts: NDArray[np.uint16], mode: int = 1, *, times: bool = True, rate: int = 10_000
+) -> bytes:
+    """Recording of Telops at 10 frames/s: a header before each frame, with its time."""
+    content, (rows, columns) = b"", counts.shape[1:]
+    for number, frame in enumerate(counts):
+        header = bytearray(4 * columns)
+        struct.pack_into("<2sBBHxxI", header, 0, b"TC", 3, 11, len(header), number)
+        struct.pack_into("<B3xHH8xI", header, 28, mode, columns, rows, rate)
+        clock = (1_700_000_000 + number // 10, number % 10 * 1_000_000) if times else (0, 0)
+        struct.pack_into("<II", header, 100, *clock)
+        content += header + frame.astype("<u2").tobytes()
+    return content
 
 
 def fate(form: str, before: bytes, after: bytes, recording: xr.Dataset) -> str:

@@ -133,6 +133,38 @@ def test_two_stacks_to_temperatures(
     assert provenance["inputs"]["capture 0"] == store.checksum(results / "aligned.zarr")
 
 
+def test_three_bands(tmp_path: Path) -> None:
+    """Three cameras, with the offset of each, go the whole way; a wrong number of offsets not."""
+    bands, rng, shape = ("8-14", "9.5", "10.6"), np.random.default_rng(1), (8, 10)
+    rig = simulation.Rig(bands=bands, noise=(0.03, 0.3, 0.3), bad_fraction=0.0)
+    glass = xr.DataArray([0.86, 0.72, 0.82], dims="band", coords={"band": list(bands)})
+    truth = simulation.walkers(np.arange(FRAMES) / 10, shape, glass, rng)
+    detector = simulation.pattern(rig, shape, rng)
+    raw = simulation.capture(simulation.observe(truth, rig.response(), rng), detector)
+    sweep = simulation.blackbody_movies(rig, np.linspace(278.15, 343.15, 4), 16, detector, rng)
+    for camera, film, steps in zip("abc", raw["counts"], sweep["counts"], strict=True):
+        np.save(tmp_path / f"{camera}.npy", film)
+        for step, still in zip("0123", steps, strict=True):
+            np.save(tmp_path / f"{camera}{step}.npy", still)
+    stated = ["--bands", *bands, "--clock", "10"]
+    offsets = ["--offset", "0", "0"]
+    done(tmp_path, "import", "a.npy", "b.npy", "c.npy", *stated, *offsets, "-o", "scene.zarr")
+    kelvin = [f"{value}K" for value in sweep["temperature"].values]
+    at = [f"--at {k} a{n}.npy b{n}.npy c{n}.npy" for n, k in enumerate(kelvin)]
+    fitted = ["-o", "r.zarr", "--correction-output", "nuc.zarr", "--offset-std", "0.5", "0.5", "1"]
+    done(tmp_path, "calibrate", *" ".join(at).split(), *stated, *fitted)
+    names = ["scene.zarr", "r.zarr", "--correction", "nuc.zarr", "--register", "none"]
+    done(tmp_path, "separate", *names, *offsets, "-o", "result.zarr")
+    result = store.open_dataset(tmp_path / "result.zarr")
+    error = result["object_temperature"].values - truth["object_temperature"].values
+    assert np.nanmedian(abs(error)) < 0.25  # [K]
+    assert "result.zarr" in done(tmp_path, "info", "result.zarr")
+    done(tmp_path, "export", "result.zarr", "--pixel", "3", "4", "-o", "curve.csv")
+    done(tmp_path, "report", "result.zarr", "scene.zarr", "r.zarr", "-o", "page.html")
+    reason = refused(tmp_path, "separate", *names, "--offset", "0", "-o", "other.zarr")
+    assert "Must be 2, one for each of the bands ['9.5', '10.6']" in reason
+
+
 def test_a_terminal_is_told_the_stage(results: Path) -> None:
     """On a terminal a command says what it does, and ends with a line of its own."""
     reading, writing = os.openpty()
@@ -517,7 +549,7 @@ export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.pn
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock for 'a.tif', which tells no times
-import a.tif b.tif --bands 8-14 9.5 10.6 --clock 10 -o x.zarr -> --bands of 3 names.* Must be two
+import a.tif b.tif --bands 8-14 9.5 10.6 -o x.zarr -> --bands of 3 names.* Must be 2, one for each
 import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 rates
 {ONE} --offset 0 --frames 0 -o x.zarr -> Invalid --frames .* first and end
 {ONE} --offset 0 --frames 300 400 -o x.zarr -> No frame or row of 'a.tif' selected

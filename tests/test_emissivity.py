@@ -12,6 +12,7 @@ from scipy.integrate import quad
 
 from dbthermal import emissivity, planck, readers, schema
 from dbthermal.bands import FILTERS, Band
+from reproduction import libraries
 
 GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
 
@@ -50,10 +51,10 @@ def spectra(mirror: Path) -> dict[str, xr.Dataset]:
     """Every spectrum of the three libraries, by the embedded table's name."""
     paths = sorted((mirror / "ecostress").glob("*.spectrum.txt"))
     spectra = {path.name: readers.ecostress(path) for path in paths}
-    slum = readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv")
+    slum = libraries.slum(mirror / "slum" / "LUMA_SLUM_IR.csv")
     spectra |= {f"LUMA_SLUM_IR.csv:{code}": sample for code, sample in slum.items()}
     others = sorted({*(mirror / "ucsb").glob("*.csv")} - {mirror / "ucsb" / "MANIFEST.csv"})
-    return spectra | {path.name: readers.ucsb(path) for path in others}
+    return spectra | {path.name: libraries.ucsb(path) for path in others}
 
 
 @given(st.floats(0.01, 1.05), st.floats(150.0, 1000.0))

@@ -20,7 +20,6 @@ from dbthermal import (
     correction,
     figures,
     limits,
-    metrics,
     mixing,
     noise,
     readers,
@@ -33,6 +32,7 @@ from dbthermal import emissivity as emissivities
 from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
 from reproduction import figures as drawings
+from reproduction import metrics
 from reproduction.methods.dbvt import DbvtSettings
 
 RIG = simulation.Rig(bad_fraction=0.0)

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import _arrays, _rows, alignment, correction, simulation
+from dbthermal.correction import _pixels
 from reproduction import disturbances
 
 SHAPE = (2, 5, 13, 7)
@@ -83,6 +84,7 @@ def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch
 
     at_once = process(lazy=False)
     monkeypatch.setattr(_rows, "_BLOCK", 40000)
+    monkeypatch.setattr(_pixels, "_BLOCK", 150 * 5)  # five pixels of a row
     for whole, by_rows in zip(at_once, process(lazy=True), strict=True):
         # The level's root mean square is that of other samples.
         np.testing.assert_allclose(whole["pattern_std"], by_rows["pattern_std"], rtol=0.02)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal import readers
 from dbthermal.readers import read_yaml
+from reproduction import libraries
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]))
 LEAVES = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(0.001, 1e9) | WORDS
@@ -48,7 +48,7 @@ def emissivity(folder: Path, text: str) -> float:
     """Number in a table of spectra, after a byte-order mark, with line ends of all kinds."""
     path = folder / "f.csv"
     path.write_bytes(b"\xef\xbb\xbf" + f"wavelength,A1\r\n8,{text}\r14,0.5\n".encode())
-    return float(readers.slum(path)["A1"]["emissivity"][0])
+    return float(libraries.slum(path)["A1"]["emissivity"][0])
 
 
 def test_decimal_numbers(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import argparse
 import re
 from collections.abc import Callable
 from inspect import Parameter, signature
+from itertools import groupby
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
@@ -27,7 +28,8 @@ _MADE_BY = {
 }
 READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
     "TIFF": (readers.tiff, (".tif", ".tiff", ".btf", ".png")),
-    "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr")),
+    "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".mat", ".zarr")),
+    "sequences": (readers.sequence, (".sfmov", ".hcc")),
     "FLIR": (readers.flir, (".fff", ".seq", ".csq", ".jpg", ".jpeg")),
     "raw files": (readers.raw, ()),
 }
@@ -141,28 +143,28 @@ def _rows_of(options: argparse.Namespace) -> slice:
     return slice(first, end)
 
 
-def capture(paths: list[Path], options: argparse.Namespace, offset: float | None) -> xr.Dataset:
-    """Capture of two bands: a store, or the files of one camera, a '+', and of the other."""
+def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
+    """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
     if len(paths) == 1 and paths[0].is_dir():
         return opened(paths[0])
-    if len(paths) == 2 and PLUS not in paths:
-        paths = [paths[0], PLUS, paths[1]]
-    place = paths.index(PLUS) if PLUS in paths else 0
-    if paths.count(PLUS) != 1 or place in {0, len(paths) - 1}:
+    number = len(options.bands or "ab")
+    cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
+    if PLUS not in paths and len(paths) in {2, number}:
+        cameras = [[path] for path in paths]
+    if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
         raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:
-        raise ValueError("Missing --bands. Must name both, such as: --bands 8-14 9.5.")
-    if len(options.clock or ()) > 2:
+        raise ValueError("Missing --bands. Must name all, such as: --bands 8-14 9.5.")
+    if len(options.clock or ()) not in {0, 1, len(cameras)}:
         label = f"Invalid --clock of {len(options.clock)} rates"
         raise ValueError(f"{label}. Must be one, or one for each camera.")
-    if len(options.bands) != 2:
-        label = f"Invalid --bands of {len(options.bands)} names: {', '.join(options.bands)}"
-        raise ValueError(f"{label}. Must be two, of two cameras, with a space between.")
-    cameras = enumerate((paths[:place], paths[place + 1 :]))
-    first, second = (recording(files, options, camera) for camera, files in cameras)
+    if number != len(cameras):
+        label = f"Invalid --bands of {number} names: {', '.join(options.bands)}"
+        raise ValueError(f"{label}. Must be {len(cameras)}, one for each camera, with spaces.")
+    movies = [recording(files, options, camera) for camera, files in enumerate(cameras)]
     with on_disk(_room(options)):
-        return readers.two_bands(first, second, bands=tuple(options.bands), offset=offset)
+        return readers.two_bands(*movies, bands=options.bands, offset=offset)
 
 
 def _room(options: argparse.Namespace) -> Path:

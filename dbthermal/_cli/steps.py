@@ -82,7 +82,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        still = files.capture(paths, options, offset=0.0)  # nothing moves: any offset will do
+        offset = [0.0] * (len(options.bands or "ab") - 1)  # nothing moves: any will do
+        still = files.capture(paths, options, offset)
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
@@ -123,10 +124,22 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
     (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
-    named = {**accepted(alignment.align, options), "clock": options.reference}
+    named = {**_aligning(options, corrected), "clock": options.reference}
     if options.register != "none":
         named["transform"] = alignment.register(corrected, model=options.register)
     return files.saved(alignment.align(corrected, lazy=True, **named), options)
+
+
+def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any]:
+    """Options of an alignment, with the offset of each band."""
+    named = accepted(alignment.align, options)
+    if "offset" in named:
+        first, *bands = capture["band"].values.tolist()
+        if len(named["offset"]) != len(bands):
+            rule = f"Must be {len(bands)}, one for each of the bands {bands}"
+            raise ValueError(f"Invalid --offset {named['offset']}. {rule}.")
+        named["offset"] = xr.DataArray([0.0, *named["offset"]], {"band": [first, *bands]}, "band")
+    return named
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
@@ -145,7 +158,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             fitted[0].load(),
             response,
             registration=None if options.register == "none" else options.register,
-            aligning=accepted(alignment.align, options),
+            aligning=_aligning(options, source),
             separating=accepted(separation.separate, options) | progress,
             target=options.output,
             provenance=files.provenance(options),
@@ -205,8 +218,7 @@ def foreseen(
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
         memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
-        # By rows, of which one at least is in memory.
-        row = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "x"))
+        row = BASE + scene.ROW * math.prod(sizes.get(dim, 0) for dim in ("time", "x"))
         most = max(3e9, row) if options.correction else 2e9 if options.method else math.inf
         summary["memory_at_most_GB"] = round(min(memory, most) / 1e9, 1)
     return summary

@@ -361,13 +361,14 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
         refitted = fit_band(band, temperature[remaining], counts[remaining])
         residual = counts - refitted.counts(temperature)
         if np.sum(residual[remaining] ** 2) <= std**2 * chdtri(counts.size - 3, _FALSE_ALARM):
-            fitting.append((place, residual[place]))
+            read = float(refitted.inverse(counts[place])) - zero_Celsius
+            fitting.append((place, residual[place], read))
     if len(fitting) == 1:
-        ((place, distance),) = fitting
+        ((place, distance, read),) = fitting
         raise ValueError(
             f"Invalid counts {counts[place]:.6g} at {temperature[place]:.6g} K in band '{band}', "
-            f"{distance:+.4g} count off the Planck curve of the others. "
-            f"Must lie on one; {explained}."
+            f"{distance:+.4g} count off the Planck curve of the others, on which they read as "
+            f"{read:.1f} degC. Must lie on one; {explained}."
         )
     place = int(np.argmax(np.abs(off)))
     shortest, longest = (1e6 * edge for edge in _wavelengths(band))

@@ -156,9 +156,10 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         stamped, events, notes = _events(capture, repeats, before, maximum)
     closed = _closed(capture)
 
-    def measured(rows: slice) -> xr.Dataset:
-        """Correct some rows, in the steps that need no other rows."""
-        corrected = correct(stamped.isel(y=rows), before.isel(y=rows), maximum=maximum)
+    def measured(rows: slice, columns: slice = slice(None)) -> xr.Dataset:
+        """Correct some rows and columns, in the steps that need no others."""
+        pixels = {"y": rows, "x": columns}
+        corrected = correct(stamped.isel(pixels), before.isel(pixels), maximum=maximum)
         corrected = _without_damaged(
             corrected if events is None else mark_shutter(corrected, events)
         )
@@ -178,7 +179,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     return warned(result.assign_attrs(shutter_closed_frames=number), *notes)
 
 
-def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
+def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
     """Correct block by block of rows, with counts that are computed when they are read."""
     blocks = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
@@ -189,7 +190,7 @@ def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.D
         if len(finite):
             whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
-    counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
+    counts = _rows.by_pixels(lambda *window: measured(*window)["counts"].values, like)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
 

@@ -35,7 +35,7 @@ _UNCORRECTED: Final = (
     "with gain and offset of these cameras, as of 'calibrate', renewed since the shutter's last "
     "event; no flag and no error bar has this error"
 )
-_BLOCK = 8_000_000  # samples of a block of rows
+_BLOCK = 8_000_000  # samples of a block
 
 
 def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:
@@ -113,12 +113,12 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         segment_numbers = schema.segments(corrected)[frames]
         movie, stepped = movie.isel(time=frames), np.diff(segment_numbers) != 0
         segments = np.unique(segment_numbers)
-        # Noise and mean picture of each pixel, block by block of rows.
+        # Noise and mean picture of each pixel, some at a time.
         level, still = np.empty(image), np.empty((segments.size, *image))
-        for rows in _rows.blocks(movie.shape, _BLOCK):
-            block = _samples(movie, rows)
-            level[rows] = samples.noise(block)
-            still[:, rows] = [_mean(block[segment_numbers == number]) for number in segments]
+        for window in _rows.windows(movie.shape, _BLOCK):
+            block = _samples(movie, *window)
+            level[window] = samples.noise(block)
+            still[:, *window] = [_mean(block[segment_numbers == number]) for number in segments]
         judged = np.isfinite(level)
         if not judged.any():
             raise ValueError(
@@ -206,19 +206,21 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     reach it are clipped.
     """
     image = (movie.sizes["y"], movie.sizes["x"])
-    middle = movie.isel(y=image[0] // 2).values
+    step = max(1, image[1] // samples.PIXELS)
+    middle = movie.isel(y=image[0] // 2, x=slice(None, None, step)).values
     grain = samples.grain(middle, np.ones(middle.shape, dtype=bool))
     clipped, frozen = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
     ends = np.zeros((2, 3, *image))
-    for rows in _rows.blocks(movie.shape, _BLOCK):
-        counts = movie.isel(y=rows).values.reshape(len(movie), -1)
+    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+        counts = movie.isel(y=rows, x=columns).values.reshape(len(movie), -1)
+        shape = (-1, columns.stop - columns.start)
         valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
         still = samples.frozen(samples.repeated(counts, valid), grain.chance)
-        frozen[rows] = still.reshape(-1, image[1])
+        frozen[rows, columns] = still.reshape(shape)
         for highest in (False, True):
             end, number = samples.end_of(counts, valid, highest=highest)
             statistics = (end, number, samples.near_end(counts, valid, end, grain))
-            ends[int(highest), :, rows] = np.reshape(statistics, (3, -1, image[1]))
+            ends[int(highest), :, rows, columns] = np.reshape(statistics, (3, *shape))
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
         clipped |= moving & samples.is_heap(number, near, grain)
@@ -233,8 +235,8 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     """Indices of the frames of a band that are not NaN."""
     finite = np.zeros(movie.sizes["time"], dtype=bool)
-    for rows in _rows.blocks(movie.shape, _BLOCK):
-        finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
+    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+        finite |= np.isfinite(movie.isel(y=rows, x=columns).values).any(axis=(1, 2))
     if finite.sum() < fewest:
         step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
         raise ValueError(
@@ -245,9 +247,9 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     return np.flatnonzero(finite)
 
 
-def _samples(movie: xr.DataArray, rows: slice) -> Single:
-    """Counts of a block of rows, NaN where they are no measurement."""
-    counts = movie.isel(y=rows).values
+def _samples(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
+    """Counts of some rows and columns, NaN where they are no measurement."""
+    counts = movie.isel(y=rows, x=columns).values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
 
 
@@ -269,14 +271,16 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
-    for rows in _rows.blocks(movie.shape, _BLOCK):
-        # Include a row of neighbours on either side.
-        top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
-        changes = _changes(_samples(movie, slice(top, bottom)), stepped)
-        inner = slice(rows.start - top, rows.stop - top)
+    for window in _rows.windows(movie.shape, _BLOCK):
+        # Include neighbours on every side.
+        (top, left), (bottom, right) = zip(*((it.start, it.stop) for it in window), strict=True)
+        wide = slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1)
+        inner = np.s_[top - wide[0].start :, left - wide[1].start :]
+        changes = _changes(_samples(movie, *wide), stepped)
         for sign in (1.0, -1.0):
             change, total = (np.float32(sign) * difference for difference in changes)
-            jumping[rows] |= _alone(change, total, limit[top:bottom], reach)[inner]
+            alone = _alone(change, total, limit[wide], reach)[inner]
+            jumping[window] |= alone[: bottom - top, : right - left]
     return jumping
 
 

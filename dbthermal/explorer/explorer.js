@@ -223,7 +223,7 @@ class Explorer {
   }
   close() {
     clearInterval(this.player);
-    this.observer?.disconnect();
+    for (const observer of [this.observer, this.themes]) observer?.disconnect();
     this.link.model.off("msg:custom", this.link.listener);
   }
   take(kind, message, buffers = []) {
@@ -272,6 +272,8 @@ class Explorer {
     this.root.addEventListener("keydown", (event) => this.key(event));
     this.observer = new ResizeObserver(() => this.redraw());
     this.observer.observe(this.root);
+    this.themes = new MutationObserver(() => this.repaint()); // pictures draw in the colour of the text
+    this.themes.observe(document.body, { attributes: true, attributeFilter: ["data-jp-theme-light"] });
     this.repaint();
     this.arrange(copy(1, Uint8Array));
     this.askCurves();

@@ -8,7 +8,6 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 """
 
 from dbthermal.figures import drawing
-from dbthermal.figures._calibration import gain_offset_maps, response_fit
 from dbthermal.figures._limits import plan
 from dbthermal.figures._live import Panel, live
 from dbthermal.figures._scenes import (
@@ -26,11 +25,9 @@ __all__ = [
     "Panel",
     "drawing",
     "film",
-    "gain_offset_maps",
     "live",
     "plan",
     "reflection_shift",
-    "response_fit",
     "separated_frames",
     "separated_temperatures",
     "status",

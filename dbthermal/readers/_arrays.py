@@ -1,4 +1,4 @@
-"""Counts in files of NumPy, HDF5, NetCDF and zarr, or in an array that is opened already."""
+"""Counts in files of NumPy, HDF5, NetCDF, MATLAB, zarr, or in an array that is opened already."""
 
 import re
 import warnings
@@ -39,7 +39,7 @@ def array(
     clock: Clock | None = None,
     memory: float = MEMORY,
 ) -> xr.Dataset:
-    """Counts of a NumPy, HDF5, NetCDF or zarr file, or of an array that is opened already.
+    """Counts of a NumPy, HDF5, NetCDF, MATLAB or zarr file, or of an array that is opened already.
 
     The format is that of the first bytes. Pickled objects are never loaded, and nothing is taken
     from another file. HDF5 and zarr may be without checksums; damage of their values is then not
@@ -99,7 +99,7 @@ def array(
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
             listed = (axis for axis in coords if containers.are_times(axis.name, axis))
             rules.compare(next(listed, None))
-        elif (kind := formats.format_of(path)) in {"zarr", "HDF5", "NetCDF"}:
+        elif (kind := formats.format_of(path)) in {"zarr", "HDF5", "NetCDF", "MATLAB 5"}:
             values = containers.read(path, kind, name, rules.check, rules.compare, stack)
         else:
             values = _numpy_file(path, name, rules, stack)

@@ -22,7 +22,8 @@ import numpy.typing as npt
 import zarr
 
 from dbthermal import _text as texts
-from dbthermal.readers import _netcdf
+from dbthermal.readers import _formats as formats
+from dbthermal.readers import _matlab, _netcdf
 from dbthermal.readers import _recording as recordings
 
 # Names of times: of a dim, and of an array beside another.
@@ -114,7 +115,8 @@ def read(
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
-        arrays = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _variables}[kind](path, stack)
+        opened = {"zarr": _foreign_store, "HDF5": _hdf5}.get(kind, _variables)
+        arrays = opened(path, stack)
         films = [key for key, array in arrays.items() if array.ndim == 3]
         name = recordings.array_name(films, name, path)
         # Shapes first, then what is stored, then times and numbers.
@@ -130,7 +132,7 @@ def read(
         if not listed:
             compare(None)
         _check_whole(values, path)
-        with path.open("rb") if kind == "HDF5" else BytesIO() as stream:
+        with path.open("rb") if kind in {"HDF5", "MATLAB 5"} else BytesIO() as stream:
             by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
         counts = recordings.film(values)
         return np.swapaxes(counts, 1, 2) if by_columns else counts
@@ -223,7 +225,8 @@ def _check_pieces(array: Any, path: Path) -> None:
 
 
 def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
-    variables = _netcdf.arrays(path)
+    is_matlab = formats.format_of(path) == "MATLAB 5"
+    variables: dict[str, Any] = _matlab.arrays(path) if is_matlab else _netcdf.arrays(path)
     return {n: v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
 
 

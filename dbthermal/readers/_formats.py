@@ -27,18 +27,17 @@ _HDF5: Final = b"\x89HDF\r\n\x1a\n"  # at 0, 512, 1024, ...: what precedes is th
 _READER: Final = {
     **dict.fromkeys(("FLIR", "JPEG"), "flir"),
     **dict.fromkeys(("TIFF", "PNG"), "tiff"),
-    **dict.fromkeys(("NumPy", "zip", "HDF5", "NetCDF", "zarr"), "array"),
+    **dict.fromkeys(("NumPy", "zip", "HDF5", "NetCDF", "zarr", "MATLAB 5"), "array"),
 }
+SEQUENCES: Final = (".sfmov", ".hcc")
 _EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
 _DRAWN: Final = (
     "most have 8 bits that are drawn, not measured: record 16-bit counts; one of 16-bit counts is "
     "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
 )
 _FOREIGN: Final = {
-    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".hcc"), _EXPORT),
-    ".sfmov": f"{_EXPORT}, or readers.raw with header=, up to the line of DATA",
+    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt"), _EXPORT),
     **dict.fromkeys(("film", "picture"), _DRAWN),
-    "MATLAB 5": "save it anew by save(..., '-v7.3') and use readers.array",
     "HDF4": "convert it by h4toh5 and use readers.array",
     **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
     "gzip": "unpack it by gunzip",
@@ -67,7 +66,7 @@ def format_of(path: Path) -> str:
 
 def refuse_text(path: Path) -> None:
     """Raise ValueError for a file that begins as a text; bare numbers hardly ever do."""
-    if format_of(path):
+    if format_of(path) or path.suffix.lower() in SEQUENCES:
         return
     with path.open("rb") as stream:
         start = stream.read(_TEXT)
@@ -82,7 +81,7 @@ def reader_of(path: Path) -> str:
         raise ValueError(f"Refused '{path.name}': {_FOREIGN[suffix]}.")
     if form in _FOREIGN:
         raise ValueError(f"Refused '{path.name}', a {form}: {_FOREIGN[form]}.")
-    return _READER.get(form, "")
+    return _READER.get(form, "sequence" if suffix in SEQUENCES and not form else "")
 
 
 def files(path: Paths, reader: str) -> list[Path]:

@@ -1,7 +1,8 @@
-"""Two recordings as one capture of two bands."""
+"""Recordings of one band each as one capture."""
 
 from collections.abc import Sequence
 from datetime import datetime
+from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
@@ -24,45 +25,44 @@ _ALIKE: Final = 5.0  # between the medians of two bands [K]
 def two_bands(
     first: xr.Dataset,
     second: xr.Dataset,
-    *,
-    bands: tuple[str, str],
-    offset: float | None = None,
+    *further: xr.Dataset,
+    bands: Sequence[str],
+    offset: float | Sequence[float] | None = None,
 ) -> xr.Dataset:
-    """Two cameras' recordings as one capture, with both clocks.
+    """Recordings of two cameras, or more, as one capture, with the clock of each.
 
     Each band keeps its own frames and times; nothing is interpolated. `alignment.time_offset` and
-    `alignment.align` bring the two onto one clock: two cameras' dates are hardly ever right to a
-    frame.
+    `alignment.align` bring all onto one clock: cameras' dates are hardly ever right to a frame.
 
     Parameters
     ----------
-    first, second : Dataset
+    first, second, *further : Dataset
         Recordings of one band each, from `flir`, `tiff`, `raw` or `array`, of the same pixels.
-    bands : (str, str)
-        Names of the two bands, such as ``("8-14", "9.5")``.
-    offset : float, optional
-        Time from the beginning of the first to that of the second recording [s]. By default from
-        the dates of both files.
+    bands : sequence of str
+        Names of the bands, such as ``("8-14", "9.5")``.
+    offset : float or sequence of float, optional
+        Time from the beginning of the first recording to that of each other one [s]. By default
+        from the dates of the files.
 
     Returns
     -------
     Dataset
         Stage `capture` of `schema`: `counts` (band, time, y, x), `exposure_time` and `frame_flags`
-        (band, time). The shorter band is filled with its last frame, flagged ``padded``, without a
-        time; `time` is the clock of the longer one. ``files`` has both recordings' attributes as a
+        (band, time). Shorter bands are filled with their last frame, flagged ``padded``, without a
+        time; `time` is the clock of the longest one. ``files`` has all recordings' attributes as a
         mapping by band. Copies the counts: twice their memory is needed.
 
     Raises
     ------
     TypeError, ValueError
         If a recording is not one of counts in one band, or its times are unknown, infinite or fall;
-        bands are not two different names; sizes differ; an offset is no number, or there is none
-        and no date; the recordings do not overlap in time, or they hold the same counts.
+        bands are not different names, one for each; sizes differ; an offset is no number, or there
+        is none and no date; recordings do not overlap in time, or hold the same counts.
 
     Warns
     -----
     UserWarning
-        If the counts of both bands read as the same temperatures in hundredths of a degree.
+        If the counts of all bands read as the same temperatures in hundredths of a degree.
 
     Examples
     --------
@@ -75,83 +75,84 @@ def two_bands(
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
     """
-    # Two recordings of one size, with names.
-    pair = (first, second)
-    names = _names(bands)
-    for name, recording in zip(names, pair, strict=True):
+    # Recordings of one size, with names.
+    cameras = (first, second, *further)
+    names = _names(bands, len(cameras))
+    for name, recording in zip(names, cameras, strict=True):
         _check(recording, name)
-    if offset is not None:
-        recordings.check_number(offset, "offset")
-    shapes = [(recording.sizes["y"], recording.sizes["x"]) for recording in pair]
-    if shapes[0] != shapes[1]:
-        raise ValueError(
-            f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
-            "equal: resample the second recording, or crop the first."
-        )
-    # Offset of the clocks, by which they must overlap.
-    late = _between_dates(pair) if offset is None else offset
-    starts, stops = ([recording["time"].values[place] for recording in pair] for place in (0, -1))
-    overlap = np.minimum(stops[0], stops[1] + late) - np.maximum(starts[0], starts[1] + late)
-    if not overlap > 0 and max(recording.sizes["time"] for recording in pair) > 1:
-        raise ValueError(
-            f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
-            "overlap. Must overlap; give offset= if a camera's clock is wrong."
-        )
-    # Two cameras, not a file named twice.
-    shared = min(recording.sizes["time"] for recording in pair)
-    overlapping = [recording["counts"].values[:shared] for recording in pair]
-    film, second_film = overlapping
-    if all(np.array_equal(film[at], second_film[at]) for at in parts(film)):
-        raise ValueError(
-            f"Same counts in both recordings, of the bands {names}. Must be those of two cameras: "
-            "is one file named twice?"
-        )
-    # Frames of both; the shorter recording is filled up, and flagged.
-    frames = max(recording.sizes["time"] for recording in pair)
-    counts = empty((2, frames, *shapes[0]), np.uint16)
-    times = np.full((2, frames), np.nan)
-    flags = np.full((2, frames), FileFlag.PADDED.value, dtype=np.uint16)
-    for place, (recording, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
+    shape, *others = [(recording.sizes["y"], recording.sizes["x"]) for recording in cameras]
+    if unlike := {*others} - {shape}:
+        label = f"Different sizes {shape} and {unlike.pop()} pixels of the bands {names}"
+        raise ValueError(f"{label}. Must be equal: resample recordings, or crop the others.")
+    # Offsets of the clocks, by which they must overlap.
+    shifts = [0.0, *_offsets(cameras, offset)]
+    starts, stops = ([recording["time"].values[n] for recording in cameras] for n in (0, -1))
+    overlap = min(np.add(stops, shifts)) - max(np.add(starts, shifts))
+    lengths = [recording.sizes["time"] for recording in cameras]
+    if not overlap > 0 and max(lengths) > 1:
+        label = f"{' and '.join(f'{shift:g}' for shift in shifts[1:])} s: the recordings of "
+        label += " and ".join(f"{stop:g}" for stop in stops)
+        rule = "Must overlap; give offset= if a camera's clock is wrong"
+        raise ValueError(f"Invalid offset {label} s do not overlap. {rule}.")
+    # As many cameras, not a file named twice.
+    overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
+    for film, other_film in combinations(overlapping, 2):
+        if all(np.array_equal(film[at], other_film[at]) for at in parts(film)):
+            label = f"Same counts in both recordings, of the bands {names}"
+            raise ValueError(f"{label}. Must be those of two cameras: is one file named twice?")
+    # Frames of all; shorter recordings are filled up, and flagged.
+    counts = empty((len(names), max(lengths), *shape), np.uint16)
+    times = np.full(counts.shape[:2], np.nan)
+    flags = np.full(counts.shape[:2], FileFlag.PADDED.value, dtype=np.uint16)
+    for place, (recording, shift) in enumerate(zip(cameras, shifts, strict=True)):
         length = recording.sizes["time"]
         for at in parts(recording["counts"].values):
             counts[place, :length][at] = recording["counts"].values[at]
         counts[place, length:] = recording["counts"].values[-1]
         times[place, :length] = recording["exposure_time"].values + shift
         flags[place, :length] = recording["frame_flags"].values
-    # The capture, on the clock of the longer recording.
-    longer = int(second.sizes["time"] > first.sizes["time"])
-    clock = pair[longer]["time"].values + (0.0, late)[longer]
+    # The capture, on the clock of the longest recording.
+    longest = int(np.argmax(lengths))
+    clock = cameras[longest]["time"].values + shifts[longest]
     variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
     variables["frame_flags"] = (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS))
     time = ("time", clock, schema.COORDINATES["time"].attrs)
     attrs = {
-        **schema.origin(first.attrs, second.attrs),
-        "source": " and ".join(str(recording.attrs.get("source", "")) for recording in pair),
-        "offset": late,
+        **schema.origin(*(recording.attrs for recording in cameras)),
+        "source": " and ".join(str(recording.attrs.get("source", "")) for recording in cameras),
+        "offset": shifts[1] if len(shifts) == 2 else shifts[1:],
         "offset_by": "dates" if offset is None else "caller",
-        "files": {name: dict(recording.attrs) for name, recording in zip(names, pair, strict=True)},
+        "files": {name: dict(it.attrs) for name, it in zip(names, cameras, strict=True)},
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
     borders = map(_border, overlapping, names)
     return warned(capture, *_temperatures(overlapping), *filter(None, borders))
 
 
-def _between_dates(pair: tuple[xr.Dataset, xr.Dataset]) -> float:
-    """Time from the date of the first recording to that of the second [s]."""
-    dates = [recording.attrs.get("start") for recording in pair]
-    if None in dates:
-        raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
-    begun, later = (datetime.fromisoformat(str(date)) for date in dates)
-    return (later - begun).total_seconds()
+def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
+    """Times from the beginning of the first recording to those of all others [s]."""
+    if offset is None:
+        dates = [recording.attrs.get("start") for recording in cameras]
+        if None in dates:
+            raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
+        begun, *later = (datetime.fromisoformat(str(date)) for date in dates)
+        return [(date - begun).total_seconds() for date in later]
+    offsets = list(offset) if isinstance(offset, list | tuple) else [offset]
+    for value in offsets:
+        recordings.check_number(value, "offset")
+    if len(offsets) != len(cameras) - 1:
+        rule = f"Must be {len(cameras) - 1}, one for each recording after the first"
+        raise ValueError(f"Invalid offset {offset} s. {rule}.")
+    return offsets
 
 
-def _names(bands: Any) -> list[str]:
-    """Names of two bands, which must be texts, and differ."""
-    is_pair = isinstance(bands, Sequence) and not isinstance(bands, str) and len(bands) == 2
-    listed = bands if is_pair else []
+def _names(bands: Any, number: int) -> list[str]:
+    """Names of so many bands, which must be texts, and differ."""
+    listed = bands if isinstance(bands, Sequence) and not isinstance(bands, str) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
-    if len({*names}) != 2:
-        raise ValueError(f"Invalid bands {bands!r}. Must be two different names, as texts.")
+    if not len({*names}) == len(listed) == number:
+        label = {2: "two", 3: "three"}.get(number, number)
+        raise ValueError(f"Invalid bands {bands!r}. Must be {label} different names, as texts.")
     return names
 
 
@@ -174,7 +175,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
         plausible = np.all((low >= 100 * (zero + _SCENE[0])) & (high <= 100 * (zero + _SCENE[1])))
         if plausible and np.ptp(middle) < 100 * _ALIKE:
             medians = " and ".join(f"{median / 100:.1f}" for median in middle)
-            label = f"The medians of both bands, over 100, are temperatures: {medians} {unit}"
+            label = f"The medians of the bands, over 100, are temperatures: {medians} {unit}"
             rule = "Must be counts of the detector; should these be alike by chance, go on"
             return [f"{label}. {rule}."]
     return []

@@ -245,8 +245,10 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
         if mask.all():
             continue
         axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
-        row, column = (float(places.mean()) for places in np.nonzero(mask))
-        label = axes[0, 0].text(column, row, name, color="white", ha="center", va="center")
+        row, column = (float(places.min()) for places in np.nonzero(mask))
+        across, above = column < mask.shape[1] / 2, row > mask.shape[0] / 10
+        side: Any = {"ha": "left" if across else "center", "va": "bottom" if above else "top"}
+        label = axes[0, 0].text(column, row - 1.0, name, color="white", fontsize=8, **side)
         label.set_path_effects([withStroke(linewidth=2.5, foreground="black")])
     return figure
 

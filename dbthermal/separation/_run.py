@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, product
 from multiprocessing import parent_process
 from pathlib import Path
 from types import MappingProxyType
@@ -58,7 +58,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
 ) -> None:
     """Separate captures of any size from disk to disk, by blocks of rows, by several processes.
 
-    Each block of rows is separated as by `solve` and written by one process. A run that was killed
+    Each block of rows, or of columns of a row that does not fit in the memory, is separated as by
+    `solve` and written by one process. A run that was killed
     goes on where it stopped, to the same bytes; a target that the same run has made is left as it
     is. A capture is recognised by its store's checksums; one in memory or lazy by its values.
 
@@ -82,9 +83,10 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
         by default two threads, or one where the memory is too small for two.
     memory : float
-        Largest memory of a process [byte]; with less, a block has fewer rows than 32. A process of
-        an executor separates one block at a time, a ThreadPoolExecutor one in each thread. The
-        process that compiles, the first after the installation, takes 0.35 GB more.
+        Largest memory of a process [byte]; with less, a block has fewer rows than 32, or columns of
+        a single one, so that a capture of any length fits. A process of an executor separates one
+        block at a time, a ThreadPoolExecutor one in each thread. The process that compiles, the
+        first after the installation, takes 0.35 GB more.
     provenance : mapping, optional
         See `store.save`.
     progress : bool
@@ -93,7 +95,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     Raises
     ------
     TypeError, ValueError
-        As `solve` does; if the memory is too small for a row, or the parts are of another run.
+        As `solve` does; if the memory is too small for a column of a row, or for the chunks of
+        dask's that hold it, or the parts are of another run.
     BlockingIOError
         With its name, while another process separates into the target.
     ExceptionGroup
@@ -163,13 +166,14 @@ class _Plan:
     method: str
     options: Mapping[str, Any]  # of `solve`
     height: int = 0  # rows of a block
+    width: int | None = None  # columns of a block of less than a row
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def of_rows(self, rows: slice) -> "_Plan":
-        """Plan with the options of some rows."""
+    def of_pixels(self, **places: slice) -> "_Plan":
+        """Plan with the options of some rows and columns."""
         options = {
-            name: value.isel(y=rows)
-            if isinstance(value, xr.DataArray) and "y" in value.dims
+            name: value.isel(places, missing_dims="ignore")
+            if isinstance(value, xr.DataArray)
             else value
             for name, value in self.options.items()
         }
@@ -192,9 +196,9 @@ def _separate_capture(
     method = get_method(plan.method)
     checked = _inputs.check(capture, plan.response, method, **plan.options)
     settings = plan.options["settings"]
-    threads, height, read = _share(capture, memory, executor, method, settings)
+    threads, (height, width), read = _share(capture, memory, executor, method, settings)
     with ThreadPoolExecutor(threads) as pool:
-        content = _content(source, capture, read, executor or pool)
+        content = _content(source, capture, (read, width), executor or pool)
     response = checked.response  # with one noise for all blocks
     digest = _digest([content, response, plan.method, plan.options])
     made = json.loads(json.dumps({**(provenance or store.provenance({})), "run": digest}))
@@ -204,20 +208,25 @@ def _separate_capture(
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed at its very end
         return
     plan = replace(plan, response=response, height=height, provenance=made)
-    _begin(folder, {"height": height, **made})
-    end = capture.sizes["y"]
-    paths = {top: folder / f"{top:06d}.zarr" for top in range(0, end, height)}
+    plan = plan if width == capture.sizes["x"] else replace(plan, width=width)
+    _begin(folder, {"height": height, "width": width, **made})
+    image, lefts = capture.sizes["y"], range(0, capture.sizes["x"], width)
+    paths = {
+        top: {left: folder / f"{top:06d}-{left:06d}.zarr" for left in lefts}
+        for top in range(0, image, height)
+    }
     # Separate the blocks that are missing, those of one reading together.
     with ThreadPoolExecutor(threads) as pool:
         missing = list[Future[None]]()
-        for top in range(0, end, read):
-            rows = slice(top, min(top + read, end))
-            blocks = range(top, rows.stop, height)
-            places = {row - top: paths[row] for row in blocks if not paths[row].exists()}
+        for top, left in product(range(0, image, read), lefts):
+            pixels = {"y": slice(top, min(top + read, image)), "x": slice(left, left + width)}
+            blocks = range(top, pixels["y"].stop, height)
+            places = {row - top: paths[row][left] for row in blocks}
+            places = {row: path for row, path in places.items() if not path.exists()}
             if places:
-                block = source if isinstance(source, Path) else capture.isel(y=rows)
-                task = block, rows, places, plan.of_rows(rows)
-                missing.append((executor or pool).submit(_separate_rows, *task))
+                block = source if isinstance(source, Path) else capture.isel(pixels)
+                task = block, pixels, places, plan.of_pixels(**pixels)
+                missing.append((executor or pool).submit(_separate_pixels, *task))
         jobs.extend(missing)
         bar.total = (bar.total or 0) + len(missing)
         try:
@@ -227,23 +236,28 @@ def _separate_capture(
         finally:
             for job in missing:
                 job.cancel()
-    store.join_parts(paths.values(), target)
+    rows = [columns[0] for columns in paths.values()]
+    if len(lefts) > 1:
+        rows = [folder / f"{top:06d}.zarr" for top in paths]
+        for columns, whole in zip(paths.values(), rows, strict=True):
+            store.join_parts(columns.values(), whole, "x")
+    store.join_parts(rows, target)
     shutil.rmtree(folder)
 
 
-def _separate_rows(
-    source: Path | xr.Dataset, rows: slice, paths: Mapping[int, Path], plan: _Plan
+def _separate_pixels(
+    source: Path | xr.Dataset, pixels: dict[str, slice], paths: Mapping[int, Path], plan: _Plan
 ) -> None:
-    """Read rows of a capture on disk or in hand; write each block of them whole or not."""
+    """Read pixels of a capture on disk or in hand; write each block of them whole or not."""
     with chunks_in_turn() if parent_process() else nullcontext():  # as an executor's process
-        capture = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
+        capture = store.open_dataset(source).isel(pixels) if isinstance(source, Path) else source
         # What is dask's is computed here: its own threads, or the cluster's, would hold more.
         capture = capture.load(scheduler="synchronous")
         for top, path in paths.items():
             block = slice(top, top + plan.height)
-            options = plan.of_rows(block).options
+            options = plan.of_pixels(y=block).options
             result = solve(capture.isel(y=block), plan.response, plan.method, workers=1, **options)
-            store.save_rows([result], path, plan.provenance, plan.height)
+            store.save_rows([result], path, plan.provenance, plan.height, plan.width)
             del result  # before the next block is in memory
 
 
@@ -270,41 +284,50 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
 
 def _share(
     capture: xr.Dataset, memory: float, executor: Executor | None, method: Method, settings: Any
-) -> tuple[int, int, int]:
-    """Threads of a process, rows of a block, as `solve` reads at once or fewer, and of a read."""
-    counts = capture["counts"]
-    row, lazy = counts[..., 0, :].size, counts.chunksizes.get("y", ())
-    chunk = max(lazy, default=counts.encoding.get("preferred_chunks", {}).get("y", 1))
+) -> tuple[int, tuple[int, int], int]:
+    """Threads of a process, rows and columns of a block, as `solve` reads or fewer, rows read."""
+    counts, columns = capture["counts"], capture.sizes["x"]
+    column, lazy = counts[..., 0, 0].size, counts.chunksizes.get("y", ())
+    stored = counts.encoding.get("preferred_chunks", {})
+    chunk, chunk_width = (
+        max(counts.chunksizes.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx"
+    )
     sample = _TILE if method.compiled else _TILE * _TIMES
-    tile = sample * largest(method, settings, capture) * row / capture.sizes["x"]
+    tile = sample * largest(method, settings, capture) * column
 
     def read(height: int) -> tuple[int, bool]:
         """Rows read together, blocks as far as a chunk of dask's; whether they are whole chunks."""
         rows = height * math.ceil(chunk / height) if lazy else height
         return rows, rows % chunk == 0 and set(lazy[:-1]) <= {chunk}
 
-    def need(height: int) -> float:
+    def need(height: int, width: int = columns) -> float:
         """Memory [byte] of the chunks read, of the blocks' samples, and of a tile."""
         rows, whole = read(height)
-        chunks = (rows if whole else rows + 2 * chunk) if lazy else 0
-        samples = _READ * (rows + chunks) + _SAMPLE * height
-        return samples * row + min(sample * row * height, tile)
+        held = width if width == columns else min(columns, width + 2 * chunk_width)
+        chunks = (rows if whole else rows + 2 * chunk) * held if lazy else 0
+        samples = _READ * (rows * width + chunks) + _SAMPLE * height * width
+        return samples * column + min(sample * column * height * width, tile)
 
-    threads = 1 if executor or memory < BASE + 2 * need(1) else 2
+    fewest = columns if lazy else 1  # a chunk of dask's is made anew for each of its blocks
+    threads = 1 if executor or memory < BASE + 2 * need(1, fewest) else 2
     if isinstance(executor, ThreadPoolExecutor):
         threads = executor._max_workers
     free = (memory - BASE) / threads
-    if free < need(1):
+    if free < need(1, 1):
         raise ValueError(
-            f"Invalid memory {memory:g} byte. Must be at least {BASE + threads * need(1):g} for "
-            f"one row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames"
-            + (f", of a source in chunks of {chunk} rows." if lazy else ".")
+            f"Invalid memory {memory:g} byte. Must be at least {BASE + threads * need(1, 1):g} for "
+            f"one pixel of {capture.sizes['time']} frames"
+            + (f", of a source in chunks of {chunk} x {chunk_width}." if lazy else ".")
         )
+    # Columns of a row that does not fit: as many as do, of whole chunks if they can be.
+    if free < need(1):
+        width = max(count for count in range(1, columns) if need(1, count) <= free)
+        return threads, (1, width - width % chunk_width or width), read(1)[0]
     # The highest block that fits; a lower one, by less than half, if it reads no chunk twice.
     highest = min(BLOCK_ROWS, capture.sizes["y"])
     fit = [height for height in range(1, highest + 1) if need(height) <= free]
     height = max([rows for rows in fit if 2 * rows > fit[-1] and read(rows)[1]] or fit)
-    return threads, height, read(height)[0]
+    return threads, (height, columns), read(height)[0]
 
 
 def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
@@ -327,16 +350,23 @@ def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
         )
 
 
-def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor: Executor) -> Any:
-    """Checksums of a capture's store; without these, digests of its values, read by the workers."""
+def _content(
+    source: Path | xr.Dataset, capture: xr.Dataset, read: tuple[int, int], executor: Executor
+) -> Any:
+    """Checksums of a capture's store; without these, digests of its values, read by the workers.
+
+    By rows, or by so many columns of a row that does not fit in the memory.
+    """
     if isinstance(source, Path) and (sums := last_sums(source)):
         return sums
     films = [name for name, variable in capture.variables.items() if "y" in variable.dims]
     constant, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
-    heights = capture["counts"].chunksizes.get("y") or [read] * math.ceil(capture.sizes["y"] / read)
+    rows, width = read
+    heights = capture["counts"].chunksizes.get("y") or [rows] * math.ceil(capture.sizes["y"] / rows)
     blocks = [
-        every.isel(y=slice(end - rows, end))
-        for end, rows in zip(accumulate(heights), heights, strict=True)
+        every.isel(y=slice(end - height, end), x=slice(left, left + width))
+        for end, height in zip(accumulate(heights), heights, strict=True)
+        for left in range(0, capture.sizes["x"], width)
     ]
     in_memory = all(array.variable._in_memory for array in capture.values())
     digests = map(_row_digests, blocks) if in_memory else executor.map(_row_digests, blocks)

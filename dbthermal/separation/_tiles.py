@@ -431,6 +431,17 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     In the frames that most pixels have; and these (time), the pixels that have them all, and the
     noise (band, pixel) over that of a sample.
     """
+    counts, usable, status, gain = _counts(inputs, rows)
+    sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
+    frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
+    window, time = (rows, slice(0, inputs.capture.sizes["x"])), inputs.capture["time"].values
+    signals = _tile(inputs, counts, time, window, None, slice(None)).signals
+    signals = signals if frames.all() else signals[:, frames]  # no copy: a row may be large
+    return signals, frames, pixels, gain
+
+
+def _counts(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Bits, Array]:
+    """Counts (band, time, pixel) of some rows, those valid or bridged, the status, the gain."""
     displacement, fewest = inputs.displacement, inputs.method.minimum_frames
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
@@ -444,11 +455,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
         counts, usable, _, status, gain = displaced.paired(
             block, inputs.noise * slopes, displacement, rows, source, slice(None), fewest
         )
-    sets = quality.common_frames(counts, usable, status, fewest)
-    frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
-    window = rows, slice(0, inputs.capture.sizes["x"])
-    signals = _tile(inputs, counts, block["time"].values, window, None, slice(None)).signals
-    return signals[:, frames], frames, pixels, gain
+    return counts, usable, status, gain
 
 
 def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import xarray as xr
@@ -42,24 +42,29 @@ _DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} 
 }
 
 
-def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
+def _chunks(
+    variable: xr.Variable | xr.DataArray, height: int | None = None, length: int | None = None
+) -> tuple[int, ...]:
     """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x.
 
     Every stage works pixel by pixel on all frames and bands, and reads rows of the image: a chunk
     is the fewest whole rows that have `_CHUNK_BYTES` before compression, or equal parts of one. Its
     frames are then long runs of the array, copied at twice the rate of a square tile's. Chunks
-    divide a `height` of rows, if there is one, so that rows that follow begin with a chunk.
+    divide a `height` and `length` of rows, if there is one, so that a part's next begins with one.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
+    for dim, size in (("y", height), ("x", length)):
+        sizes |= {dim: size} if size and dim in sizes else {}
     if not {"y", "x"} <= sizes.keys():
-        return tuple((sizes | ({"y": height} if height and "y" in sizes else {})).values())
+        return tuple(sizes.values())
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
-    tallest = height or sizes["y"]
-    rows = min(tallest, math.ceil(pixels / width))
+    rows = min(sizes["y"], math.ceil(pixels / width))
+    if length:
+        width = next(count for count in range(width, length + 1) if length % count == 0)
     if height:
-        rows = next(count for count in range(rows, tallest + 1) if tallest % count == 0)
+        rows = next(count for count in range(rows, height + 1) if height % count == 0)
     return tuple((sizes | {"y": rows, "x": width}).values())
 
 
@@ -98,6 +103,7 @@ def save_rows(
     path: str | Path,
     provenance: Mapping[str, Any],
     height: int | None = None,
+    width: int | None = None,
 ) -> None:
     """Save a dataset as `save` does, by blocks of rows from the first to the last.
 
@@ -112,6 +118,8 @@ def save_rows(
     height : int, optional
         Rows of each block; the last may have fewer. That of the first block by default. For
         `join_parts` all folders have the same.
+    width : int, optional
+        Columns of each folder, for `join_parts` along x; the last may have fewer.
 
     Examples
     --------
@@ -127,15 +135,20 @@ def save_rows(
     following = iter(blocks)
     if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
-    if height is not None and (type(height) is not int or height < 1):
-        raise ValueError(f"Invalid height {height!r} of the rows. Must be a whole number from 1.")
-    _save(chain([first], following), path, provenance, height or first.sizes.get("y"))
+    for name, size in {"height": height, "width": width}.items():
+        if size is not None and (type(size) is not int or size < 1):
+            raise ValueError(f"Invalid {name} {size!r} of the rows. Must be a whole number from 1.")
+    _save(chain([first], following), path, provenance, height or first.sizes.get("y"), width)
 
 
 def _save(
-    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None
+    blocks: Iterable[xr.Dataset],
+    path: str | Path,
+    provenance: Any,
+    height: int | None,
+    width: int | None = None,
 ) -> None:
-    """Save blocks of rows, of a height that chunks then divide."""
+    """Save blocks of rows, of a height and width that chunks then divide."""
     if not isinstance(provenance, Mapping):
         kind = type(provenance).__name__
         raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
@@ -151,7 +164,7 @@ def _save(
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {name: _chunks(array, height) for name, array in plain.variables.items()}
+            chunks = {n: _chunks(array, height, width) for n, array in plain.variables.items()}
             encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
@@ -315,16 +328,20 @@ def _open_valid_part(checked: integrity.CheckedStore) -> xr.Dataset:
     return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
 
 
-def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
-    """Join datasets of rows that follow one another; their chunks are linked, and not read.
+def join_parts(
+    folders: Iterable[str | Path], path: str | Path, dim: Literal["y", "x"] = "y"
+) -> None:
+    """Join datasets of rows or columns that follow one another; chunks are linked, and not read.
 
     Parameters
     ----------
     folders : iterable of str or Path
-        From `save_rows`, all of one `height` except the last. They stay as they are; on a disk
-        without hard links their chunks are copied.
+        From `save_rows`, all of one `height` or `width` except the last. They stay as they are; on
+        a disk without hard links their chunks are copied.
     path : str or Path
         Folder ``*.zarr`` of the whole, with the attributes of the first.
+    dim : {"y", "x"}
+        Along which they follow.
 
     Examples
     --------
@@ -348,10 +365,11 @@ def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
         metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
         sums = integrity.last_sums(folder)
         for file, array in metadata.items():
-            if "y" not in array["dimension_names"]:
+            if dim not in array["dimension_names"]:
                 continue
+            axis = array["dimension_names"].index(dim)
             for source in sources[1:]:
-                sums |= _linked_chunks(source, folder, file.parent.name, array)
+                sums |= _linked_chunks(source, folder, file.parent.name, array, axis)
             # The metadata, of all rows, in a file of its own: that of the first is linked.
             content = json.dumps(array, indent=2).encode()
             file.unlink()
@@ -370,16 +388,14 @@ def _link(source: str | Path, target: str | Path) -> None:
 
 
 def _linked_chunks(
-    source: Path, folder: Path, name: str, metadata: dict[str, Any]
+    source: Path, folder: Path, name: str, metadata: dict[str, Any], axis: int
 ) -> dict[str, str]:
     """Link the chunks of an array of a part behind those of the whole; checksums by file."""
-    axis, sums = metadata["dimension_names"].index("y"), {}
-    end, rows = (
-        metadata["shape"][axis],
-        metadata["chunk_grid"]["configuration"]["chunk_shape"][axis],
-    )
+    sums = dict[str, str]()
+    end = metadata["shape"][axis]
+    rows = metadata["chunk_grid"]["configuration"]["chunk_shape"][axis]
     if end % rows:
-        label = f"Invalid part '{source}' after {end} rows in chunks of {rows}"
+        label = f"Invalid part '{source}' after {end} rows or columns in chunks of {rows}"
         raise ValueError(f"{label}. Must follow whole chunks.")
     for key, crc in integrity.last_sums(source).items():
         if key.startswith(f"{name}/c/"):

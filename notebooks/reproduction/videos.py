@@ -16,8 +16,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from dbthermal import metrics
-from reproduction import palettes, parallax, scales
+from reproduction import metrics, palettes, parallax, scales
 
 Array = npt.NDArray[np.float64]
 

@@ -11,8 +11,9 @@ import xarray as xr
 from attack.damage import FORMS, VALUED, Rng, first, hurt_one
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick
-from dbthermal import calibration, correction, emissivity, limits, metrics, separation, simulation
+from dbthermal import calibration, correction, emissivity, limits, separation, simulation
 from dbthermal import response as responses
+from reproduction import metrics
 from reproduction.contact import contact_measurements
 
 

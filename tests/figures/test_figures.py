@@ -13,6 +13,7 @@ from sketches import BANDS, DEGREE, array, check_measured, titles
 
 from dbthermal import emissivity, figures, limits
 from dbthermal.figures import drawing
+from reproduction import figures as drawings
 
 LABELS = ("input [1]", "emission [1]", "reflection [1]")
 SHIFTS = ("shift down [pixel]", "shift right [pixel]")
@@ -28,7 +29,7 @@ def correction(fill: float = 1.0, **attrs: object) -> xr.Dataset:
 
 def draw_maps(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw gain and offset."""
-    return figures.gain_offset_maps(correction(fill, **attrs))
+    return drawings.gain_offset_maps(correction(fill, **attrs))
 
 
 def draw_response(**attrs: object) -> Figure:
@@ -38,7 +39,7 @@ def draw_response(**attrs: object) -> Figure:
     counts = xr.DataArray([115 * temperature, 11 * temperature], names)
     pair = {"linear_slope": ("band", [115.0, 11.0]), "linear_intercept": ("band", [0.0, 0.0])}
     parts = {"counts": counts, "residual": 0 * counts, "linear_residual": 0 * counts}
-    return figures.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
+    return drawings.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
 
 
 def draw_frames(fill: float = 1.0, **attrs: object) -> Figure:
@@ -102,7 +103,8 @@ DRAWN: dict[str, tuple[Callable[..., Figure], tuple[str, ...]]] = {
 def test_every_figure_is_tested() -> None:
     """The table of figures above holds every public figure."""
     elsewhere = {"FilmPanel", "Panel", "REASONS", "drawing", "film", "live"}
-    assert {*figures.__all__} - elsewhere == DRAWN.keys()
+    of_notebook_1 = {"gain_offset_maps", "response_fit"}
+    assert {*figures.__all__} - elsewhere | of_notebook_1 == DRAWN.keys()
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -133,7 +135,7 @@ def test_celsius_on_the_axes() -> None:
 
 def test_bad_pixels_are_marked() -> None:
     """The bad pixel is blank, crossed at its column and row, and counted."""
-    axis = figures.gain_offset_maps(correction()).axes[0]
+    axis = drawings.gain_offset_maps(correction()).axes[0]
     image = axis.images[0].get_array()
     assert image is not None
     assert np.argwhere(np.ma.getmaskarray(image)).tolist() == [[1, 2]]

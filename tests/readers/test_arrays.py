@@ -19,6 +19,7 @@ import zarr
 from flir_files import scene
 from hostile_files import write
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.io import savemat
 from zarr.codecs import BloscCodec, GzipCodec
 
 from dbthermal import readers, store
@@ -380,9 +381,34 @@ def test_user_block_and_matlab(tmp_path: Path) -> None:
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file")
     assert_array_equal(read(path).counts, scene())
-    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
-    with pytest.raises(ValueError, match=r"a MATLAB 5: save it anew by save\(\.\.\., '-v7\.3'"):
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_matlab_5(tmp_path: Path, *, packed: bool) -> None:
+    """Of MATLAB's older files the film is read, by columns, with its times; others are refused."""
+    path, times = tmp_path / "a.mat", np.arange(len(scene())) / 10.0
+    film = np.moveaxis(scene(), 0, 2)
+    about = {"camera": "A", "settings": {"gain": 1.0}, "time": times}
+    savemat(path, {"frames": film, **about}, do_compression=packed)
+    assert_array_equal(readers.array(path, unit="count").counts, scene())
+    assert_allclose(readers.array(path, unit="count").time, times)
+    with pytest.raises(ValueError, match="Must agree to half a frame"):
+        readers.array(path, unit="count", clock=25.0)
+    content = path.read_bytes()
+    path.write_bytes(content[:-3])
+    with pytest.raises(ValueError, match=rf"Truncated at {len(content) - 3}"):
         read(path)
+    path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    with pytest.raises(ValueError, match=r"Damaged 'a\.mat': Kind|Damaged"):
+        read(path)
+    for wrong, rule in (
+        ({"frames": film.astype(float)}, "Invalid dtype float64"),
+        ({"frames": film, "more": film}, "Missing name of one of the arrays"),
+        ({"settings": {"frames": film}}, "Missing array"),
+    ):
+        savemat(path, wrong, do_compression=packed)
+        with pytest.raises(ValueError, match=rule):
+            read(path)
 
 
 def chunked(path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]], **options: Any) -> Path:

@@ -13,6 +13,7 @@ import hostile_files as hostile
 import pytest
 
 from dbthermal import readers
+from reproduction import libraries
 
 SIZES = [
     100,
@@ -76,7 +77,7 @@ def test_recordings(tmp_path: Path, form: str, number: int) -> None:
     assert fewer <= at_most(0.001 if form in hostile.TIFF else 0, number) or form in FRAMEWISE
 
 
-FRAMEWISE = {"seq", "fff", "csq", "raw"}
+FRAMEWISE = {"seq", "fff", "csq", "raw", "hcc"}
 """Forms whose frames follow one another, without a number of them."""
 
 
@@ -108,7 +109,8 @@ def same(spectra: Any, whole: Any) -> bool:
 @pytest.mark.parametrize("library", hostile.tables())
 def test_spectra(tmp_path: Path, library: str, number: int) -> None:
     """Only a digit that became another digit goes unseen: a cut or a row never does."""
-    path, read = tmp_path / f"{library}.txt", getattr(readers, library)
+    path = tmp_path / f"{library}.txt"
+    read = readers.ecostress if library == "ecostress" else getattr(libraries, library)
     content, counts, first = hostile.tables()[library], Counter[str](), first_seed(number)
     path.write_bytes(content)
     whole = read(path)

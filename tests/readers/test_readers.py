@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from dbthermal import readers
+from reproduction import libraries
 
 
 def library_file(
@@ -100,7 +101,7 @@ def test_slum(tmp_path: Path) -> None:
     """Each column becomes a spectrum under its sample's code."""
     path = tmp_path / "slum.csv"
     path.write_text('"wavelength","A001","R002"\n8.0,0.94,0.41\n14.0,0.95,0.42\n')
-    spectra = readers.slum(path)
+    spectra = libraries.slum(path)
     assert list(spectra) == ["A001", "R002"]
     assert_allclose(spectra["R002"]["emissivity"], [0.41, 0.42], rtol=0, atol=0)
     assert_allclose(spectra["R002"]["wavelength"], [8e-6, 14e-6], rtol=0, atol=1e-12)
@@ -110,7 +111,7 @@ def test_ucsb(tmp_path: Path) -> None:
     """The falling wavelengths are turned to rise; the name is the third column's."""
     path = tmp_path / "brick.csv"
     path.write_text("x1,x2,y_brick\n16,625,0.97\n3.125,3200,0.95\n")
-    spectrum = readers.ucsb(path)
+    spectrum = libraries.ucsb(path)
     assert_allclose(spectrum["wavelength"], [3.125e-6, 16e-6], rtol=0, atol=1e-12)
     assert_allclose(spectrum["emissivity"], [0.95, 0.97], rtol=0, atol=0)
     assert spectrum.attrs["name"] == "brick"
@@ -143,4 +144,4 @@ def test_tables_are_refused(tmp_path: Path, name: str, text: str, message: str) 
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        getattr(readers, name)(path)
+        getattr(libraries, name)(path)

@@ -7,10 +7,10 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
+from dbthermal import alignment, calibration, emissivity, separation, simulation
 from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
-from reproduction import methods, twins
+from reproduction import methods, metrics, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.experiments.scores import held, rmse

@@ -1,6 +1,7 @@
 """Figures of the experiments: accuracy, filters, limits, comparisons, nuisances, twins."""
 
 from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
+from reproduction.figures.calibration import gain_offset_maps, response_fit
 from reproduction.figures.comparison import (
     compared_reflections,
     descents,
@@ -46,6 +47,7 @@ __all__ = [
     "error_over_bands",
     "error_over_bound",
     "error_over_noise",
+    "gain_offset_maps",
     "hours",
     "offsets",
     "parallax",
@@ -53,6 +55,7 @@ __all__ = [
     "pooling",
     "raw_pictures",
     "reductions",
+    "response_fit",
     "sensitivity",
     "separated_film",
     "sky_changes",

@@ -9,7 +9,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal import metrics
+from reproduction import metrics
 
 KELVIN = {"units": "K"}
 

@@ -1,0 +1,121 @@
+"""Recordings of frames behind headers: FLIR .sfmov, whose rate is in an .inc, and Telops .hcc."""
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal._arrays import Array
+from dbthermal.readers import _formats as formats
+from dbthermal.readers import _recording as recordings
+from dbthermal.readers._recording import MEMORY, Clock, Counts
+
+_LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
+# Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
+_HEADER: Final[np.dtype[Any]] = np.dtype(
+    {
+        "names": ["signature", "length", "mode", "columns", "rows", "rate", "seconds", "fraction"],
+        "formats": ["S2", "<u2", "u1", "<u2", "<u2", "<u4", "<u4", "<u4"],
+        "offsets": [0, 4, 28, 32, 34, 44, 100, 104],
+    }
+)
+_COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
+
+
+def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
+    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
+
+    Parameters
+    ----------
+    path : str or Path
+        File; the .inc of an .sfmov lies beside it.
+    clock, memory
+        As for `array`.
+
+    Returns
+    -------
+    Dataset
+        As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `array`, and if the numbers are temperatures or radiances.
+    """
+    recordings.check_number(memory, "memory")
+    (path,) = formats.files([path], "sequence")
+    with recordings.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
+        read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
+        counts, times = read(path, memory)
+    if recordings.smoother(counts) < 0:
+        raise ValueError(f"Invalid counts of '{path.name}', bytes swapped. Must be little-endian.")
+    if times is not None:
+        clock = recordings.check_times(times, "s", clock, path.name)
+    kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
+    return recordings.clocked(counts, name=path.name, **kind)
+
+
+def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
+    """Counts behind the lines of a header, and their times, if an .inc tells the rate."""
+    with path.open("rb") as stream:
+        content = stream.read(_LONGEST)
+    header, mark, _ = content.partition(b"\nDATA")
+    lines = _lines(header)
+    names = ("NumDPs", "yPixls", "xPixls")
+    if not mark or not all(lines.get(name, "").isdecimal() for name in names):
+        rule = f"Must have {', '.join(names)} and DATA within {_LONGEST} bytes"
+        raise ValueError(f"Invalid header of '{path.name}'. {rule}.")
+    if re.search("fl|32|64|8", kind := lines.get("DaType", ""), re.IGNORECASE):
+        rule = "Must be of 16-bit counts: record or export those"
+        raise ValueError(f"Invalid DaType '{kind}' of '{path.name}'. {rule}.")
+    frames, rows, columns = (int(lines[name]) for name in names)
+    size, behind = path.stat().st_size, len(header) + len(mark)
+    recordings.check_memory((frames, rows, columns), memory, path.name, size)
+    # The frames end with the file; blanks, if any, and the end of the line lie before them.
+    start = size - 2 * frames * rows * columns
+    if not re.fullmatch(rb"[ \0]*\r?\n?", content[behind : max(start, 0)]) or start < behind:
+        label = f"{size - behind} bytes behind DATA of '{path.name}'"
+        rule = f"Must be {frames} frames of {rows} x {columns}, or be read by readers.raw"
+        raise ValueError(f"Truncated or damaged: {label}. {rule} with header=.")
+    counts = np.memmap(path, "<u2", "r", start, (frames, rows, columns))
+    beside = path.with_suffix(".inc")
+    is_short = beside.is_file() and beside.stat().st_size <= _LONGEST
+    rate = float(_lines(beside.read_bytes()).get("FRate_0", 0.0)) if is_short else 0.0
+    return recordings.film(counts), np.arange(frames) / rate if rate > 0.0 else None
+
+
+def _lines(header: bytes) -> dict[str, str]:
+    """Values by name of the lines of a text."""
+    pairs = [line.split(maxsplit=1) for line in header.decode("latin-1").splitlines()]
+    return {pair[0]: pair[1].strip() for pair in pairs if len(pair) == 2}
+
+
+def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
+    """Counts of frames that have a header each, and their times, which may be those of a rate."""
+    size, first = path.stat().st_size, np.fromfile(path, _HEADER, 1)
+    if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
+        raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")
+    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
+    whole = length + 2 * rows * columns
+    recordings.check_memory((size // whole, rows, columns), memory, path.name, size)
+    if size % whole:
+        label = f"{size} bytes of '{path.name}' in frames of {whole}"
+        raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
+    # All frames by their headers, which must be alike.
+    between = ("more", f"V{length - _HEADER.itemsize}")
+    form: Any = [("header", _HEADER), between, ("counts", "<u2", (rows, columns))]
+    frames = np.memmap(path, form, "r")
+    headers = frames["header"]
+    for name in ("signature", "length", "rows", "columns", "mode"):
+        for number in np.flatnonzero(headers[name] != headers[name][0]):
+            label = f"Damaged '{path.name}': {name} of frame {number}"
+            raise ValueError(f"{label}. Must be as of the first frame.")
+    if (mode := int(first["mode"][0])) not in _COUNTS:
+        label = f"calibration mode {mode} of '{path.name}', temperatures or radiances"
+        raise ValueError(f"Invalid {label}. Must be of counts, raw or corrected (NUC).")
+    times = headers["seconds"] - float(first["seconds"][0]) + 1e-7 * headers["fraction"]
+    if not np.ptp(times) and (rate := 1e-3 * float(first["rate"][0])) > 0.0:
+        times = np.arange(len(frames)) / rate
+    return recordings.film(frames["counts"]), times if np.ptp(times) else None
