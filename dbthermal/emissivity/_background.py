@@ -107,7 +107,7 @@ def background_ratio(result: xr.Dataset, mask: xr.DataArray) -> xr.Dataset:
     names = ("reflection_ratio", "reflection_ratio_std")
     schema.check(result, "separated", names, "the result")
     dims, dtype = getattr(mask, "dims", None), getattr(mask, "dtype", None)
-    if dims != ("y", "x") or dtype != bool:
+    if dims != ("y", "x") or getattr(dtype, "kind", "") != "b":
         raise TypeError("Invalid mask of foil. Must be a DataArray of dims ('y', 'x'), boolean.")
     pixels = laid_on(mask, result, "the mask", "the result").values
     ratio, std = (result[name].values[:, pixels].astype(np.float64) for name in names)
