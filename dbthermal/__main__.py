@@ -121,6 +121,7 @@ materials text*         as listed by 'data'; all by default
 --emissivity number+    of each band, for the method 'calibrated'
 --surroundings kelvin   temperature of what is reflected, as 22C
 --outdoors flag         the sky is mirrored, which is not gray: wider bars
+--background-ratio number2  changes of what is mirrored, second band over first; its deviation
 --prior text            material of pixels that cannot be measured, as listed by 'data'
 --workers whole=2       number of threads
 --title text            heading of the report
@@ -201,7 +202,7 @@ corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
 separate steps.separate capture response --correction --register --offset --method \
-    --emissivity --surroundings --outdoors --prior --workers --output
+    --emissivity --surroundings --outdoors --background-ratio --prior --workers --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr
@@ -211,7 +212,7 @@ complete steps.complete result capture response --surroundings --prior --workers
 complete the result of a single method by what is known of the scene
 result.zarr aligned.zarr response.zarr --surroundings 22C -o completed.zarr
 
-plan steps.plan materials --noise --seconds --rate --span --amplitude
+plan steps.plan materials --noise --seconds --rate --span --amplitude --outdoors
 say which accuracy a capture can have, by material and filter, before it is recorded
 'plate window glass' water --noise 0.03
 

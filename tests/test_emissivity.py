@@ -13,6 +13,7 @@ from scipy.integrate import quad
 from dbthermal import emissivity, planck, readers, schema
 from dbthermal.bands import FILTERS, Band
 from reproduction import libraries
+from reproduction.filters import condition_numbers, pair_summary, rank_filters
 
 GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
 
@@ -144,8 +145,8 @@ def test_bad_arguments(change: dict[str, object], message: str) -> None:
 
 def test_pair_summary_leaves_gray_out_of_the_mean() -> None:
     """A gray material is infinite in the median, not in the mean, and is counted."""
-    numbers = emissivity.condition_numbers(table(a=[0.9, 0.5], b=[0.8, 0.8], c=[0.9, 0.7]))
-    summary = emissivity.pair_summary(numbers)
+    numbers = condition_numbers(table(a=[0.9, 0.5], b=[0.8, 0.8], c=[0.9, 0.7]))
+    summary = pair_summary(numbers)
     values = np.sort(numbers.values[:, 0, 1])
     assert summary["median"].values[0, 1] == values[1]
     assert summary["mean"].values[0, 1] == pytest.approx(values[:2].mean(), abs=1e-12)
@@ -169,7 +170,7 @@ def test_single_frame_std() -> None:
     drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * noise.values[:, np.newaxis]
     scatter = np.linalg.solve(np.array([[0.3, 0.7], [0.5, 0.5]]), drawn)[0].std()
     for pair, expected in (([0.86, 0.72], 0.408), ([0.9, 0.9], np.inf), ([0.3, 0.5], scatter)):
-        choice = emissivity.rank_filters(table(m=pair), noise)
+        choice = rank_filters(table(m=pair), noise)
         assert choice["band"].values.tolist() == ["9.5"]
         assert float(choice["object_temperature_std"][0]) == pytest.approx(expected, rel=0.01)
 
@@ -178,7 +179,7 @@ def test_choice_weighs_condition_against_noise() -> None:
     """Filters are ordered by condition number; the lowest deviation may belong to another."""
     made = table(a=[0.90, 0.70, 0.75], b=[0.85, 0.60, 0.66])
     noise = xr.DataArray([0.03, 0.6, 0.1], coords={"band": made["band"]}, dims="band")
-    choice = emissivity.rank_filters(made, noise)
+    choice = rank_filters(made, noise)
     assert choice["band"].values.tolist() == ["9.5", "8.5"]
     assert choice["condition_number"].values[0] < choice["condition_number"].values[1]
     assert choice.attrs["lowest_condition_number"] == "9.5"
@@ -207,11 +208,11 @@ def test_tables_that_rank_no_filter(
 ) -> None:
     """Noise that is no positive kelvin of every band, per cent and an absent band are refused."""
     with pytest.raises(ValueError, match=re.escape(message)):
-        emissivity.rank_filters(table(glass=row), noise, **more)
+        rank_filters(table(glass=row), noise, **more)
     with pytest.raises(ValueError, match="Must be at least two"):
-        emissivity.condition_numbers(table(m=[0.9]))
+        condition_numbers(table(m=[0.9]))
     with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
-        emissivity.pair_summary(np.ones(3))  # type: ignore[arg-type]
+        pair_summary(np.ones(3))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):
         emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]
 
@@ -290,7 +291,7 @@ def test_filter_of_the_paper(spectra: dict[str, xr.Dataset]) -> None:
     """The lowest condition number belongs to the filter at 9.5 um, as published."""
     whole = {name: one for name, one in spectra.items() if one["wavelength"][-1] > 13e-6}
     made = emissivity.band_table(whole, FILTERS)
-    choice = emissivity.rank_filters(made, emissivity.filter_noise(0.03, FILTERS))
+    choice = rank_filters(made, emissivity.filter_noise(0.03, FILTERS))
     assert choice.attrs["lowest_condition_number"] == "9.5"
     assert float(choice["condition_number"][0]) == pytest.approx(98.9, abs=0.5)
 

@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3610, 18),
-    "_cli": (1200, 8),
+    "": (3615, 18),
+    "_cli": (1210, 8),
     "alignment": (3010, 13),
     "calibration": (850, 3),
     "correction": (1925, 8),
-    "emissivity": (510, 3),
+    "emissivity": (460, 4),
     "explorer": (1360, 7),
     "figures": (665, 6),
-    "instruments": (5900, 23),
-    "limits": (730, 4),
-    "readers": (2785, 13),
-    "reporting": (660, 4),
+    "instruments": (5895, 23),
+    "limits": (765, 4),
+    "readers": (2780, 13),
+    "reporting": (655, 4),
     "separation": (12875, 54),
-    "simulation": (640, 3),
+    "simulation": (635, 3),
     "store": (1525, 7),
 }
-INSTALLED = 38_210  # lines of all rooms
+INSTALLED = 38_200  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -33,7 +33,10 @@ from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
 from reproduction import figures as drawings
 from reproduction import metrics
+from reproduction.celsius import relative_error_celsius
+from reproduction.filters import rank_filters
 from reproduction.methods.dbvt import DbvtSettings
+from reproduction.reflection import reflected_change
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -52,7 +55,7 @@ STATISTICS = correction.blackbody_statistics(MOVIES)
 CORRECTION = correction.fit_correction(STATISTICS)
 RESULT = separation.solve(CAPTURE, CAMERA, workers=1)
 APPARENT = response.apparent_temperature(CAMERA, CAPTURE["counts"])
-CHANGE = separation.reflected_change(APPARENT, RESULT)
+CHANGE = reflected_change(APPARENT, RESULT)
 OBJECT = RESULT["object_temperature"]
 PIXELS = xr.DataArray(np.ones(SHAPE, dtype=bool), PLACE, dims=("y", "x"))
 FRAMES = xr.DataArray(np.ones(60, dtype=bool), {"time": TIME}, dims="time")
@@ -209,14 +212,12 @@ CASES: list[tuple[Call, str]] = [
     (viewed(noise=("band", [1.0, -1.0])), "noise .count. -1.0 in band '9.5'. Must be finite"),
     (viewed(offset=("band", [np.nan, 0.0])), "offset of the response in band '8-14'. Must be fin"),
     (
-        lambda: separation.reflected_change(
-            APPARENT, RESULT.assign(emissivity=100 * RESULT["emissivity"])
-        ),
+        lambda: reflected_change(APPARENT, RESULT.assign(emissivity=100 * RESULT["emissivity"])),
         "not per cent",
     ),
-    (lambda: separation.reflected_change(APPARENT.rename(y="row"), RESULT), "Invalid dims"),
+    (lambda: reflected_change(APPARENT.rename(y="row"), RESULT), "Invalid dims"),
     (
-        lambda: separation.reflected_change(APPARENT, RESULT.drop_vars("emissivity")),
+        lambda: reflected_change(APPARENT, RESULT.drop_vars("emissivity")),
         "Missing variable 'emissivity'",
     ),
     *((partial(make, **values), named) for make, values, named in SETTINGS),
@@ -271,7 +272,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "time y x band",
     ),
     "reflected_change": (
-        lambda it: separation.reflected_change(it, RESULT),
+        lambda it: reflected_change(it, RESULT),
         APPARENT,
         "time y x",
     ),
@@ -304,11 +305,11 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     ),
     "bounds": (lambda it: limits.bounds(SCENE.isel(y=[0]), it), CAMERA, "band"),
     "plan": (lambda it: limits.plan(TABLE.isel(material=[0]), it), NOISE, "band"),
-    "rank_filters": (lambda it: emissivities.rank_filters(TABLE, it), NOISE, "band"),
+    "rank_filters": (lambda it: rank_filters(TABLE, it), NOISE, "band"),
     "correlation": (lambda it: metrics.correlation(COUNTS, it), APPARENT, "time y x band"),
     "correlation mask": (lambda it: metrics.correlation(FIRST, SECOND, it), PIXELS, "y x"),
     "relative_error_celsius": (
-        lambda it: metrics.relative_error_celsius(OBJECT, it),
+        lambda it: relative_error_celsius(OBJECT, it),
         SCENE["object_temperature"],
         "time y x",
     ),

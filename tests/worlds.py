@@ -4,12 +4,14 @@ A maker of its own, beside the library's: films by Gaussian optics and splines, 
 upright shapes. Glass is warmed up, and on the right coated, before five or six people.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from scipy.interpolate import interp1d
 from scipy.ndimage import gaussian_filter, shift
 from scipy.special import expit
 
@@ -40,20 +42,44 @@ class World:
     behind: Pair | None = None  # transmittances, with other people behind [1]
     breath: float = 0.0  # motion of the object at 0.25 Hz [pixel]
     surface: tuple[Pair, Pair] = ((0.86, 0.72), (0.93, 0.82))  # emissivities, left and right
+    rate: float = RATE  # of the frames [Hz]
+    pace: Pair = (8.0, 20.0)  # of the people [pixel/s]
+    together: bool = False  # people all go in one direction
+    parallax: float = 0.0  # columns by which the second camera sees what is mirrored displaced
+    lag: float = 0.0  # of the second band's frames [s], which are stamped or not
+    stamped: bool = False
+    jitter: float = 0.0  # of each camera's frames, not stamped [s]
+    fast: float = 0.0  # share by which the second camera's clock runs slow, and it too late [1]
+
+    @property
+    def clocks(self) -> bool:
+        """Two cameras, or bands, whose frames are not known to be of one time."""
+        return any((self.parallax, self.lag, self.jitter, self.fast))
 
 
-def people(rng: np.random.Generator, number: int) -> Iterator[tuple[Array, float]]:
-    """Yield the share (time, y, x) of each pixel that shows a person, and its warmth [K]."""
-    time = np.arange(FRAMES) / RATE
+Shape = Callable[[Array, float], Array]
+
+
+def people(rng: np.random.Generator, world: World, number: int) -> Iterator[tuple[Shape, float]]:
+    """Yield the share (time, y, x) of each pixel that shows a person, and its warmth [K].
+
+    The share is a function of the times [s] and of the columns by which it is seen displaced.
+    """
     y, x = np.indices([size + 2 * MARGIN for size in SHAPE])
     for _ in range(number):
-        speed = rng.uniform(8.0, 20.0) * rng.choice([-1.0, 1.0])
-        center = 0.5 * x.shape[1] + speed * (time - rng.uniform(0.03, 0.92) * time[-1])
-        center += 1.5 * np.sin(np.pi * time + rng.uniform(0.0, 6.0))
+        speed, direction = rng.uniform(*world.pace), rng.choice([-1.0, 1.0])
+        speed *= 1.0 if world.together else direction
+        start, phase = rng.uniform(0.03, 0.92) * (FRAMES - 1) / world.rate, rng.uniform(0.0, 6.0)
         half, top = rng.uniform(4.0, 8.0), rng.uniform(-0.1, 0.4) * len(y)
-        beside = np.abs(x - center[:, np.newaxis, np.newaxis]) - half
-        shape = expit(-beside / 0.7) * expit((y - top) / 0.7)
-        yield shape, rng.uniform(5.0, 10.0)
+
+        def shape(time: Array, shift: float, own: tuple[float, ...]) -> Array:
+            speed, start, phase, half, top = own
+            center = 0.5 * x.shape[1] + speed * (time - start) + shift
+            center = center + 1.5 * np.sin(np.pi * time + phase)
+            beside = np.abs(x - center[:, np.newaxis, np.newaxis]) - half
+            return np.asarray(expit(-beside / 0.7) * expit((y - top) / 0.7))
+
+        yield partial(shape, own=(speed, start, phase, half, top)), rng.uniform(5.0, 10.0)
 
 
 def paths(rng: np.random.Generator, sizes: Pair) -> Array:
@@ -76,7 +102,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     rng = np.random.default_rng(seed)
     size = tuple(side + 2 * MARGIN for side in SHAPE)
     y, x = np.indices(size)
-    time = np.arange(FRAMES) / RATE
+    time = np.arange(FRAMES) / world.rate
     # The object: two materials, warmed unevenly.
     coated = x > 0.55 * size[1] + 3.0 * np.sin(y / 9.0)
     texture = gaussian_filter(rng.standard_normal(size), 1.2)
@@ -92,8 +118,11 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     spot = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) / 12.0)
     truth += world.lamp * np.sin(0.8 * np.pi * time)[:, np.newaxis, np.newaxis] * spot
     # What it mirrors, and what is behind it.
-    before, beyond = list(people(rng, 6)), list(people(rng, 4))
+    before, beyond = list(people(rng, world, 6)), list(people(rng, world, 4))
     motion = paths(rng, world.shake)
+    times = np.stack([time, (time + world.lag) * (1.0 + world.fast)])
+    if world.jitter:
+        times = times + world.jitter * np.random.default_rng([seed, 1]).standard_normal(times.shape)
     breath = world.breath * np.outer(np.sin(0.5 * np.pi * time), [1.0, 0.3])
     film = np.empty((2, FRAMES, *SHAPE), dtype=np.float32)
     inside = slice(MARGIN, -MARGIN)
@@ -102,15 +131,19 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
         views = []
         for group, fabric in ((before, world.fabric), (beyond, None)):
             view = np.full(truth.shape, room)
-            for number, (share, warmer) in enumerate(group):
+            for number, (person, warmer) in enumerate(group):
+                share = person(times[band], world.parallax * band)
                 skin = fabric[band] if fabric is not None and number % 2 == 0 else 1.0
                 view += share * (room + skin * (curve.counts(ROOM + warmer) - room) - view)
             views.append(view)
         clear = world.behind[band] if world.behind is not None else 0.0
+        film_of_object = truth
+        if np.any(times[band] != time):
+            film_of_object = interp1d(time, truth, axis=0, fill_value="extrapolate")(times[band])
         noise = noise_of(rng, world.flicker) * float(RESPONSE["noise"][band])
         for frame in range(FRAMES):
             share, warm = (
-                moved(image, breath[frame]) for image in (emissivity[band], truth[frame])
+                moved(image, breath[frame]) for image in (emissivity[band], film_of_object[frame])
             )
             front = gaussian_filter(views[0][frame], world.roughness[band])
             image = share * curve.counts(warm) + (1.0 - share - clear) * front
@@ -123,6 +156,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
         "x": np.arange(SHAPE[1]),
     }
     capture = xr.Dataset(schema.variables("corrected", {"counts": film}), coordinates)
+    if world.stamped:
+        capture["exposure_time"] = ("band", "time"), times, {"units": "s"}
     return capture.assign_attrs(origin="simulated"), truth[:, inside, inside]
 
 

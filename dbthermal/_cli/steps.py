@@ -24,6 +24,7 @@ from dbthermal import (
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._warnings import warned
+from dbthermal.limits._planner import SKY_LEVEL
 from dbthermal.response import ACCURACY
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
@@ -235,9 +236,10 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
                 raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
     # Plan of the capture, and its best filter by material.
-    design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options))
+    level = {"level": SKY_LEVEL} if options.outdoors else {}
+    design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
-    plans = limits.plan(table, noise, design)
+    plans = limits.plan(table, noise, design, outdoors=options.outdoors)
     deviations = plans["object_temperature_std"].transpose("filter", "material").to_pandas()
     numbers = {
         str(name): {
@@ -246,6 +248,9 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
         }
         for name, best in plans["best"].to_series().items()
     }
+    if options.outdoors:
+        for name, costs in plans["sky_error"].transpose("filter", "material").to_pandas().items():
+            numbers[str(name)]["sky_error_K"] = costs.round(4).to_dict()
     return {"answer": [*_table(numbers, noise, design)], "numbers": numbers}
 
 
@@ -267,6 +272,9 @@ def _table(
     for name, entry in numbers.items():
         cells = [f"{value:8.3f}" for value in entry["object_temperature_std_K"].values()]
         yield "  ".join([name.ljust(wide), entry["best_filter"].ljust(4), *cells])
+        if "sky_error_K" in entry:
+            cells = [f"{value:8.3f}" for value in entry["sky_error_K"].values()]
+            yield "  ".join(["  by a sky taken for gray".ljust(wide + 6), *cells])
     if any(entry["best_filter"] == "none" for entry in numbers.values()):
         yield "Best none: no filter tells more than the range of the temperatures does."
 

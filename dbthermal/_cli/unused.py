@@ -37,7 +37,8 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
     if options.correction:
         return {"with --correction": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
-    completing = {"with --method: 'dbthermal complete'": "surroundings outdoors prior workers"}
+    names = "surroundings outdoors background_ratio prior workers"
+    completing = {"with --method: 'dbthermal complete'": names}
     return aligned | (
         completing if options.method else {"without --method calibrated": "emissivity"}
     )

@@ -82,8 +82,8 @@ def separated_temperatures(
     apparent, emission : DataArray
         Temperature of the inputs (band, time, y, x), and of the object (time, y, x) [K].
     change : DataArray
-        Background temperature less its mean over time, or `separation.reflected_change`
-        (time, y, x) [K].
+        Background temperature less its mean over time, or the change that it
+        causes (time, y, x) [K].
     title, label : str
         Name of the scene; label of the change, with its unit.
 

@@ -14,6 +14,12 @@ from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, sm
 
 _NO_FILTER: Final = "none"  # entry of a material whose temperature no filter determines
 _TIME_CONSTANT: Final = 1.0 / 3.0  # of the object's warming, as a share of the capture
+SKY_LEVEL: Final = 273.15  # of what is mirrored outdoors, at rest [K]
+SKY: Final = {"8-14": 1.0, "8.5": 1.22, "9.5": 1.48, "10.6": 1.37, "12.1": 0.62}
+"""Changes of a band over those in 8-14 um as clouds pass, of measured spectra [1]_.
+
+.. [1] Atmospheric Radiation Measurement user facility, interferometer's radiances, notebook 15
+"""
 _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 
 
@@ -70,9 +76,10 @@ def plan(
     noise: xr.DataArray,
     design: CaptureDesign | None = None,
     *,
-    beside: str = "8-14",
+    beside: str | None = None,
     together: int = 1,
     temperature: float = 300.0,
+    outdoors: bool = False,
 ) -> xr.Dataset:
     r"""Expected accuracy of one pixel for each material and filter, and the best filter.
 
@@ -90,13 +97,16 @@ def plan(
     noise : DataArray
         Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
     design : CaptureDesign, optional
-        Capture conditions; 35 s of an object that warms by 25 K if not given.
-    beside : str
-        Name of the band that is always recorded.
+        Capture conditions; 35 s of an object that warms by 25 K if not given, outdoors below a sky
+        of 273 K.
+    beside : str, optional
+        Name of the band that is always recorded; "8-14", outdoors "10.6" as in the air's window.
     together : int
         Number of filters recorded beside it at once.
     temperature : float
         Temperature [K] at which the noise is stated; in counts it is the same at all.
+    outdoors : bool
+        The sky is mirrored, whose changes in the bands are not alike (`SKY`).
 
     Returns
     -------
@@ -107,6 +117,9 @@ def plan(
         `beside` [1]; NaN for a band outside the combination. `best` (material): the filter of the
         smallest object deviation, "none" if all are above that of a uniform number within the
         capture's temperatures. `noise` (band) [K], and the design's numbers as attributes.
+        Outdoors also `sky_error` (material, filter) [K], of an object before a sky that is taken
+        for gray, :math:`|x - y| \sum_m w_m (1 - e_m) (g_m / g_1 - 1)` with the weights w of the
+        bands in the object; the best filter has the smallest root of both squares.
 
     Examples
     --------
@@ -116,9 +129,11 @@ def plan(
     >>> limits.plan(table, noise)["best"].values.tolist()
     ['9.5', 'none']
     """
-    design = CaptureDesign() if design is None else design
+    if design is None:
+        design = CaptureDesign(level=SKY_LEVEL) if outdoors else CaptureDesign()
     if not isinstance(design, CaptureDesign):
         raise TypeError(f"Invalid design {design!r}. Must be a CaptureDesign.")
+    beside = beside or ("10.6" if outdoors else "8-14")
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
     if beside not in names:
@@ -139,10 +154,15 @@ def plan(
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
     # Best filter of each material, if it says more than the range of temperatures.
-    uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
+    uniform, total = float(np.ptp(temperatures)) / np.sqrt(12.0), result["object_temperature_std"]
+    if outdoors:
+        contrast = np.sqrt(np.mean((temperatures[0] - temperatures[1]) ** 2))
+        errors = [contrast * _sky(emissivity[it], std[it], [names[b] for b in it]) for it in sets]
+        attrs = {"units": "K", "long_name": "error by a sky that is taken for gray"}
+        result["sky_error"] = ("material", "filter"), np.stack(errors, axis=1), attrs
+        total = xr.DataArray(np.hypot(total, result["sky_error"]))
     best = [
-        labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER
-        for row in result["object_temperature_std"].values
+        labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER for row in total.values
     ]
     return result.assign(
         best=("material", best, {"long_name": "filter of the smallest object deviation"}),
@@ -210,6 +230,18 @@ def _truth(design: CaptureDesign, emissivity: Array) -> Truth:
         emissivity=emissivity,
         resting=np.outer(~pulse, materials.astype(bool)),
     )
+
+
+def _sky(emissivity: Array, noise: Array, names: list[str]) -> Array:
+    """Error of the object (material) by the sky's colour in some bands, for a contrast of 1 K."""
+    if lacking := [name for name in names if name not in SKY]:
+        raise ValueError(f"Missing band '{lacking[0]}' in the sky. Must be one of {[*SKY]}.")
+    colour = np.array([SKY[name] / SKY[names[0]] for name in names]) - 1.0
+    errors = []
+    for value in emissivity.T:  # weights of the bands in the object, by least squares
+        weights = np.linalg.pinv(np.stack([value, 1.0 - value], axis=1) / noise[:, np.newaxis])[0]
+        errors.append(abs(np.sum(weights / noise * (1.0 - value) * colour)))
+    return np.array(errors)
 
 
 def _emissivities(table: xr.Dataset) -> Array:

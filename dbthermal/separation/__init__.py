@@ -12,7 +12,6 @@ from dbthermal.separation._budget import without_calibration
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflection import reflected_change
 from dbthermal.separation._run import run
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
@@ -31,7 +30,6 @@ __all__ = [
     "complete",
     "get_method",
     "materials",
-    "reflected_change",
     "run",
     "separate",
     "solve",

@@ -32,6 +32,7 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, empty, release
+from dbthermal.emissivity._background import Colour
 from dbthermal.response import Accuracy
 from dbthermal.schema import BUDGETS, CALIBRATION, CAUSES
 from dbthermal.separation._inputs import Inputs
@@ -57,8 +58,9 @@ def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
         variable = schema.OPTIONAL["separated"][name]
         values = np.zeros([result.sizes[dim] for dim in variable.dims], np.float32)
         result[name] = (variable.dims, values, variable.attrs)
+    stated = inputs.capture.attrs.get("background_colour")
     for rows in inputs.blocks:
-        _add(result.isel(y=rows), inputs.noise, inputs.bands[0], accuracy)
+        _add(result.isel(y=rows), inputs.noise, inputs.bands[0], accuracy, stated)
         release()
     return result
 
@@ -107,7 +109,9 @@ def _drift(result: xr.Dataset) -> Array:
     return np.asarray(np.nan_to_num(drift), dtype=np.float64)
 
 
-def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> None:
+def _add(
+    cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy, stated: Colour | None
+) -> None:
     """Add the budgets of some rows, whose values are views, in place."""
     # Where only ratios are known: any emissivities of these ratios move the object alike.
     ratio = cut["reflection_ratio"].values.astype(np.float64)
@@ -123,9 +127,14 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     by_ratio = contrast * _combined(weights, np.where(np.isfinite(ratio_std), ratio_std, 0.0))
     # Coloured reflections are taken for another ratio; those colder than a room are of the sky.
     cold = _mean(films[1]) < _COLD
-    colour = np.nan_to_num(ratio) * np.where(cold & (accuracy.colour > 0.0), SKY, accuracy.colour)
+    colour = np.where(cold & (accuracy.colour > 0.0), SKY, accuracy.colour)
+    colour = np.nan_to_num(ratio) * (colour if stated is None else stated.std[:, None, None])
     colour[reference] = 0.0
     by_colour = contrast * _combined(weights, colour)
+    if stated is not None:
+        apart = np.where(single, 0.0, _rms(films[0], films[1]))
+        scaled = stated.deviations(value, cut["emissivity_std"].values, apart)
+        by_colour = np.hypot(by_colour, _combined(weights, scaled))
     drift = np.where(single, 0.0, _drift(cut))
     by_drift = np.zeros_like(drift), drift * _rms(films[0], films[1])
     for place, (name, film) in enumerate(zip(_FILMS, films, strict=True)):
@@ -145,6 +154,7 @@ def _add(cut: xr.Dataset, noise: Array, reference: int, accuracy: Accuracy) -> N
     stds = cut["emissivity_std"].values
     deviations = {"drift": np.abs(1.0 - value) * drift}
     deviations |= {"gain": np.abs(value * (1.0 - value)) * slope}
+    deviations["colour"] = value * (1.0 - value[reference]) * _combined(weights[0], colour)
     _enter(cut[BUDGETS["emissivity"]].values, deviations, stds[np.newaxis], stds.astype(np.float64))
 
 

@@ -1,76 +1,65 @@
-"""Reflections as pictures: of a result, in the first band's unit."""
+"""Reflections of a colour, as those of a sky: scaled to those of a gray background, and back."""
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 import xarray as xr
 
-from dbthermal import schema
-from dbthermal._coordinates import laid_on
+from dbthermal._arrays import Array, empty, release
+from dbthermal.emissivity._background import Colour
+
+if TYPE_CHECKING:
+    from dbthermal.separation._separate import Measured
+
+# Rounds in which s is found, and its change that moves no object: 0.05 % of 20 K are 0.01 K.
+_ROUNDS: Final = 5
+_SETTLED: Final = 5e-4
 
 
-def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    r"""Change of the first band's apparent temperature that the reflection causes.
+def as_gray(
+    corrected: xr.Dataset,
+    once: Callable[[xr.Dataset], tuple["Measured", Any]],
+    measured: "Measured",
+    colour: Colour,
+) -> tuple[xr.Dataset, Array, tuple["Measured", Any]]:
+    """Scale a capture to one of a gray background: with the scales s, and what it is found to be.
 
-    .. math:: (1 - e_1) (y - \bar y)
-
-    with the mean over time, in the linear response of small changes. Of a constant object without
-    a completed background it is the change of the apparent temperature.
-
-    Parameters
-    ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K], from
-        `response.apparent_temperature`.
-    result : Dataset
-        From `solve`, `separate` or `complete`, of the same capture.
-
-    Returns
-    -------
-    DataArray
-        (time, y, x) [K], float32; NaN where the reflection is unknown.
-
-    Raises
-    ------
-    ValueError
-        If a variable is missing, emissivities are in per cent, or the first bands, dims, sizes or
-        coordinates differ.
-
-    Examples
-    --------
-    Plate glass, of reflectivity 0.14, reflects people who are 10 K warmer than the room:
-
-    >>> import numpy as np
-    >>> from dbthermal import response, separation, simulation
-    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
-    >>> glass = xr.DataArray([0.86, 0.72], coords={"band": list(rig.bands)}, dims="band")
-    >>> scene = simulation.walkers(np.arange(200) / 10, (4, 6), glass, rng)
-    >>> capture = simulation.observe(scene, rig.response(), rng)
-    >>> apparent = response.apparent_temperature(rig.response(), capture["counts"])
-    >>> change = reflected_change(apparent, separation.solve(capture, rig.response()))
-    >>> bool(1.2 < (change.max("time") - change.min("time")).median() < 1.8)  # 1.4 K and noise
-    True
+    Its emissivities, from which s follows, are at first those of the signals as they are.
     """
-    schema.check_numbers(apparent, "the apparent temperature", "K")
-    if not isinstance(result, xr.Dataset):
-        raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
-    if apparent.dims != ("band", "time", "y", "x"):
-        rule = "Must be ('band', 'time', 'y', 'x')"
-        raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
-    if str(apparent["band"].values[0]) != str(result["band"].values[0]):
-        raise ValueError(
-            f"Invalid first band '{apparent['band'].values[0]}'. "
-            f"Must be '{result['band'].values[0]}', as in the result."
-        )
-    needed = ("background_temperature", "emissivity", "status")
-    schema.check(result, "separated", needed, "the result")
-    if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
-        message = f"Invalid emissivities of the result, {usual:.3g} in the median"
-        raise ValueError(f"{message}. Must be shares of one, not per cent.")
-    first = apparent.isel(band=0, drop=True)
-    first = laid_on(first, result, "the apparent temperature", "the result")
-    background = result["background_temperature"]
-    reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
-    change = (background - background.mean("time")) * reflectivity
-    constant = (result["status"] & int(schema.Status.CONSTANT_OBJECT)) != 0
-    without = constant & background.isnull().all("time")
-    change = change.where(~without, first - first.mean("time"))
-    attrs = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
-    return change.astype("float32").rename("reflected_change").assign_attrs(attrs)
+    inputs, level, scale = measured.inputs, colour.level, colour.scale(measured.result)
+    if level is None:
+        films = measured.result["background_temperature"].values
+        films = films[:, measured.result["status"].values == 0]
+        level = float(np.nanmedian(films)) if films.size else inputs.curves[0].reference
+    for _ in range(_ROUNDS):
+        counts = empty(corrected["counts"].shape, np.float32)
+        for band, curve in enumerate(inputs.curves):
+            rest, share = np.float32(curve.counts(level)), np.float32(scale[band])
+            for frame, image in zip(counts[band], corrected["counts"].values[band], strict=True):
+                frame[:] = rest + (image - rest) / share
+            release()
+        # Noise and pattern are divided as in most pixels.
+        capture = corrected.assign(counts=corrected["counts"].copy(data=counts))
+        capture = capture.assign_attrs(background_colour=colour)
+        for name in {"noise_factor", *({"pattern_std"} & {*corrected})}:
+            before = corrected[name].values if name in corrected else 1.0
+            capture[name] = "band", before / np.median(scale, axis=(1, 2))
+        outcome = once(capture)
+        used, scale = scale, colour.scale(outcome[0].result, scale)
+        if np.mean(np.abs(scale - used)) < _SETTLED:
+            break
+    return capture, used, outcome
+
+
+def restored(result: xr.Dataset, scale: Array, colour: Colour) -> xr.Dataset:
+    """Result of scaled signals with the emissivities, ratios and noise of those before."""
+    g = colour.ratio[:, np.newaxis, np.newaxis]
+    of_std, of_ratio = (np.where(scale == 1.0, 1.0, s) for s in (scale**2 / g, scale / g))
+    factors = {"emissivity": scale, "reflection_ratio": of_ratio, "reflection_ratio_std": of_ratio}
+    factors |= dict.fromkeys(("emissivity_std", "emissivity_uncertainty"), of_std)
+    factors["emissivity_covariance"] = of_std[:, np.newaxis] * of_std
+    factors["noise"] = np.median(scale, axis=(1, 2))
+    for name in factors.keys() & {*map(str, result.data_vars)}:
+        result[name].values[...] *= factors[name].astype(result[name].dtype)
+    return result

@@ -1,6 +1,6 @@
 """The default way through a capture: all steps of the separation, in one call."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,17 +11,17 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment, schema
-from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.bands import FILTERS
+from dbthermal.emissivity._background import colour_of
 from dbthermal.schema import Status
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._blur import equalise
-from dbthermal.separation._budget import SKY, without_calibration
+from dbthermal.separation._budget import SKY
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
@@ -30,6 +30,7 @@ from dbthermal.separation._misfit import Misfit
 from dbthermal.separation._motion import stabilise
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
+from dbthermal.separation._reflection import as_gray, restored
 from dbthermal.separation._solve import get_method, require_workers, separated
 from dbthermal.separation._tiles import Material
 
@@ -62,9 +63,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     surroundings: float | xr.DataArray | None = None,
     surroundings_std: float = 2.0,
     outdoors: bool = False,
+    background_ratio: xr.Dataset | Sequence[float] | None = None,
     prior: str | xr.DataArray | xr.Dataset | None = None,
     settings: "SubspaceSettings | None" = None,
-    alone: xr.Dataset | None = None,
     workers: int = 2,
     progress: bool = False,
 ) -> xr.Dataset:
@@ -90,11 +91,12 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     outdoors : bool
         The sky is mirrored, whose changes are not alike in two bands: the bars say so
         (`background_ratio_std` 0.4). Not needed where what is mirrored is below 5 degrees Celsius.
+    background_ratio : Dataset or (float, float), optional
+        Changes of what is mirrored in each band over those in the reference band, known or seen in
+        foil (`emissivity.background_ratio`); or of two bands the second's over the first's, and its
+        deviation. Changes are from the surroundings; if not stated, from where most rests.
     settings : SubspaceSettings, optional
         Options of the method "subspace".
-    alone : Dataset, optional
-        Result of `solve` for the same arguments, if at hand: of cameras at one place the first step
-        is not done again.
     workers : int
         Number of threads.
     progress : bool
@@ -132,24 +134,27 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     names = [str(band) for band in corrected["band"].values]
     completable = _completable(prior, names)
     require_workers(workers)
+    if outdoors and background_ratio is not None:
+        raise ValueError("Invalid outdoors beside a background_ratio. State one of them.")
     response = response.assign(background_ratio_std=SKY) if outdoors else response
     inputs = check(corrected, response, get_method("subspace"), settings=settings)
+    colour = None
+    if background_ratio is not None:
+        level = None if surroundings is None else float(np.mean(surroundings))
+        colour = colour_of(background_ratio, names, inputs.bands[0], level, surroundings_std)
     response = inputs.response  # with one noise for all steps
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
-    alone = None if alone is None else _checked(alone, corrected, inputs)
 
-    def once(capture: xr.Dataset, per_pixel: xr.Dataset | None = None) -> tuple[_Parts, Misfit]:
+    def once(capture: xr.Dataset) -> tuple[Measured, Misfit]:
         scope = check(capture, response, inputs.method, settings=settings)
-        measured = _separated(
-            capture, scope, reflection_shift, materials, per_pixel, workers, progress
-        )
+        measured = _separated(capture, scope, reflection_shift, materials, workers, progress)
         return measured, misfits.measure(measured.inputs, measured.result, workers)
 
     # Separate, and widen the bars by what is left.
-    corrected, (measured, misfit), mended = _mended(corrected, once, alone)
+    corrected, (measured, misfit), mended = _mended(corrected, once)
+    if colour is not None:
+        corrected, scale, (measured, misfit) = as_gray(corrected, once, measured, colour)
     result, materials = measured.result, measured.materials
-    if result is alone:  # which is the caller's
-        result = result.copy(deep=True)
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=measured.reflection_shift)
@@ -159,6 +164,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     else:
         doubts.append(_NOT_COMPLETED.format(names))
         result = budget.added(result, measured.inputs)
+    if colour is not None:
+        result = restored(result, scale, colour)
     if materials is not None:
         result["material"] = materials
     source = "none" if measured.reflection_shift is None else "found"
@@ -168,15 +175,14 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 def _mended(
     original: xr.Dataset,
-    once: Callable[..., tuple["_Parts", Misfit]],
-    per_pixel: xr.Dataset | None,
-) -> tuple[xr.Dataset, tuple["_Parts", Misfit], list[str]]:
+    once: Callable[..., tuple["Measured", Misfit]],
+) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate; again, while what is left shows that cameras move, or that their blurs differ.
 
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
     capture, motion, sentences = original, None, []
-    outcome = measured, misfit = once(capture, per_pixel)
+    outcome = measured, misfit = once(capture)
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
@@ -199,13 +205,13 @@ def _mended(
     return capture, outcome, sentences
 
 
-def _measured(measured: "_Parts") -> int:
+def _measured(measured: "Measured") -> int:
     """Number of pixels without a flag."""
     return int(np.count_nonzero(measured.result["status"].values == 0))
 
 
 @dataclass(frozen=True)
-class _Parts:
+class Measured:
     """What was measured, and by what."""
 
     result: xr.Dataset
@@ -220,10 +226,9 @@ def _separated(
     inputs: Inputs,
     reflection_shift: xr.Dataset | None,
     materials: xr.DataArray | None,
-    alone: xr.Dataset | None,
     workers: int,
     progress: bool,  # noqa: FBT001 - passed on
-) -> _Parts:
+) -> Measured:
     """Separate each pixel, with the shift of the reflections, and then over materials."""
     # Find the shift of the reflections, where cameras stand apart.
     share = 0.0
@@ -233,9 +238,7 @@ def _separated(
         shift = displaced.check(reflection_shift, corrected, inputs.bands[0])
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
-    surveys = None
-    if alone is None or reflection_shift is not None:
-        alone, surveys = separated(inputs, workers=workers, progress=progress)
+    alone, surveys = separated(inputs, workers=workers, progress=progress)
     doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else []
     if reflection_shift is not None:
         doubts = _unexplained(alone)
@@ -251,7 +254,7 @@ def _separated(
         result, materials = _over_found_materials(pool, inputs, corrected, alone)
     if materials is not None:
         hold(alone, result, materials, apart=reflection_shift is not None)
-    return _Parts(result, inputs, materials, reflection_shift, doubts)
+    return Measured(result, inputs, materials, reflection_shift, doubts)
 
 
 def _completable(prior: str | xr.DataArray | xr.Dataset | None, names: list[str]) -> bool:
@@ -260,17 +263,6 @@ def _completable(prior: str | xr.DataArray | xr.Dataset | None, names: list[str]
         return False
     stated(prior, names)
     return True
-
-
-def _checked(per_pixel: xr.Dataset, corrected: xr.Dataset, inputs: Inputs) -> xr.Dataset:
-    """Result of each pixel alone that is at hand, in the order of the capture."""
-    made = {"method": "subspace", "pooled": 0, "settings": repr(inputs.settings)}
-    if any(per_pixel.attrs.get(name) != value for name, value in made.items()):
-        raise ValueError(
-            "Invalid result alone. Must be of 'subspace', without materials, with "
-            f"{made['settings']}."
-        )
-    return laid_on(without_calibration(per_pixel), corrected, "the result alone", "the capture")
 
 
 def _over_found_materials(

@@ -14,7 +14,10 @@ from attack.scenes import pick
 from dbthermal import calibration, correction, emissivity, limits, separation, simulation
 from dbthermal import response as responses
 from reproduction import metrics
+from reproduction.celsius import relative_error_celsius
 from reproduction.contact import contact_measurements
+from reproduction.filters import condition_numbers, rank_filters
+from reproduction.reflection import reflected_change
 
 
 @dataclass(frozen=True)
@@ -78,15 +81,15 @@ def _steps() -> Mapping[str, Step]:
         Step(calibration.reflector_emissivity, {"measured": reflector, **fixed}),
         Step(responses.apparent_temperature, {"response": curves, "counts": corrected["counts"]}),
         # Used where the object is constant, and where there is no flag.
-        Step(separation.reflected_change, changed, "result", ("apparent",)),
+        Step(reflected_change, changed, "result", ("apparent",)),
         Step(separation.materials, completed, "result", ("result", "corrected")),
         Step(limits.bounds, {"scene": truth, "response": curves}),
         Step(limits.plan, {"table": table, "noise": netd}),
-        Step(emissivity.condition_numbers, {"table": table}),
-        Step(emissivity.rank_filters, {"table": table, "noise": netd}),
+        Step(condition_numbers, {"table": table}),
+        Step(rank_filters, {"table": table, "noise": netd}),
         Step(_band_table, {"spectrum": spectrum}),
         Step(metrics.correlation, plain, "first"),
-        Step(metrics.relative_error_celsius, errors, "estimate"),
+        Step(relative_error_celsius, errors, "estimate"),
     ]
     return {step.call.__name__: step for step in steps}
 

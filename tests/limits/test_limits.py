@@ -312,6 +312,26 @@ def test_plan_is_the_bound(materials: Materials) -> None:
     assert float(planned[0]) == pytest.approx(ratio, rel=0.01)
 
 
+def test_plan_outdoors_says_what_the_sky_costs() -> None:
+    """The error of two bands in closed form; 10.6 um beside 9.5 leaves a third of that of 8-14."""
+    table = emissivity.embedded_table().sel(material=["plate window glass"])
+    noise = emissivity.filter_noise(0.03, table["band"].values.tolist())
+    planned = limits.plan(table, noise, outdoors=True)
+    assert planned.attrs["beside"] == "10.6"
+    first, second = (float(table["emissivity"].sel(band=name)[0]) for name in ("10.6", "9.5"))
+    ratio = (1.0 - second) / (1.0 - first)
+    error = (1.0 - second) * (1.48 / 1.37 - 1.0) / abs(1.0 - ratio)
+    rise = np.expm1(-np.arange(350) / 349 * 3) / np.expm1(-3.0)
+    pulse = 3.0 * (np.mod(np.arange(350) + 0.5, 50) > 30)
+    contrast = np.sqrt(np.mean((293.15 + 25.0 * rise - 273.15 - pulse) ** 2))
+    cost = planned["sky_error"].sel(filter="9.5")
+    np.testing.assert_allclose(cost, error * contrast, rtol=1e-6)
+    wide = limits.plan(table, noise, outdoors=True, beside="8-14")["sky_error"]
+    assert float(cost[0]) < 0.35 * float(wide.sel(filter="9.5")[0])
+    total = np.hypot(planned["object_temperature_std"], planned["sky_error"])
+    assert planned["best"][0] == planned["filter"][int(np.argmin(total))]
+
+
 def test_plan_finds_the_filter(materials: Materials) -> None:
     """Silicates get a filter in their reststrahlen bands, nearly gray metals get none."""
     expected = limits.plan(*materials)

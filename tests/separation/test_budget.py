@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.constants import Boltzmann, Planck, speed_of_light
 
-from dbthermal import calibration, correction, explorer, reporting, separation, store
+from dbthermal import calibration, correction, emissivity, explorer, reporting, separation, store
 from dbthermal.__main__ import main
 from dbthermal.response import EXACT
 from dbthermal.schema import BUDGETS, COMPLETED, SHARED
@@ -65,14 +65,15 @@ def glass(
     pivot: float = 290.0,
     patches: tuple[float, ...] = (),
     colour: float = 1.0,
+    left: tuple[float, float] = LEFT,
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Two panes that warm up while people pass; cameras whose level [K] and gain have drifted.
 
-    What is mirrored changes `colour` times as much in the second band.
+    The signal of what is mirrored changes `colour` times as much in the second band.
     """
     rng = np.random.default_rng(seed)
     rows, columns = np.indices(SHAPE)
-    left = columns < SHAPE[1] // 2
+    half = columns < SHAPE[1] // 2
     rise = 5.0 + 20.0 * np.exp(-((rows - 8) ** 2 + (columns - 14) ** 2) / 90.0)
     warm = 293.15 + rise * (1.0 - np.exp(-TIME / 12.0))[:, None, None]
     cold = np.full(warm.shape, ROOM)
@@ -82,12 +83,12 @@ def glass(
         near = np.abs(columns - place[:, None, None]) < 2.5
         near &= np.abs(rows - rng.uniform(4, 12)) < height / 2
         cold[near] = 295.15 + rng.uniform(5, 10)
-    values = np.array([np.where(left, *pair) for pair in zip(LEFT, RIGHT, strict=True)])
+    values = np.array([np.where(half, *pair) for pair in zip(left, RIGHT, strict=True)])
     movie = []
     for band in range(2):
-        mirrored = ROOM + (colour if band else 1.0) * (cold - ROOM)
+        rest, share = counts_of(band, ROOM), colour if band else 1.0
         clean = values[band] * counts_of(band, warm)
-        clean += (1 - values[band]) * counts_of(band, mirrored)
+        clean += (1 - values[band]) * (rest + share * (counts_of(band, cold) - rest))
         for place, temperature in enumerate(patches):  # black ones, at the upper edge
             clean[:, :3, 8 * place : 8 * place + 8] = counts_of(band, temperature)
         clean += gain[band] * (clean - counts_of(band, pivot)) + offset[band] * COUNTS[band]
@@ -155,6 +156,54 @@ def test_sky_is_no_gray_body(seed: int) -> None:
     part = outdoors["uncertainty"].sel(cause="colour").where(outdoors["status"] == 0)
     error = abs(outdoors[name] - truth[name]).where(outdoors["status"] == 0)
     assert 0.5 < float(error.median() / part.median()) < 2.0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("colour", [1.05, 1.45])
+def test_a_known_colour_biases_nothing(seed: int, colour: float) -> None:
+    """Not the object, nor the emissivities; and foil in view shows it."""
+    truth, capture = glass(seed, colour=colour)
+    gray, coloured = (
+        separation.separate(capture, response(**EXACT), background_ratio=ratio)
+        for ratio in (None, (colour, 0.004))
+    )
+    bias = [
+        float(np.nanmean(it["object_temperature"] - truth["object_temperature"]))
+        for it in (gray, coloured)
+    ]
+    off = [abs(it["emissivity"] - truth["emissivity"]).median() for it in (gray, coloured)]
+    print(colour, seed, bias, holds(gray, truth), holds(coloured, truth))
+    assert bias[0] < -0.05
+    assert abs(bias[1]) < 0.012  # K; without a colour 0.006
+    assert off[1] < off[0]
+    assert holds(gray, truth) < 0.7
+    assert min(holds(coloured, truth, str(quantity)) for quantity in truth.data_vars) > 0.9
+    # An error of the ratio moves the object by as much as it adds to the budget.
+    stated = (colour, 0.0), (colour, 0.02), (colour + 0.02, 0.0)
+    sure, vague, near = (
+        separation.separate(capture, response(**EXACT), background_ratio=pair) for pair in stated
+    )
+    parts = [it["uncertainty"].sel(cause="colour") ** 2 for it in (sure, vague)]
+    moved = ((near["object_temperature"] - sure["object_temperature"]) ** 2).mean("time")
+    assert float((moved / (parts[1] - parts[0])).median()) == pytest.approx(1.0, abs=0.5)
+
+
+def test_foil_shows_the_colour() -> None:
+    """Its own 1 % apart, within two deviations; by one band or the other, and in `separate`."""
+    truth, capture = glass(1, colour=1.2, left=(0.05, 0.05))
+    foil = xr.DataArray(np.broadcast_to(np.arange(24) < 10, SHAPE), dims=("y", "x"))
+    result = separation.separate(capture, response(**EXACT))
+    ratio = emissivity.background_ratio(result, foil)
+    value, std = (float(ratio[name][1]) for name in ("background_ratio", "background_ratio_std"))
+    print(value, std)
+    assert abs(value - 1.2) < 2.0 * std < 0.1
+    coloured = separation.separate(capture, response(**EXACT), background_ratio=ratio)
+    right = (coloured["status"] == 0) & (coloured["x"] > 12)
+    inside = abs(coloured["object_temperature"] - truth["object_temperature"])
+    inside = inside < 1.96 * coloured["object_temperature_std"]
+    assert float(inside.where(right).mean()) > 0.95
+    with pytest.raises(ValueError, match="Missing reflection ratio of the foil"):
+        emissivity.background_ratio(result, foil & False)
 
 
 @pytest.mark.parametrize("call", [separation.solve, separation.separate])

@@ -234,26 +234,6 @@ def test_a_shift_of_zero_changes_nothing(shelf: Shelf) -> None:
         )
 
 
-def test_what_is_at_hand_is_not_separated_again(shelf: Shelf) -> None:
-    """A result of `solve`, one thread: the same to the bit; another's result is refused.
-
-    In one process: code just compiled and code read from its file may add in different order.
-    """
-    scene = shelf.scene("two materials")
-    alone = separation.solve(scene.capture, scene.response)
-    given, plain = (
-        separation.separate(scene.capture, scene.response, alone=result, workers=workers)
-        for result, workers in ((alone, 1), (None, 2))
-    )
-    xr.testing.assert_identical(given, plain)
-    pooled = alone.assign_attrs(pooled=1)
-    unlike = alone.assign_attrs(settings="SubspaceSettings(background_drift=1.0)")
-    wrong = [(pooled, "without materials"), (unlike, "background_drift=3.0")]
-    for other, message in (*wrong, (alone.isel(x=slice(9)), "size 9")):
-        with pytest.raises(ValueError, match=message):
-            separation.separate(scene.capture, scene.response, alone=other)
-
-
 def test_what_is_measured_stays_when_the_rest_is_completed(shelf: Shelf) -> None:
     """`complete` leaves values and bits of a measured pixel, and fills all others, flagged."""
     scene, alone = shelf.scene("still half"), shelf.outcome("still half", "solve").result

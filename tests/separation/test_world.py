@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import interp1d
 from worlds import RESPONSE, SHAPE, World, seen
 
-from dbthermal import separation
+from dbthermal import alignment, separation
 from dbthermal.schema import Status
 
 SKIN, PLASTIC = (0.93, 0.85), (0.75, 0.60)
@@ -27,14 +28,36 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
     "lock-in": (World(lamp=0.3), "", ""),
     "foil": (World(behind=(0.10, 0.15), surface=(PLASTIC, PLASTIC)), "", ""),
+    "one way": (World(together=True, parallax=3.0), "", ""),
+    "one way, slow": (World(together=True, parallax=3.0, pace=(3.0, 6.0)), "", ""),
+    "one way, quick": (World(together=True, parallax=3.0, pace=(25.0, 50.0)), "", ""),
+    "one way, late": (World(together=True, parallax=3.0, lag=0.03), "", ""),
+    "filter wheel": (World(lag=0.05), "", ""),
+    "filter wheel, stamped": (World(lag=0.05, stamped=True), "", ""),
+    "slow filter wheel": (World(lag=0.1, rate=5.0), "", ""),
+    "slow filter wheel, stamped": (World(lag=0.1, rate=5.0, stamped=True), "", ""),
+    "jitter": (World(jitter=0.025, rate=9.0), "", ""),
+    "clocks apart": (World(fast=5e-4), "", ""),
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
 QUICK = list(WORLDS)[:7]
-LEAST, MOST_RMSE = 0.9, 1.3
+CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
+LEAST, FEW, MOST_RMSE = 0.9, 0.05, 1.3
 # By situation and seed: what is not reached.
 MISSED = {
     ("cameras shake", 1): "0.85 hold, RMSE 1.4 times: motion that is left thins the ratio by 1 %",
     ("lenses blur unlike", 1): "RMSE 1.4 times: details of the object stay unlike",
+    ("one way, quick", 2): "0.89 hold: 3 to 5 pixels a frame, as far as the views lie apart",
+    ("one way, late", 1): "0.87 hold: parallax and delay are not told apart by one direction",
+    **{
+        (
+            f"slow filter wheel{stamps}",
+            seed,
+        ): "0.74 and 0.86 hold: edges that move by 2 to 4 pixels "
+        "from frame to frame are not what is interpolated half-way"
+        for stamps in ("", ", stamped")
+        for seed in (1, 2)
+    },
 }
 
 
@@ -44,10 +67,18 @@ def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]
     capture, truth = seen(WORLDS[name][0], seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
+        if name in CLOCKS:  # as the documentation has it: on one clock, which has other times
+            before = capture["time"].values
+            capture = alignment.align(capture)
+            course = interp1d(before, truth, axis=0, fill_value="extrapolate")
+            truth = course(capture["time"].values)
         result = separation.separate(capture, RESPONSE)
     sound = result["status"].values == 0
     error = (result["object_temperature"].values - truth)[:, sound]
-    holds = np.abs(error) < 1.96 * result["object_temperature_std"].values[:, sound]
+    std = result["object_temperature_std"].values[:, sound]
+    valid = np.isfinite(error).all(axis=1)  # frames before and after the other camera's
+    error, std = error[valid], std[valid]
+    holds = np.abs(error) < 1.96 * std
     figures = float(holds.mean()), float(sound.mean()), float(np.sqrt(np.mean(error**2)))
     print(name, seed, *(f"{figure:.3f}" for figure in figures))
     return *figures, tuple(result.attrs.get("warnings", []))
@@ -66,9 +97,9 @@ def cases() -> Iterator[Any]:
 @pytest.mark.parametrize(("name", "seed"), [*cases()])
 def test_intervals_hold(name: str, seed: int) -> None:
     """In 9 of 10 samples without a flag; what is mended is nearly as good as without."""
-    holds, _, rmse, _ = outcome(name, seed)
+    holds, share, rmse, _ = outcome(name, seed)
     without = WORLDS[name][2]
-    assert holds >= LEAST
+    assert holds >= LEAST or share <= FEW
     assert not without or rmse <= MOST_RMSE * outcome(without, seed)[2]
 
 

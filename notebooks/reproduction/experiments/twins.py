@@ -10,7 +10,8 @@ from scipy.constants import zero_Celsius
 from dbthermal import alignment, calibration, emissivity, separation, simulation
 from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
-from reproduction import methods, metrics, twins
+from reproduction import methods, twins
+from reproduction.celsius import relative_error_celsius
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.experiments.scores import held, rmse
@@ -87,9 +88,7 @@ def judge_twin(
         read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
         ways = {"alone": over_the_image(scene, separated)}
         if (whole and cameras != "one place") or (shown and picture is None):
-            result = separation.separate(
-                corrected, response, reflection_shift=shift, alone=separated
-            )
+            result = separation.separate(corrected, response, reflection_shift=shift)
             ways["pooled"] = over_the_image(scene, result)
             ways["completed"] = over_the_image(scene, result, completed=True)
             if shown and picture is None:
@@ -243,7 +242,7 @@ def at_thermocouple(
 def _relative_error(estimate: xr.DataArray, readings: Sequence[xr.DataArray]) -> xr.DataArray:
     """Error of a temperature (time), mean over its frames and the probes' readings (time)."""
     times = {"time": estimate["time"]}
-    errors = [metrics.relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
+    errors = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
     return xr.concat(errors, "probe").mean(("probe", "time"), skipna=False)
 
 
