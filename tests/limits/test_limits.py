@@ -328,7 +328,7 @@ def test_plan_outdoors_says_what_the_sky_costs() -> None:
     np.testing.assert_allclose(cost, error * contrast, rtol=1e-6)
     wide = limits.plan(table, noise, outdoors=True, beside="8-14")["sky_error"]
     assert float(cost[0]) < 0.35 * float(wide.sel(filter="9.5")[0])
-    total = np.hypot(planned["object_temperature_std"], planned["sky_error"])
+    total = np.hypot(planned["object_temperature_std"], planned["sky_error"]).values
     assert planned["best"][0] == planned["filter"][int(np.argmin(total))]
 
 
