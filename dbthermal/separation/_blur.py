@@ -23,7 +23,6 @@ from scipy.ndimage import (
 )
 
 from dbthermal._arrays import Array, Mask, empty, quotient, release
-from dbthermal._smooth import leading
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import object_weights, reflected, smooth_functions
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
@@ -39,7 +38,7 @@ _BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
 _GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 _FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
-_PLANES: Final = 32  # functions of time that hold the rapid changes
+_NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
 _MOVING: Final = 1.0  # variance of the changes over that of noise
 # Deviations and size [pixel^2] of a difference that counts, and deviations in some rows from which
 # it is sought in all: 0 to 2 in plain scenes, 8 to 25 for 0.5 and 1.3 pixels.
@@ -188,24 +187,27 @@ def _equations(
     within = maximum_filter(ratio, _BORDER) < _ALIKE * minimum_filter(ratio, _BORDER)
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
     blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
-    # Maps along functions of time that hold most of the rapid changes: a blur is one of each.
     basis = smooth_functions(inputs, frames)
-    quick = films[0].T - (films[0].T @ basis) @ basis.T
-    functions = leading(quick[used.ravel()] if used.any() else quick, _PLANES)
+
+    def rapid(film: Array) -> Array:
+        return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
+
     first, second = (
-        np.stack([_details(image, blur) for image in (functions.T @ film).reshape(-1, *shape)])
-        for film, blur in zip(films[[0, place]], blurs, strict=True)
+        np.stack([_details(image, blur) for image in films[order].reshape(-1, *shape)])
+        for order, blur in zip((0, place), blurs, strict=True)
     )
-    remainder, reflection = second / ratio - first, first
-    curvature = laplace(first, axes=(1, 2))
+    remainder, reflection = rapid(second / ratio - first), rapid(first)
+    curvature = rapid(laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
-    point = np.zeros((1 + 8 * int(_BROAD),) * 2)
-    point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
-    noise = _details(point, blurs[0])
-    bent, number = laplace(noise), functions.shape[1]
+    rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
+    noise = np.stack(
+        [_details(image, blurs[0]) for image in rng.standard_normal((_NUMBER, *shape))]
+    )
+    bent = laplace(noise, axes=(1, 2))
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
     level, mixed, bending = (
-        number * levels[0] * np.sum(a * b) for a, b in ((noise, noise), (noise, bent), (bent, bent))
+        free * levels[0] * np.mean((a * b)[:, inner])
+        for a, b in ((noise, noise), (noise, bent), (bent, bent))
     )
     products = (
         np.sum(remainder * reflection, axis=0) + level,

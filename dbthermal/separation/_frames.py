@@ -104,16 +104,17 @@ def solve(
     bands, frames, pixels = tile.signals.shape
     if covariance is None:
         covariance = np.zeros((bands + 1, bands + 1, pixels))
+    pattern = np.zeros(bands) if tile.pattern is None else np.square(tile.pattern)
     share = np.ones(bands) if not apart else np.eye(bands)[0]
     unseen = np.outer(fluctuation, 1.0 - share) * np.square(1.0 - emissivity.T)
     result = np.empty((5, pixels, frames))
     _solve(
         response_tables(tile),
         np.ascontiguousarray(tile.signals.transpose(2, 0, 1)),
-        np.stack([emissivity.T, tile.pixel_noise.T**2 + unseen, tile.pixel_pattern.T**2], axis=1),
+        np.stack([emissivity.T, np.square(tile.noise) + unseen], axis=1),
         np.stack([level, fluctuation], axis=-1),
         np.ascontiguousarray(covariance.transpose(2, 0, 1)),
-        share,
+        np.stack([share, pattern]),
         _Work(
             *np.empty((4, bands, frames)), *np.empty((2, bands + 1, frames)), *np.empty((9, frames))
         ),
@@ -174,15 +175,15 @@ def _solve(
     parameters: Array,
     levels: Array,
     covariance: Array,
-    share: Array,
+    shares: Array,
     work: _Work,
     result: Array,
 ) -> None:
     """As `solve`, in place (5, pixel, time).
 
-    Of each pixel its signals (band, time), emissivities and variances of the bands and of the
-    pixel's offset in them (3, band), level of the background and variance about it (2), and their
-    covariance; of each band the share of the fluctuation that it sees.
+    Of each pixel its signals (band, time), emissivities and variances of the bands (2, band), level
+    of the background and variance about it (2), and their covariance; of each band the share of the
+    fluctuation that it sees, and the variance of a pixel's offset (2, band).
     """
     for p in range(len(signals)):
         room = kernels.inverse(tables[0], levels[p, 0])
@@ -192,14 +193,14 @@ def _solve(
         for t in range(work.object.size):
             work.object[t] = room if np.isnan(work.object[t]) else work.object[t]
         for _ in range(_STEPS):
-            for m in range(share.size):
-                seen = work.background if share[m] > 0 else work.room
+            for m in range(shares.shape[1]):
+                seen = work.background if shares[0, m] > 0 else work.room
                 kernels.blackbody(tables[m], work.object, work.emitted[m], work.slope[m])
                 kernels.blackbody(tables[m], seen, work.behind[m], work.rate[m])
-            if _step(signals[p], parameters[p], share, levels[p], work, result[:2, p]):
+            if _step(signals[p], parameters[p], shares[0], levels[p], work, result[:2, p]):
                 break
         at_room = kernels.exact(tables[0], room)[1]
-        _propagate(parameters[p], share, at_room, covariance[p], work, result[2:, p])
+        _propagate(parameters[p], shares, at_room, covariance[p], work, result[2:, p])
 
 
 @compiled
@@ -247,19 +248,19 @@ def _propagate(
 ) -> None:
     """Variances of a pixel, see `Frames` (3, time), in place."""
     ss, sr, rr, to_s, to_r = work.ss, work.sr, work.rr, work.to_s, work.to_r
-    white, offset, bands = result[0], work.variance, shares.size
+    white, offset, bands = result[0], work.variance, shares.shape[1]
     for t in range(ss.size):
         white[t], offset[t] = 0.0, 0.0
         work.of_s[bands, t], work.of_r[bands, t] = 0.0, 1.0
     for m in range(bands):
-        e, variance, share = parameters[0, m], parameters[1, m], shares[m]
+        e, variance, share = parameters[0, m], parameters[1, m], shares[0, m]
         for t in range(ss.size):
             by_s = e * work.slope[m, t] / work.slope[0, t]
             by_level = (1.0 - e) * work.rate[m, t] / (work.rate[0, t] if share > 0.0 else at_room)
             to_s[t] = (by_s * rr[t] - share * by_level * sr[t]) / variance
             to_r[t] = (share * by_level * ss[t] - by_s * sr[t]) / variance
             white[t] += to_s[t] ** 2 * variance
-            offset[t] += to_s[t] ** 2 * parameters[2, m]
+            offset[t] += to_s[t] ** 2 * shares[1, m]
             contrast = work.emitted[m, t] - work.behind[m, t]
             work.of_s[m, t], work.of_r[m, t] = -to_s[t] * contrast, -to_r[t] * contrast
             work.of_s[bands, t] -= to_s[t] * by_level

@@ -242,15 +242,12 @@ def _separated(
     doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else []
     if reflection_shift is not None:
         doubts = _unexplained(alone)
-    # One wrong material spoils an image that no shift explains: with a band two frames late a tenth
-    # of the pixels were 3.4 K off and more in 2 of 10 scenes, 0.7 K without pooling.
-    unexplained = reflection_shift is not None and bool(doubts)
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
     pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
         result, _ = pool(replace(inputs, labels=numbered(corrected, materials)))
-    elif find_spec("skimage") is not None and not unexplained:
+    elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(pool, inputs, corrected, alone)
     if materials is not None:
         hold(alone, result, materials, apart=reflection_shift is not None)

@@ -351,8 +351,8 @@ def _separate(
             estimates.append((frames, pixels, estimate))
             if estimate.survey is not None:
                 # Whitened by one noise for all, not by that of the tile.
-                scale = tile.pixel_noise / inputs.noise[inputs.bands][:, np.newaxis]
-                scatter = estimate.survey.scatter * scale * scale[:, np.newaxis]
+                scale = np.array(tile.noise) / inputs.noise[inputs.bands]
+                scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
                 section = replace(estimate.survey, scatter=scatter)
                 survey.replace_pixels(cut.places[pixels], section)
         if result is not None:

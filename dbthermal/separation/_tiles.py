@@ -42,6 +42,7 @@ SAMPLES: Final = 2**19
 _COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
+_NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
 RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 
@@ -135,7 +136,6 @@ class Tile:
     noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
-    gain: Array | None = None  # noise of each pixel's bands over `noise` (band, pixel) [1]
     pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
@@ -148,21 +148,6 @@ class Tile:
     def reference(self) -> float:
         """Reference temperature [K] that the signals are relative to."""
         return self.curves[0].reference
-
-    @property
-    def pixel_noise(self) -> Array:
-        """Standard deviation of the signals' noise in each pixel (band, pixel) [K]."""
-        return self._resampled(self.noise)
-
-    @property
-    def pixel_pattern(self) -> Array:
-        """Residual fixed pattern, independent from pixel to pixel (band, pixel) [K]."""
-        return self._resampled(self.pattern or np.zeros(len(self.noise)))
-
-    def _resampled(self, deviation: npt.ArrayLike) -> Array:
-        """Deviations (band, pixel) of what has one (band) before the bands were resampled."""
-        gain = np.ones((len(self.noise), self.signals.shape[2])) if self.gain is None else self.gain
-        return np.asarray(np.asarray(deviation)[:, np.newaxis] * gain)
 
     def blackbody(self, band: int, temperature: Array) -> Array:
         """Signal of a blackbody at a temperature [K] in a band, relative to the reference [K]."""
@@ -193,7 +178,7 @@ class Tile:
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         arrays: dict[str, Any] = {
             name: None if getattr(self, name) is None else select(getattr(self, name), selected)
-            for name in ("emissivity", "emissivity_covariance", "division", "gain")
+            for name in ("emissivity", "emissivity_covariance", "division")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = select(self.signals, selected)
@@ -379,14 +364,14 @@ def cut(
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
 
-    @cache
+    @cache  # and never read where all that is wanted of it is kept
     def load() -> tuple[xr.Dataset, list[Grain]]:
         loaded = block.load()
         return loaded, quality.grains(loaded, inputs.noise * slopes)
 
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
-        gain = None
+        gain = np.ones((2, places.size))
         if displacement is None:
             loaded, grains = load()
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
@@ -397,8 +382,7 @@ def cut(
             counts, usable = quality.bridge(counts, valid, time)
         else:
             counts, usable, valid, status, gain = displaced.paired(
-                *(block, inputs.noise * slopes, displacement, window[0], source, selected),
-                method.minimum_frames,
+                load, displacement, window[0], source, selected, method.minimum_frames
             )
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
@@ -407,21 +391,22 @@ def cut(
         tile = _tile(inputs, counts, time, window, segment, selected)
         needed = displacement is None or wanted is not None
         division = _unpacked(inputs.division[:, places], time.size)
-        tile = replace(tile, surveyed=needed, division=division, gain=gain)
+        tile = replace(tile, surveyed=needed, division=division)
         if material is not None:
             tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(places)
-        sections, step = [], status.size if displacement is None else most
+            tile.signals[1:] -= inputs.difference(window[0], selected)
+        sections = []
         for frames, pixels in sets:  # of which there may be many, each of few pixels
-            numbered = np.flatnonzero(pixels)
-            for start in range(0, numbered.size, step):
-                group = np.zeros_like(pixels)
-                group[numbered[start : start + step]] = True
-                whole = method.whole_image or np.all(group)
-                piece = tile if whole else tile.select_pixels(group)
-                piece = piece if np.all(frames) else piece.select_frames(frames)
-                sections.append((frames, group, piece))
+            whole = method.whole_image or np.all(pixels)
+            piece = tile if whole else tile.select_pixels(pixels)
+            sections.append(
+                (frames, pixels, piece if np.all(frames) else piece.select_frames(frames))
+            )
+        if displacement is not None:
+            sections = [
+                piece for section in sections for piece in of_one_noise(*section, gain, most)
+            ]
         yield Cut(window, places, status, valid, sections)
 
 
@@ -437,7 +422,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     window, time = (rows, slice(0, inputs.capture.sizes["x"])), inputs.capture["time"].values
     signals = _tile(inputs, counts, time, window, None, slice(None)).signals
     signals = signals if frames.all() else signals[:, frames]  # no copy: a row may be large
-    return signals, frames, pixels, gain
+    return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
 
 def _counts(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Bits, Array]:
@@ -446,14 +431,14 @@ def _counts(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Bits, Array]:
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
+    grains = quality.grains(block, inputs.noise * slopes)
     if displacement is None:
-        grains = quality.grains(block, inputs.noise * slopes)
         counts, valid, status = quality.read(block, fewest, grains)
         counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-        gain = np.ones((len(counts), status.size))
+        gain = np.ones((2, status.size))
     else:
         counts, usable, _, status, gain = displaced.paired(
-            block, inputs.noise * slopes, displacement, rows, source, slice(None), fewest
+            lambda: (block, grains), displacement, rows, source, slice(None), fewest
         )
     return counts, usable, status, gain
 
@@ -500,3 +485,27 @@ def _tile(
         emissivity=emissivity,
         emissivity_covariance=covariance,
     )
+
+
+def of_one_noise(
+    frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
+) -> Iterator[tuple[Mask, Mask, Tile]]:
+    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
+
+    A residual pattern is independent from pixel to pixel, and is scaled like the noise.
+    """
+    order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
+    for level in np.unique(order):
+        alike = np.flatnonzero(order == level)
+        for start in range(0, alike.size, most):
+            chosen = alike[start : start + most]
+            group = np.zeros_like(pixels)
+            group[np.flatnonzero(pixels)[chosen]] = True
+            factor = np.exp(np.log(gain[:, group]).mean(axis=1))
+            factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
+            single = replace(
+                tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist())
+            )
+            if tile.pattern is not None:
+                single = replace(single, pattern=tuple((factors * tile.pattern).tolist()))
+            yield frames, group, single

@@ -9,6 +9,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
@@ -20,7 +21,6 @@ from scipy.sparse import csr_array
 from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, select
-from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -35,11 +35,13 @@ _UNSOLVED: Final = 1e-2
 _OUTSIDE: Final = 0.2
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
+# Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
+# an image is high leaves most of them without a weight [1].
+_FEW: Final = 0.5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 # Memory of samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
-_BLOCK: Final = 128  # pixels that are resampled together
 
 
 T = TypeVar("T")
@@ -58,7 +60,7 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
-    read: dict[int, Any] = field(default_factory=dict)  # see `paired`, by the first row
+    read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
 
     def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
@@ -191,8 +193,7 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
 
 
 def paired(
-    block: xr.Dataset,
-    noise: Array,
+    load: Callable[[], tuple[xr.Dataset, list[samples.Grain]]],
     displacement: Displacement,
     rows: slice,
     source: slice,
@@ -201,36 +202,31 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    Of the rows of the source, and the noise (band) [count]. Kept are those of a small capture, of
-    the second camera alone where no sample is missing.
+    The source is read if they are not kept; only those of a small capture are.
     """
-    films, start = displacement.read, rows.start
-    reading = films.get(start)
-    if reading is None:
-        loaded = block.load()
-        grains = quality.grains(loaded, noise)
-        counts, valid, status, gain = read(loaded, displacement, rows, source, fewest, grains)
-        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-        complete = bool(valid.all())
-        needed = counts[displacement.others] if complete else counts
-        masks = (None, None) if complete else (usable, valid)
-        reading = needed.astype(np.float32), *masks, status, gain
-        if reading[0].nbytes <= (rows.stop - start) / displacement.shape[0] * _KEPT:
-            films[start] = reading
-    if not isinstance(selected, slice):
-        reading = tuple(None if film is None else select(film, selected) for film in reading)
-    kept, usable, valid, status, gain = reading
-    if valid is not None:
-        return kept.astype(np.float64), usable, valid, status.copy(), gain
-    # The first camera's samples are those of the capture.
-    within = slice(start - source.start, rows.stop - source.start)
-    first = block["counts"][displacement.reference, :, within].values
-    counts = np.empty((1 + len(kept), *kept.shape[1:]))
-    counts[displacement.reference] = first.reshape(len(first), -1)[:, selected]
-    counts[displacement.others] = kept
-    counts[:, :, quality.unusable(status)] = 0.0
-    whole = np.ones(counts.shape[1:], dtype=bool)
-    return counts, whole, whole, status.copy(), gain
+    films, key = displacement.read, (rows.start, rows.stop)
+    every, chosen = (
+        (*key, None),
+        (*key, None if isinstance(selected, slice) else selected.tobytes()),
+    )
+    if chosen not in films:
+        reading = films.get(every)
+        if reading is None:
+            block, grains = load()
+            counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
+            counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+            reading = counts, usable, valid, status, gain
+        share = (rows.stop - rows.start) / displacement.shape[0]
+        if chosen != every:
+            share, reading = 1.0, tuple(select(film, selected) for film in reading)
+        size, held = (
+            sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
+        )
+        if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
+            return reading
+        films[chosen] = reading
+    counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
+    return counts.copy(), usable, valid, status.copy(), gain
 
 
 def read(
@@ -245,7 +241,7 @@ def read(
     Read some rows of the reference band, and what the others show of the same reflections.
 
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
-    `quality.read`; and the noise (band, pixel) [1] over that of a sample, the reference first.
+    `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
@@ -253,16 +249,17 @@ def read(
         band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
     )
     weights = displacement.weights(rows, needed)
-    place = slice(needed.start - source.start, needed.stop - source.start)
+    used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
-    second = block.isel(band=second_bands, y=place)
+    second = block.isel(band=second_bands, **place)
     seen, measured, flags = quality.read(second, fewest, [grains[band] for band in second_bands])
     seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
-    bad = quality.unusable(flags)
-    weights = without(weights, bad, displacement.shape[1])
-    counts = np.repeat(counts, len(second_bands) + 1, axis=0)
+    bad = np.zeros(weights.shape[1], dtype=bool)
+    bad[used] = quality.unusable(flags)
+    weights = without(weights, bad, displacement.shape[1])[:, used]
+    counts = np.stack([counts[0]] * (len(second_bands) + 1))
     for band, signal in zip(second_bands, seen, strict=True):
-        resample(weights.indptr, weights.indices, weights.data, signal, counts[band])
+        counts[band] = (weights @ signal.T).T
     share = abs(weights)
     if not measured.all():  # a sample that was bridged does not count where its weight is small
         valid = valid & ((share @ ~usable.T).T <= 0.0)
@@ -280,33 +277,27 @@ def read(
             status[share @ holds > _NO_WEIGHT] |= np.uint32(bit)
     counts[:, :, quality.unusable(status)] = 0.0
     gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
-    if (
-        "noise_factor" in block
-        and np.any(block["noise_factor"][second_bands] < 1.0)
-        and not bad.all()
-    ):
+    good = ~quality.unusable(flags)
+    if "noise_factor" in block and np.any(block["noise_factor"][second_bands] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
         key = (rows.start, rows.stop, source.start, source.stop)
         gain *= displacement.once(
             key,
             lambda: samples.resampled_noise(
-                seen[:, :, ~bad], counts[second_bands], gain, displacement.shape[1]
+                seen[:, :, good], counts[second_bands], gain, displacement.shape[1]
             ),
         )
-    return counts, valid, status, np.stack([np.ones_like(gain), *[gain] * len(second_bands)])
+    return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 
-@compiled
-def resample(start: Any, places: Any, weights: Array, film: Array, result: Array) -> None:
-    """Film (time, pixel) at the rows of a sparse matrix of weights, in place."""
-    rows = len(start) - 1
-    for first in range(0, rows, _BLOCK):  # whose weights stay in the cache
-        for t in range(len(film)):
-            for row in range(first, min(first + _BLOCK, rows)):
-                value = 0.0
-                for entry in range(start[row], start[row + 1]):
-                    value += weights[entry] * film[t, places[entry]]
-                result[t, row] = value
+def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
+    """Pixels of some rows that have a weight, if few; and the places of those that are read."""
+    used, pixels = np.unique(weights.indices), weights.shape[1]
+    if used.size > _FEW * pixels:
+        return slice(None), {"y": rows}
+    y, x = np.divmod(used, pixels // (rows.stop - rows.start))
+    places = {"y": y + rows.start, "x": x}
+    return used, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
@@ -320,19 +311,13 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
     if rows.size == 0:
         return weights
     weights = weights.copy()
-    # Entries of these rows, of which there are up to so many, one beside another.
-    first, count = weights.indptr[rows], np.diff(weights.indptr)[rows]
-    entry = np.minimum(first[:, np.newaxis] + np.arange(count.max()), weights.nnz - 1)
-    used = np.arange(count.max()) < count[:, np.newaxis]
-    pixels, values = weights.indices[entry], np.where(used, weights.data[entry], 0.0)
-    off, size = used & bad[pixels], np.abs(values)
-    plane = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)], axis=1)
-    center = (plane[:, 1:] * size[:, np.newaxis]).sum(axis=2) / size.sum(axis=1, keepdims=True)
-    plane[:, 1:] -= center[..., np.newaxis]
-    # The smallest change of the others with the same sums over the plane.
-    others = np.where(used & ~off, 1.0, 0.0)[:, np.newaxis] * plane
-    lacking = plane @ np.where(off, values, 0.0)[..., np.newaxis]
-    change = others.mT @ (np.linalg.pinv(others @ others.mT, hermitian=True) @ lacking)
-    values = np.where(off, 0.0, values + change[..., 0])
-    weights.data[entry[used]] = values[used]
+    for row in rows:
+        entries = slice(weights.indptr[row], weights.indptr[row + 1])
+        pixels, values = weights.indices[entries], weights.data[entries]
+        plane = np.stack([np.ones(pixels.size), *np.divmod(pixels, width)])
+        plane[1:] -= plane[1:] @ np.abs(values)[:, np.newaxis] / np.abs(values).sum()
+        off = bad[pixels]
+        # The smallest change of the others with the same sums over the plane.
+        values[~off] += np.linalg.lstsq(plane[:, ~off], plane[:, off] @ values[off], rcond=None)[0]
+        values[off] = 0.0
     return weights

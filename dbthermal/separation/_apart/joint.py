@@ -125,8 +125,10 @@ class Joint:
     factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, pixels: Whole) -> Floats:
-        """Signals (band - 1, time, pixel) [K] of x(p) over x(r); 0 unknown."""
+    def difference(self, rows: slice, selected: slice | Whole) -> Floats:
+        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
+        width = self.inputs.capture.sizes["x"]
+        pixels = np.arange(rows.start * width, rows.stop * width)[selected]
         return self.at(slice(None), pixels)
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:

@@ -33,7 +33,7 @@ TAIL: Final = 3.0
 """Deviations of the blur beyond which it has no weight."""
 
 # Functions of the rapid changes, pixels that make them, and degree of the responses' polynomials.
-_PLANES, _SAMPLE = 96, 1024
+_PLANES, _SAMPLE = 128, 1024
 _DEGREE: Final = 7
 # Share of a neighbourhood without which a blurred pixel is none [1].
 _LEAST_SHARE: Final = 1e-3
@@ -167,12 +167,14 @@ def project(
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
-                    for band, changes in enumerate(inputs.difference(places)[:, frames], 1):
-                        straight[band][:, places] += inverse @ changes
+                    more = inputs.difference(cut.window[0], slice(None))[:, frames]
+                    index = np.searchsorted(cut.places, places)
+                    for band, changes in enumerate(more, 1):
+                        straight[band][:, places] += inverse @ changes[:, index]
                 _without_object(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = quick.T @ signal
-                noise[0][:, row, column] = tile.pixel_noise
+                noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
                 freedom[row, column] = np.sum(quick**2, dtype=np.float64)
                 usable[row, column] = True
         release()

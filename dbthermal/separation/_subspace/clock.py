@@ -26,7 +26,7 @@ def check(signals: Array, time: Array, noise: Array, segment: Whole | None) -> N
     axis is compared, pixel by pixel, by :math:`N \ln(E_{time} / E_{number})`. Where it is as large
     in both, the object does not change smoothly, or its changes are too small to tell.
     """
-    frames, white = time.size, pieces.plane(signals, noise[:, np.newaxis])[0]
+    frames, white = time.size, pieces.plane(signals, noise)[0]
     any_axis = np.full((2, white.shape[2]), np.nan)
     order = min(reflection_ratio.HIGHEST_ORDER, frames // 4)
     chi2 = []

@@ -245,12 +245,11 @@ def _separate(
     model: Model,
     signals: Array,
     places: Whole,
-    noises: Array,
     materials: Array,
     work: Work,
     solved: Solved,
 ) -> None:
-    """Steps of some pixels of a tile, whose noise and pattern are in the model for the time."""
+    """Steps of some pixels of a tile."""
     samples, outside, pixels = work.inside, work.outside, places.size
     block = len(samples)
     for start in range(0, pixels, block):
@@ -260,8 +259,6 @@ def _separate(
             place = np.uintp(together[p])
             for m in range(model.noise.size):
                 kernels.copy(samples[p, m], work.signals[m])
-            kernels.copy(noises[place, 0], model.noise)
-            kernels.copy(noises[place, 1], model.pattern)
             kernels.copy(materials[place], work.material)
             record, matrices = solved.record[place], solved.matrices[place]
             _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
@@ -375,8 +372,6 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
-    noises = np.stack([tile.pixel_noise, tile.pixel_pattern])
-    noises = np.ascontiguousarray(noises.transpose(2, 0, 1))
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
@@ -387,7 +382,7 @@ def solve(
         model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((of_part.orders, bands, bands))
-        _separate(model, signals, places, noises, materials, Work(**space), solved)
+        _separate(model, signals, places, materials, Work(**space), solved)
     named: dict[str, Any] = {
         name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
     }

@@ -264,6 +264,7 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
 
 def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
+    noise = np.array(tile.noise)
     solution = _solve(tile, functions, settings)
     used = solution.order + functions.steps
     asked = pieces.asked(
@@ -276,11 +277,10 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
         return result
     first = np.zeros((tile.time.size, suspect.size), dtype=bool)
     suspects, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    noise = suspects.pixel_noise
     white, axes = pieces.plane(suspects.signals, noise)
     axis = np.full((2, suspect.size), np.nan)
     if suspects.material is not None:
-        axis = np.einsum("abp,bp->ap", axes, suspects.material.ratio / noise)
+        axis = np.einsum("abp,bp->ap", axes, suspects.material.ratio / noise[:, np.newaxis])
         axis /= np.sqrt((axis**2).sum(axis=0))
     pooled = np.where(solution.pooled[suspect], axis, np.nan)
     energy, count = pieces.null_energy(white, functions, pooled)
@@ -323,12 +323,11 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
     surveyed = divided & tile.surveyed
     if tile.material is not None:  # one with its emissivity is not asked for a scatter
         surveyed &= np.isnan(tile.material.noise_variance)
-    noise = tile.pixel_noise[:, surveyed]
     if surveyed.any():
         straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
         parts = _parts(tile, first[:, surveyed], functions, number)
-        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, noise, parts))
+        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, tile.noise, parts))
     jumping = divided & pieces.sudden(
         estimate.object_temperature, _AS_GIVEN * estimate.object_temperature_std, tile.time
     )

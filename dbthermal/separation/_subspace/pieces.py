@@ -80,11 +80,11 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
 
 
 def outside(
-    signals: Array, noise: Array, divided: Iterable[tuple[Whole, smooth.Subspace]]
+    signals: Array, noise: tuple[float, ...], divided: Iterable[tuple[Whole, smooth.Subspace]]
 ) -> tuple[Array, Array]:
     """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
 
-    Of signals (pixel, band, time) [K], whitened by their noise (band, pixel) [K].
+    Of signals (pixel, band, time) [K], whitened.
     """
     pixels, bands, frames = signals.shape
     scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
@@ -92,7 +92,7 @@ def outside(
         columns = np.ascontiguousarray(of_part.functions.T)
         _outside(columns, of_part.spans, signals, places, np.empty((bands, len(columns))), scatter)
         freedom[places] = frames - len(columns)
-    whitened = scatter.transpose(1, 2, 0) / (noise * noise[:, np.newaxis])
+    whitened = scatter.transpose(1, 2, 0) / np.multiply.outer(noise, noise)[..., np.newaxis]
     return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
 
 
@@ -114,11 +114,10 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
     """
     Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
 
-    The noise is that of each pixel (band, pixel) [K]. Object and background change more than two
-    bands along two lines: of the whitened signals all but the noise lies in one plane, with axes
-    (2, band, pixel) [1]. Two bands are the plane.
+    Object and background change more than two bands along two lines: of the whitened signals all
+    but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
     """
-    white = signals / noise[:, np.newaxis]
+    white = signals / noise[:, np.newaxis, np.newaxis]
     if len(noise) == 2:
         return white, np.repeat(np.eye(2)[..., np.newaxis], signals.shape[2], axis=2)
     changes = white - white.mean(axis=1, keepdims=True)

@@ -37,8 +37,8 @@ class Model(NamedTuple):
     leverage: Array  # (order, time)
     steps: int
     stepless: bool  # no function has a step of the camera: both are the same
-    noise: Array  # of the pixel that is solved (band) [K]
-    pattern: Array  # the same (band) [K]
+    noise: Array  # (band) [K]
+    pattern: Array  # (band) [K]
     drift: float  # limit of the background's, over the square root of three [K]
     rates: Array  # change of the ratios of the responses' slopes with the background (band) [1/K]
     gray: Array  # ratios of the slopes at temperatures of the background (temperature, band) [1]
