@@ -42,9 +42,9 @@ class _Rows(BackendArray):
             (wanted,) = np.nonzero((rows >= block.start) & (rows < block.stop))
             if wanted.size:
                 first, last = rows[wanted].min(), rows[wanted].max()
-                left, right = (int(end(columns)) if columns.size else 0 for end in (np.min, np.max))
-                values = self._compute(slice(int(first), int(last) + 1), slice(left, right + 1))
-                for axis, index in enumerate((*leading, rows[wanted] - first, columns - left)):
+                low, high = (int(end(columns)) if columns.size else 0 for end in (np.min, np.max))
+                values = self._compute(slice(int(first), int(last) + 1), slice(low, high + 1))
+                for axis, index in enumerate((*leading, rows[wanted] - first, columns - low)):
                     values = values[(slice(None),) * axis + (_even(index),)]
                 result[..., _even(wanted), :] = values
                 release()
@@ -73,8 +73,8 @@ def windows(shape: tuple[int, ...], samples: int = 0) -> Iterator[tuple[slice, s
     column = int(np.prod(shape)) // max(1, shape[-2] * shape[-1])
     for rows in blocks(shape, samples):
         pixels = max(1, (samples or _BLOCK) // max(1, column * (rows.stop - rows.start)))
-        for left in range(0, shape[-1], pixels):
-            yield rows, slice(left, min(left + pixels, shape[-1]))
+        for start in range(0, shape[-1], pixels):
+            yield rows, slice(start, min(start + pixels, shape[-1]))
 
 
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:

@@ -33,7 +33,6 @@ from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
 from reproduction import figures as drawings
 from reproduction import metrics
-from reproduction.celsius import relative_error_celsius
 from reproduction.filters import rank_filters
 from reproduction.methods.dbvt import DbvtSettings
 from reproduction.reflection import reflected_change
@@ -309,7 +308,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "correlation": (lambda it: metrics.correlation(COUNTS, it), APPARENT, "time y x band"),
     "correlation mask": (lambda it: metrics.correlation(FIRST, SECOND, it), PIXELS, "y x"),
     "relative_error_celsius": (
-        lambda it: relative_error_celsius(OBJECT, it),
+        lambda it: metrics.relative_error_celsius(OBJECT, it),
         SCENE["object_temperature"],
         "time y x",
     ),

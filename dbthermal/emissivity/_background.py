@@ -32,7 +32,8 @@ class Colour:
         """Scales s (band, y, x) by what is found with others; 1 where nothing is known."""
         place = [*result["band"].values].index(result.attrs["reference_band"])
         value, g = result["emissivity"].values[place], self.ratio[:, np.newaxis, np.newaxis]
-        # Of the signals as they are: ratio, emissivity over the object in the null combination.
+        # With the ratio r = g kappa the null combination is u(x) (e_2 - r e_1) / (1 - r). The slope
+        # of z_1 over it is e_1 (1 - r) / (e_2 - r e_1), e_2 = 1 - (r / g) (1 - e_1): solve for e_1.
         ratio = result["reflection_ratio"].values * before
         slope = value / (before - ratio)
         first = slope * (1.0 - ratio / g) / (1.0 - slope * ratio * (1.0 / g - 1.0))
@@ -51,7 +52,7 @@ class Colour:
 def colour_of(
     stated: xr.Dataset | Sequence[float], bands: list[str], reference: int, *level: Any
 ) -> Colour:
-    """Colour that is stated, over the reference band; TypeError or ValueError if it is none."""
+    """Colour of a stated ratio, relative to the reference band; else a TypeError or ValueError."""
     if isinstance(stated, xr.Dataset):
         names = ("background_ratio", "background_ratio_std")
         if lacking := [name for name in names if name not in stated]:

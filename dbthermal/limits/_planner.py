@@ -15,7 +15,7 @@ from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, sm
 _NO_FILTER: Final = "none"  # entry of a material whose temperature no filter determines
 _TIME_CONSTANT: Final = 1.0 / 3.0  # of the object's warming, as a share of the capture
 SKY_LEVEL: Final = 273.15  # of what is mirrored outdoors, at rest [K]
-SKY: Final = {"8-14": 1.0, "8.5": 1.22, "9.5": 1.48, "10.6": 1.37, "12.1": 0.62}
+SKY: Final = {"8-14": 1.0, "8.5": 1.22, "9.5": 1.47, "10.6": 1.34, "12.1": 0.64}
 """Changes of a band over those in 8-14 um as clouds pass, of measured spectra [1]_.
 
 .. [1] Atmospheric Radiation Measurement user facility, interferometer's radiances, notebook 15
@@ -154,16 +154,15 @@ def plan(
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
     # Best filter of each material, if it says more than the range of temperatures.
-    uniform, total = float(np.ptp(temperatures)) / np.sqrt(12.0), result["object_temperature_std"]
+    uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
+    total = result["object_temperature_std"].values
     if outdoors:
         contrast = np.sqrt(np.mean((temperatures[0] - temperatures[1]) ** 2))
         errors = [contrast * _sky(emissivity[it], std[it], [names[b] for b in it]) for it in sets]
         attrs = {"units": "K", "long_name": "error by a sky that is taken for gray"}
         result["sky_error"] = ("material", "filter"), np.stack(errors, axis=1), attrs
-        total = xr.DataArray(np.hypot(total, result["sky_error"]))
-    best = [
-        labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER for row in total.values
-    ]
+        total = np.hypot(total, result["sky_error"].values)
+    best = [labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER for row in total]
     return result.assign(
         best=("material", best, {"long_name": "filter of the smallest object deviation"}),
         noise=("band", std, {"units": "K", "long_name": "noise-equivalent temperature difference"}),

@@ -92,14 +92,14 @@ def _variable(
     kind, whole = struct.unpack_from(f"{order}II", head)
     if kind != _MATRIX:
         raise ValueError(f"Kind {kind} of a packed variable. Must be {_MATRIX}.")
-    parts = _parts(head, order)
-    flags = struct.unpack_from(f"{order}I", head, next(parts)[1])[0]
+    elements = _elements(head, order)
+    flags = struct.unpack_from(f"{order}I", head, next(elements)[1])[0]
     if (form := _CLASSES.get(flags & 0xFF)) is None or flags & _COMPLEX:
         return None
-    (_, place, length), (_, start, letters) = next(parts), next(parts)
+    (_, place, length), (_, start, letters) = next(elements), next(elements)
     shape = struct.unpack_from(f"{order}{length // 4}i", head, place)[::-1]
     name = head[start : start + letters].decode()
-    kind, begin, length = next(parts)
+    kind, begin, length = next(elements)
     stored = np.dtype(order + _STORED[kind])
     if length != stored.itemsize * math.prod(shape) or begin + length > 8 + whole:
         rule = f"Must be {stored.itemsize} x {shape}, within its {whole}"
@@ -109,8 +109,8 @@ def _variable(
     )
 
 
-def _parts(head: bytes, order: str) -> Iterator[tuple[int, int, int]]:
-    """Yield kind, place and length of the parts of a variable; small ones lie in their tag."""
+def _elements(head: bytes, order: str) -> Iterator[tuple[int, int, int]]:
+    """Yield kind, place and length of the elements of a variable; small ones lie in their tag."""
     at = 8
     while True:
         kind, length = struct.unpack_from(f"{order}II", head, at)

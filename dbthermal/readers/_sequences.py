@@ -80,9 +80,9 @@ def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
         rule = f"Must be {frames} frames of {rows} x {columns}, or be read by readers.raw"
         raise ValueError(f"Truncated or damaged: {label}. {rule} with header=.")
     counts = np.memmap(path, "<u2", "r", start, (frames, rows, columns))
-    beside = path.with_suffix(".inc")
-    is_short = beside.is_file() and beside.stat().st_size <= _LONGEST
-    rate = float(_lines(beside.read_bytes()).get("FRate_0", 0.0)) if is_short else 0.0
+    notes = path.with_suffix(".inc")
+    is_short = notes.is_file() and notes.stat().st_size <= _LONGEST
+    rate = float(_lines(notes.read_bytes()).get("FRate_0", 0.0)) if is_short else 0.0
     return recordings.film(counts), np.arange(frames) / rate if rate > 0.0 else None
 
 

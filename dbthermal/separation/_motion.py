@@ -96,13 +96,14 @@ def _add_equations(
     weights = weights.reshape(len(signals), -1)
     used = pixels & (weights[0] != 0.0)
     basis = smooth_functions(inputs, frames)
-    # Gradients of the image, which changes slowly.
+    # Gradients of the image, which changes slowly; a side of one pixel shows no motion.
     shape = (_SLOW, len(films), rows.stop - rows.start, result.sizes["x"])
     images = np.einsum("tj,btp->jbp", basis[:, :_SLOW], signals).reshape(shape)
     whole = pixels.reshape(shape[2:])
     for image in images.reshape(-1, *images.shape[2:]):
         image[:] = without_gaps(image, whole)
-    slopes = np.stack(np.gradient(images, axis=(2, 3)), axis=2)
+    sides = [np.gradient(images, axis=it) if shape[it] > 1 else 0.0 * images for it in (2, 3)]
+    slopes = np.stack(sides, axis=2)
     slopes = slopes.reshape(_SLOW, len(signals), 2, -1) * weights[:, np.newaxis]
     slopes = slopes[..., used].reshape(_SLOW * 2 * len(signals), -1)
     noise = inputs.noise[inputs.bands, np.newaxis] * gain

@@ -59,9 +59,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     """Separate captures of any size from disk to disk, by blocks of rows, by several processes.
 
     Each block of rows, or of columns of a row that does not fit in the memory, is separated as by
-    `solve` and written by one process. A run that was killed
-    goes on where it stopped, to the same bytes; a target that the same run has made is left as it
-    is. A capture is recognised by its store's checksums; one in memory or lazy by its values.
+    `solve` and written by one process. A run that was killed goes on where it stopped, to the same
+    bytes; a target that the same run has made is left as it is. A capture is recognised by its
+    store's checksums; one in memory or lazy by its values.
 
     Parameters
     ----------
@@ -210,18 +210,18 @@ def _separate_capture(
     plan = replace(plan, response=response, height=height, provenance=made)
     plan = plan if width == capture.sizes["x"] else replace(plan, width=width)
     _begin(folder, {"height": height, "width": width, **made})
-    image, lefts = capture.sizes["y"], range(0, capture.sizes["x"], width)
+    image, starts = capture.sizes["y"], range(0, capture.sizes["x"], width)
     paths = {
-        top: {left: folder / f"{top:06d}-{left:06d}.zarr" for left in lefts}
+        top: {start: folder / f"{top:06d}-{start:06d}.zarr" for start in starts}
         for top in range(0, image, height)
     }
     # Separate the blocks that are missing, those of one reading together.
     with ThreadPoolExecutor(threads) as pool:
         missing = list[Future[None]]()
-        for top, left in product(range(0, image, read), lefts):
-            pixels = {"y": slice(top, min(top + read, image)), "x": slice(left, left + width)}
+        for top, start in product(range(0, image, read), starts):
+            pixels = {"y": slice(top, min(top + read, image)), "x": slice(start, start + width)}
             blocks = range(top, pixels["y"].stop, height)
-            places = {row - top: paths[row][left] for row in blocks}
+            places = {row - top: paths[row][start] for row in blocks}
             places = {row: path for row, path in places.items() if not path.exists()}
             if places:
                 block = source if isinstance(source, Path) else capture.isel(pixels)
@@ -237,7 +237,7 @@ def _separate_capture(
             for job in missing:
                 job.cancel()
     rows = [columns[0] for columns in paths.values()]
-    if len(lefts) > 1:
+    if len(starts) > 1:
         rows = [folder / f"{top:06d}.zarr" for top in paths]
         for columns, whole in zip(paths.values(), rows, strict=True):
             store.join_parts(columns.values(), whole, "x")
@@ -364,9 +364,9 @@ def _content(
     rows, width = read
     heights = capture["counts"].chunksizes.get("y") or [rows] * math.ceil(capture.sizes["y"] / rows)
     blocks = [
-        every.isel(y=slice(end - height, end), x=slice(left, left + width))
+        every.isel(y=slice(end - height, end), x=slice(start, start + width))
         for end, height in zip(accumulate(heights), heights, strict=True)
-        for left in range(0, capture.sizes["x"], width)
+        for start in range(0, capture.sizes["x"], width)
     ]
     in_memory = all(array.variable._in_memory for array in capture.values())
     digests = map(_row_digests, blocks) if in_memory else executor.map(_row_digests, blocks)

@@ -212,7 +212,7 @@ def _measured(measured: "Measured") -> int:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured, and by what."""
+    """Separated capture, with the inputs, materials and shift that it was separated with."""
 
     result: xr.Dataset
     inputs: Inputs

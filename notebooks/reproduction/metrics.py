@@ -7,12 +7,13 @@ average over the pixels that happened to work would flatter the method.
 
 import numpy as np
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import schema
 from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 
-__all__ = ["correlation"]
+__all__ = ["correlation", "relative_error_celsius"]
 __dir__ = __all__.copy
 
 
@@ -54,6 +55,43 @@ def correlation(
     result = first.isel(y=0, x=0, drop=True).copy(data=np.sum(signal * partner, axis=-1) / norm)
     attrs = {"long_name": "correlation of the maps", "units": "1"}
     return result.drop_attrs(deep=False).rename("correlation").assign_attrs(attrs)
+
+
+def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
+    r"""Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
+
+    .. math:: 100 \, |\hat T - T| / (T - 273.15)
+
+    The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
+    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled.
+
+    Parameters
+    ----------
+    estimate, truth : DataArray
+        Temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError.
+        The result is NaN where the estimate is.
+
+    Examples
+    --------
+    Half a kelvin at 25 degrees Celsius:
+
+    >>> import xarray as xr
+    >>> truth = xr.DataArray(298.15)
+    >>> round(float(relative_error_celsius(truth + 0.5, truth)), 6)  # [percent]
+    2.0
+    """
+    schema.check_numbers(estimate, "the estimate", "K")
+    schema.check_numbers(truth, "the truth", "K")
+    _require_dims(truth, estimate)
+    bad = ~(truth.values > zero_Celsius)
+    if np.any(bad):
+        rule = f"Must be above {zero_Celsius} K, the zero of degrees Celsius"
+        raise ValueError(f"Invalid true temperature {truth.values[bad].flat[0]} K. {rule}.")
+    truth = laid_on(truth, estimate, "the truth", "the estimate")
+    result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
+    label = "error relative to the true temperature in degrees Celsius"
+    bare: xr.DataArray = result.drop_attrs(deep=False).rename("relative_error")
+    return bare.assign_attrs(long_name=label, units="percent")
 
 
 def _require_dims(reference: xr.DataArray, values: xr.DataArray) -> None:

@@ -14,7 +14,6 @@ from attack.scenes import pick
 from dbthermal import calibration, correction, emissivity, limits, separation, simulation
 from dbthermal import response as responses
 from reproduction import metrics
-from reproduction.celsius import relative_error_celsius
 from reproduction.contact import contact_measurements
 from reproduction.filters import condition_numbers, rank_filters
 from reproduction.reflection import reflected_change
@@ -89,7 +88,7 @@ def _steps() -> Mapping[str, Step]:
         Step(rank_filters, {"table": table, "noise": netd}),
         Step(_band_table, {"spectrum": spectrum}),
         Step(metrics.correlation, plain, "first"),
-        Step(relative_error_celsius, errors, "estimate"),
+        Step(metrics.relative_error_celsius, errors, "estimate"),
     ]
     return {step.call.__name__: step for step in steps}
 

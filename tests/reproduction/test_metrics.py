@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reproduction import metrics
-from reproduction.celsius import relative_error_celsius
 
 KELVIN = {"units": "K"}
 
@@ -50,7 +49,7 @@ def test_correlation_ignores_gain_and_offset(gain: float, offset: float) -> None
 def test_relative_error_is_of_degrees_celsius() -> None:
     """At 50 degrees Celsius an error of 1 K is 2 per cent, and the label says of what."""
     truth = xr.DataArray([323.15], dims="time", attrs=KELVIN)
-    result = relative_error_celsius(truth - 1.0, truth)
+    result = metrics.relative_error_celsius(truth - 1.0, truth)
     np.testing.assert_allclose(result.values, [2.0], rtol=0, atol=1e-12)
     assert result.attrs["units"] == "percent"
     assert "degrees Celsius" in result.attrs["long_name"]
@@ -66,7 +65,7 @@ def test_relative_error_needs_kelvin_above_zero(
     """Temperatures in degrees Celsius, or at or below 273.15 K, raise a ValueError."""
     truth = xr.DataArray([temperature], dims="time", attrs={"units": units})
     with pytest.raises(ValueError, match=re.escape(message)):
-        relative_error_celsius(truth, truth)
+        metrics.relative_error_celsius(truth, truth)
 
 
 Change = Callable[[xr.DataArray], tuple[xr.DataArray, ...]]
@@ -99,7 +98,7 @@ def test_what_has_no_correlation_is_refused(
 def test_other_dims_are_refused(truth: xr.DataArray) -> None:
     """A curve in time is broadcast; a dim that the other array lacks raises a ValueError."""
     curve = truth.isel(y=0, x=0, drop=True)
-    assert relative_error_celsius(truth, curve).dims == truth.dims
+    assert metrics.relative_error_celsius(truth, curve).dims == truth.dims
     for estimate, reference in ((truth.rename(x="column"), truth), (curve, truth)):
         with pytest.raises(ValueError, match=r"Invalid dims .* Must be among"):
-            relative_error_celsius(estimate, reference)
+            metrics.relative_error_celsius(estimate, reference)

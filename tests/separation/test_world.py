@@ -128,3 +128,11 @@ def test_lost_frames_and_dead_pixels_spoil_nothing(name: str) -> None:
     error = (result["object_temperature"].values - truth)[:, sound]
     assert np.sqrt(np.nanmean(error**2)) <= MOST_RMSE * outcome(name, 2)[2]
     assert any(WORLDS[name][1] in line for line in result.attrs.get("warnings", [""]))
+
+
+def test_a_shaking_image_of_33_rows_is_separated() -> None:
+    """The last row is read by itself, and shows no motion across it."""
+    capture, _ = seen(WORLDS["cameras shake"][0], 1)
+    with pytest.warns(UserWarning, match="image moved"):
+        result = separation.separate(capture.isel(y=slice(0, 33)), RESPONSE)
+    assert np.isfinite(result["object_temperature"].values).any(axis=0).all()

@@ -11,10 +11,10 @@ from dbthermal import alignment, calibration, emissivity, separation, simulation
 from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import methods, twins
-from reproduction.celsius import relative_error_celsius
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.experiments.scores import held, rmse
+from reproduction.metrics import relative_error_celsius
 from reproduction.twins.views import Registration
 
 BEAD: Final = 3
