@@ -35,6 +35,7 @@ class World:
     blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
     roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
     shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
+    drift: Pair = (0.0, 0.0)  # of the cameras' pointing along the rows, over the capture [pixel]
     detail: float = 0.0  # of the emissivity [1]
     fabric: Pair | None = None  # emissivities of every second person [1]
     flicker: float = 0.0  # corner frequency of 1/f noise of each pixel [Hz]
@@ -120,6 +121,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     # What it mirrors, and what is behind it.
     before, beyond = list(people(rng, world, 6)), list(people(rng, world, 4))
     motion = paths(rng, world.shake)
+    motion[..., 1] += np.outer(world.drift, time / time[-1] - 0.5)
     times = np.stack([time, (time + world.lag) * (1.0 + world.fast)])
     if world.jitter:
         times = times + world.jitter * np.random.default_rng([seed, 1]).standard_normal(times.shape)

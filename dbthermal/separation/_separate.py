@@ -186,7 +186,11 @@ def _mended(
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
-        if steady is None or retry is None or retry[1].size > _BETTER * misfit.size:
+        if steady is None or retry is None:
+            break
+        # Of rapid motion less is left; slow motion is in the object, which is to stay measured.
+        fails = _measured(retry[0]) < _KEPT * _measured(measured)
+        if retry[1].size > _BETTER * misfit.size if steady.rapid else fails:
             break
         capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
         outcome = measured, misfit = retry

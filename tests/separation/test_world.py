@@ -22,7 +22,10 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "lenses blur alike": (World(blur=(0.9, 0.9)), "", ""),
     "lenses blur unlike": (World(blur=(0.5, 1.3)), "not equally sharp", "lenses blur alike"),
     "cameras shake": (World(shake=(0.3, 0.3), detail=DETAIL), "image moved", "fine detail"),
+    "pointing drifts": (World(drift=(0.0, 1.0)), "image moved", "plain"),
     "1/f noise": (World(flicker=0.5), "", ""),
+    "first camera drifts": (World(drift=(1.0, 0.0), detail=DETAIL), "image moved", "fine detail"),
+    "cameras drift": (World(drift=(1.0, 1.0), detail=DETAIL), "image moved", "fine detail"),
     "fabrics": (World(fabric=(0.92, 0.80)), "", ""),
     "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
@@ -40,7 +43,7 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "clocks apart": (World(fast=5e-4), "", ""),
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
-QUICK = list(WORLDS)[:7]
+QUICK = list(WORLDS)[:8]
 CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
 LEAST, FEW, MOST_RMSE = 0.9, 0.05, 1.3
 # By situation and seed: what is not reached.
