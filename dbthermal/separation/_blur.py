@@ -22,6 +22,7 @@ from scipy.ndimage import (
     uniform_filter,
 )
 
+from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, empty, quotient, release
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import object_weights, reflected, smooth_functions
@@ -45,6 +46,7 @@ _MOVING: Final = 1.0  # variance of the changes over that of noise
 _SURE, _LEAST, _HINT = 6.0, 0.1, 3.0
 _MOST: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
 _BLOCKS: Final = 8  # of rows that tell it
+_LEADING: Final = 64  # functions of time that hold most of the rapid changes of some rows
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     every = [rows for rows in inputs.blocks if rows.stop - rows.start >= _FEWEST]
     if result.sizes["x"] < _FEWEST or not every:
         return 0.0
-    hint = _equations(inputs, result, place, excess, every[len(every) // 2])
+    hint = _equations(inputs, result, place, excess, every[len(every) // 2], _LEADING)
     if hint[0] ** 2 < _HINT**2 * hint[2]:
         return 0.0
     for turn in range(_ROUNDS):
@@ -173,9 +175,17 @@ def _details(image: Array, deviation: float) -> Array:
 
 
 def _equations(
-    inputs: Inputs, result: xr.Dataset, place: int, excess: float, rows: slice
+    inputs: Inputs,
+    result: xr.Dataset,
+    place: int,
+    excess: float,
+    rows: slice,
+    leading: int | None = None,
 ) -> tuple[float, float, float]:
-    """Normal equation of c over some rows, for bands that are blurred by an excess before."""
+    """Normal equation of c over some rows, for bands that are blurred by an excess before.
+
+    Of all rapid changes, or of a leading number of functions of time that hold most of them.
+    """
     _, films, frames, pixels, gain = reflected(inputs, result, rows)
     shape = (rows.stop - rows.start, result.sizes["x"])
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
@@ -188,6 +198,11 @@ def _equations(
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
     blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
     basis = smooth_functions(inputs, frames)
+    if leading is not None:
+        changes = films[0][:, pixels]
+        changes = smooth.leading((changes - basis @ (basis.T @ changes)).T, leading)
+        films = np.einsum("tr,btp->brp", changes, films, optimize=True)
+        basis = np.zeros((len(films[0]), 0))
 
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
