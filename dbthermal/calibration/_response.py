@@ -161,7 +161,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     # Keep the measured counts with the residuals of both fits.
     result["counts"] = (("band", "temperature"), values, {"units": "count"})
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
-        fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
+        fitted = [it.counts(temperature) for it in responses.curves(result, names, kind)]
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
     celsius = ", ".join(f"{kelvin - zero_Celsius:.2f}" for kelvin in temperature)
     stated = f"standard deviation of a reading {temperature_std:g} K"

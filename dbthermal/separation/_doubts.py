@@ -41,9 +41,9 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     factors = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
     stds = np.hypot(noises * factors, patterns)
-    for name, film, std in zip(names, counts, stds, strict=True):
+    curves = responses.curves(response, names)
+    for name, curve, film, std in zip(names, curves, counts, stds, strict=True):
         every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
-        curve = responses.curve(response, name)
         low, high = curve.counts([curve.lowest, curve.highest])
         margin = RANGE_SIGMAS * std
         outside = (every < low - margin) | (every > high + margin)
@@ -73,7 +73,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     if not seen.any():  # too few pixels tell it
         return []
     names, sentences = [str(name) for name in counts["band"].values], list[str]()
-    slopes = np.array([[responses.curve(response, name).reference_slope] for name in names])
+    slopes = np.array([[it.reference_slope] for it in responses.curves(response, names)])
     with np.errstate(invalid="ignore"):
         changes = np.where(valid, np.diff(films, axis=1), np.nan)  # [count]
     # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.

@@ -45,8 +45,9 @@ def mean_signals(
     means, frames, change = np.empty(shape), np.empty(shape), np.empty(shape[1:])
     third = max(counts.sizes["time"] // 3, 1)
     thirds = slice(third), slice(third, -third), slice(-third, None)
-    for index, band in enumerate(bands):
-        curve = responses.curve(response, str(counts["band"].values[band]))
+    names = [str(counts["band"].values[band]) for band in bands]
+    curves = responses.curves(response, names)
+    for index, (band, curve) in enumerate(zip(bands, curves, strict=True)):
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
             block = counts.isel(band=band, y=rows).values

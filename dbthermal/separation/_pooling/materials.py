@@ -271,7 +271,7 @@ def _checked(
 def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
     """Numbers of the bands from the quietest, which is the reference, and their noise [K]."""
     names = [str(name) for name in result["band"].values]
-    slopes = [responses.curve(response, name).reference_slope for name in names]
+    slopes = [it.reference_slope for it in responses.curves(response, names)]
     noise = result["noise"].values / slopes
     bands = [int(band) for band in np.argsort(noise, kind="stable")]
     return bands, noise[bands]
