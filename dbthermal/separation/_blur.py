@@ -203,6 +203,8 @@ def _equations(
         changes = smooth.leading((changes - basis @ (basis.T @ changes)).T, leading)
         films = np.einsum("tr,btp->brp", changes, films, optimize=True)
         basis = np.zeros((len(films[0]), 0))
+    if not films.size:  # without a pixel
+        return 0.0, 0.0, 0.0
 
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)

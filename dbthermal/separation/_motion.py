@@ -6,25 +6,23 @@ gradient of its mean:
 .. math:: r(t) = \sum_b w_b \, s_b(t) \cdot \nabla \bar z_b
 
 Rapid motion is told by what is left of the combination beside the object, frame by frame: least
-squares over all pixels, with a prior for s, as cameras on one support move alike. Slow motion is
-told by the object, which takes it up: its change in time, in details of the image, along these
-gradients. That an object changes where its own temperature or the signals have details, or where
-the temperature has a gradient, as before a front of heat, is no motion.
+squares over all pixels, with a prior for s, as cameras on one support move alike. Slow motion the
+object takes up; where only one band's image moves, its reflections h move against those of the
+first band, beside a delay of the clocks:
+
+.. math:: h_b / k_b - h_1 = s_b(t) \cdot \nabla h_1 + \tau(t) \, \partial_t h_1
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_erosion
 from scipy.ndimage import shift as shifted
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, Mask, empty, quotient, release
-from dbthermal.noise import MAD
+from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
@@ -35,14 +33,10 @@ _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the band
 # eight scenes at random, and a shake of 0.2 pixel shows 27 or more.
 _SURE, _FURTHER = 10.0, 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
-_LEAST: Final = 0.1  # motion that matters, root mean square [pixel]; two depths feign 0.06
+_LEAST: Final = 0.1  # motion of a band that matters, root mean square [pixel]
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
-# Of slow motion, of which pixels at one place feign up to 9, and a drift by one pixel shows 80 or
-# more: polynomials of the time, and spans whose means tell them; a band's motion by itself [pixel].
-_DEGREES, _SPANS, _ALONE = 6, 24, 1.0
-_DETAIL, _SIDE = 3.0, 2  # of an image: deviation of what is around [pixel], pixels left out
-_WINDOWS: Final = 4  # along a side of the image, for a jackknife
-_OUTLIER, _ROUNDS = 1.5, 4  # deviations, and rounds of weights
+# Of slow motion: polynomials of the time, windows along a side of the image, and frames, about.
+_DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
 
 
 @dataclass(frozen=True)
@@ -78,7 +72,7 @@ def stabilise(
     rapid = bool(np.any(steps))
     steps += _slow(inputs, result)
     motion = np.asarray(steps if before is None else steps + before)
-    if not np.any(steps) or np.sqrt(np.mean(motion**2)) < _LEAST:
+    if not np.any(steps) or np.sqrt(np.mean(motion**2, axis=(1, 2)).max()) < _LEAST:
         return None
     counts, good = empty(shape, np.float32), good_pixels(inputs)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
@@ -90,10 +84,10 @@ def stabilise(
     return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion, rapid)
 
 
-def _precision(count: int, apart: float, unit: float = 1.0) -> Array:
-    """Inverse covariance of the motion (band, axis) of so many bands, by its prior, in a unit."""
-    prior = _COMMON**2 * np.ones((count, count)) + apart**2 * np.eye(count)
-    return np.kron(np.linalg.inv(prior * unit**2), np.eye(2))
+def _precision(count: int) -> Array:
+    """Inverse covariance of the motion (band, axis) of so many bands, by its prior."""
+    prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
+    return np.kron(np.linalg.inv(prior), np.eye(2))
 
 
 def _rapid(inputs: Inputs, result: xr.Dataset, least: float) -> Array:
@@ -111,98 +105,69 @@ def _rapid(inputs: Inputs, result: xr.Dataset, least: float) -> Array:
     square = np.sum(quotient(pull**2, level * seen, 0.0), axis=0) / np.maximum(seen.sum(axis=0), 1)
     if not np.any(square > least):
         return np.zeros((count, frames, 2))
-    steps = np.linalg.solve(form + _precision(count, _APART), forces[..., np.newaxis])
+    steps = np.linalg.solve(form + _precision(count), forces[..., np.newaxis])
     return np.swapaxes(steps.reshape(-1, count, 2), 0, 1)[np.argsort(inputs.bands)]
 
 
 def _slow(inputs: Inputs, result: xr.Dataset) -> Array:
-    """Motion (band, time, axis) [pixel] that the object has taken up; zero without any."""
-    bands, time = inputs.bands, result["time"].values.astype(np.float64)
-    none, sound = np.zeros((len(bands), time.size, 2)), result["status"].values == 0
-    if min(sound.shape) < 2 * _WINDOWS:
-        return none
-    # The object and each band along polynomials of the time.
-    basis = smooth.polynomial_basis(time, _DEGREES + 1)
-    film, curves = result["object_temperature"].values, [inputs.curves[band] for band in bands]
-    courses = [_course(film, basis, curves[0].signal)]
-    for band, curve in zip(bands, curves, strict=True):
-        courses.append(_course(inputs.capture["counts"].values[band], basis, curve.linearise))
-    maps = np.stack(courses)
-    sound &= np.isfinite(maps).all(axis=(0, 1))
-    places = np.nonzero(np.pad(sound[_SIDE:-_SIDE, _SIDE:-_SIDE], _SIDE))
-    # Details of what an object may change by, and of what motion of each band changes in it.
-    images = np.stack([without_gaps(image, sound) for image in maps[:, 0] * basis[0, 0]])
-    slopes = np.array([np.gradient(image) for image in images])
-    beside = _details(np.concatenate([images, slopes[0]]), sound, places)
-    if places[0].size < 4 * _WINDOWS**2 * len(beside):
-        return none
-    row, column = (
-        place * _WINDOWS // side for place, side in zip(places, sound.shape, strict=True)
-    )
-    window, form, force = row * _WINDOWS + column, np.zeros(1), np.zeros(1)
-    weights = np.nan_to_num(object_weights(inputs, result)[bands])
-    shares = [weights, *np.eye(len(bands))[..., np.newaxis, np.newaxis]]
-    for share, course in zip(shares, maps, strict=True):
-        moving = (share[:, np.newaxis] * slopes[1:]).reshape(-1, *sound.shape)
-        moving, changes = (_details(part, sound, places) for part in (moving, course[1:]))
-        terms = _equations(moving, beside, changes, window)
-        form, force = form + terms[0], force + terms[1]
-    # Solve with the prior, and without each window of the image in turn: a jackknife.
-    prior = _precision(len(bands), _ALONE, np.sqrt(time.size / _DEGREES))
-    steps = np.linalg.solve(form.sum(axis=0) + prior, force.sum(axis=0))[..., 0]
-    less = np.linalg.solve(form.sum(axis=0) - form + prior, force.sum(axis=0) - force)[..., 0]
-    variance = np.var(less, axis=0) * (len(less) - 1)
-    if not np.any(np.mean(quotient(steps**2, variance, 0.0), axis=0) > _SURE):
-        return none
-    motion = (basis[:, 1:] @ steps).reshape(time.size, len(bands), 2)
-    return np.swapaxes(motion, 0, 1)[np.argsort(bands)]
+    """Motion (band, time, axis) [pixel] of the bands against the first one; zero without any."""
+    time = result["time"].values.astype(np.float64)
+    motion = np.zeros((len(inputs.bands), time.size, 2))
+    # Of cameras apart parallax that changes as people come and go is like motion.
+    if inputs.displacement is not None or min(result["status"].shape) < 2 * _WINDOWS:
+        return motion
+    course = smooth.polynomial_basis(time, _DEGREES + 1) * np.sqrt(time.size)
+    blocks = [rows for rows in inputs.blocks if rows.stop - rows.start > 1]
+    blocks = blocks[:: max(1, len(blocks) // _WINDOWS)]
+    for place, band in enumerate(inputs.bands[1:], 1):
+        parts = [_displaced(inputs, result, place, rows, course) for rows in blocks]
+        form, force = (np.concatenate(part) for part in zip(*parts, strict=True))
+        # A delay, which feigns motion of what walks by, is that of clocks: it hardly changes.
+        wanted = np.ones((_DEGREES + 1, 3), dtype=bool)
+        wanted[2:, 2] = False
+        form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
+        # Solve with a prior, and without each window of the image in turn: a jackknife.
+        whole = form.sum(axis=0) + np.eye(form.shape[1]) / _COMMON**2
+        steps = np.linalg.solve(whole, force.sum(axis=0))
+        less = np.linalg.solve(whole - form, (force.sum(axis=0) - force)[..., np.newaxis])[..., 0]
+        variance = np.var(less, axis=0) * (len(less) - 1)
+        # What does not change in time is no motion.
+        score, path = np.zeros((2, *wanted.shape))
+        score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps
+        if np.any(score[1:, :2].mean(axis=0) > _SURE):
+            motion[band] = course[:, 1:] @ path[1:, :2]
+    return motion
 
 
-def _course(film: Any, basis: Array, signal: Callable[[Array], Array]) -> Array:
-    """Signal (number, y, x) [K] of a film (time, y, x) along polynomials (time, number)."""
-    spans = np.array_split(np.arange(len(basis)), min(_SPANS, len(basis) // 2))
-    means = np.empty((len(spans), *film.shape[1:]))
-    for mean, span in zip(means, spans, strict=True):
-        counted = np.isfinite(film[span]).sum(axis=0)
-        total = np.nansum(film[span], axis=0, dtype=np.float64)
-        mean[:] = signal(quotient(total, counted + 0.0 * total, np.nan))
-        release()
-    design = np.stack([basis[span].mean(axis=0) for span in spans])
-    return np.asarray(np.tensordot(np.linalg.pinv(design), means, 1))
-
-
-def _equations(
-    slopes: Array, beside: Array, changes: Array, window: npt.NDArray[np.intp]
+def _displaced(
+    inputs: Inputs, result: xr.Dataset, place: int, rows: slice, course: Array
 ) -> tuple[Array, Array]:
-    """Normal equations by window of changes (function, pixel) along slopes (cause, pixel).
+    """Normal equations (window, ...) of a band's motion and delay along functions of time.
 
-    Without outliers, and without what an object may change by `beside` (cause, pixel).
+    Of windows of some rows; what does not change rapidly has no part in them.
     """
-    causes, weight = np.concatenate([slopes, beside]), np.ones(window.size)
-    for _ in range(_ROUNDS):
-        inverse = np.linalg.pinv((causes * weight) @ causes.T)
-        left = changes - (changes * weight) @ causes.T @ inverse @ causes
-        scale = MAD * np.median(np.abs(left), axis=1)
-        far = np.sqrt(np.mean((left / scale[:, np.newaxis]) ** 2, axis=0))
-        weight = _OUTLIER / np.maximum(far, _OUTLIER)
-    # Less what an object may change by; neighbours share what is left.
-    inverse = np.linalg.pinv((beside * weight) @ beside.T)
-    slopes, changes = (
-        values - (values * weight) @ beside.T @ inverse @ beside for values in (slopes, changes)
+    _, films, frames, pixels, _ = reflected(inputs, result, rows)
+    ratio = result["reflection_ratio"].values[inputs.bands[place], rows].astype(np.float64)
+    used = binary_erosion(pixels.reshape(ratio.shape) & (ratio > 0.0), border_value=1)
+    basis = smooth_functions(inputs, frames)
+    first, second = (
+        (film - basis @ (basis.T @ film)).reshape(-1, *ratio.shape) for film in films[[0, place]]
     )
-    parts = [weight * (window == number) for number in np.unique(window)]
-    form = np.stack([(slopes * part) @ slopes.T for part in parts])[:, np.newaxis]
-    force = np.stack([(changes * part) @ slopes.T for part in parts])
-    variance = (_DETAIL * scale[:, np.newaxis]) ** 2
-    return form / variance[..., np.newaxis], (force / variance)[..., np.newaxis]
-
-
-def _details(maps: Array, sound: Mask, places: tuple[Any, ...]) -> Array:
-    """Maps (map, y, x) less their means around, at some places (map, pixel) of sound pixels."""
-    filled = np.where(sound, maps, 0.0)
-    weight = gaussian_filter(1.0 * sound, _DETAIL)
-    around = quotient(gaussian_filter(filled, (0, _DETAIL, _DETAIL)), weight + 0.0 * maps, 0.0)
-    return np.asarray((filled - around)[:, *places])
+    slopes = np.stack([*np.gradient(first, axis=(1, 2)), np.gradient(first, axis=0)])
+    noise = inputs.noise[inputs.bands] ** 2
+    every = slice(None, None, max(1, len(first) // _FRAMES))
+    course, forms, forces = course[frames][every], list[Array](), list[Array]()
+    for columns in np.array_split(np.arange(ratio.shape[1]), _WINDOWS):
+        y, x = np.nonzero(used[:, columns])
+        at = y, columns[x]
+        slope, left = slopes[:, every, *at], (second[every, *at] / ratio[at] - first[every, *at])
+        weighted = slope / (noise[0] + noise[place] / ratio[at] ** 2)
+        form = np.einsum("atp,btp->tab", weighted, slope, optimize=True)
+        force = np.einsum("atp,tp->ta", weighted, left)
+        forms.append(np.einsum("tj,tk,tab->jakb", course, course, form, optimize=True))
+        forces.append(np.einsum("tj,ta->ja", course, force))
+    size = course.shape[1] * 3
+    return np.reshape(forms, (-1, size, size)), np.reshape(forces, (-1, size))
 
 
 def _add_equations(
