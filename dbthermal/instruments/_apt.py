@@ -14,8 +14,9 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 
 import struct
 from collections.abc import Collection
+from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 # Addresses: computer, a rack's own board (a BSC20x counts as a rack), the first of its ten bays,
 # and a controller that is not a rack.
@@ -27,7 +28,6 @@ CONTROLLERS: Final = frozenset({RACK, *range(BAY_1, BAY_1 + 10), UNIT})
 
 YES: Final = 1
 NO: Final = 2
-
 _SHORT = struct.Struct("<HBBBB")
 _LONG = struct.Struct("<HHBB")
 _HEADER = _SHORT.size
@@ -39,44 +39,43 @@ _IDENTIFIERS = 0x1000  # all documented identifiers of controllers are below
 class Id(IntEnum):
     """Messages that a filter wheel needs, and that a controller may send, by the maker's names.
 
-    `lengths` are those that the data of a message can have [byte], 0 without data. After
-    ``SET`` comes the number of the request of the same parameters, then that of its reply.
+    After ``SET`` comes the number of the request of the same parameters, then that of its reply.
     """
 
-    lengths: tuple[int, ...]
-
-    def __new__(cls, value: int, *lengths: int) -> Self:
-        """Make an identifier from its number and its lengths."""
-        member = int.__new__(cls, value)
-        member._value_, member.lengths = value, lengths or (0,)
-        return member
-
     HW_REQ_INFO = 0x0005
-    HW_GET_INFO = 0x0006, 84
+    HW_GET_INFO = 0x0006
     HW_STOP_UPDATEMSGS = 0x0012  # nothing starts them: some BSC then stop answering after 5 s
     HW_NO_FLASH_PROGRAMMING = 0x0018  # first of all messages
     HW_RESPONSE = 0x0080
-    HW_RICHRESPONSE = 0x0081, 68
+    HW_RICHRESPONSE = 0x0081
     MOD_SET_CHANENABLESTATE = 0x0210
     MOD_REQ_CHANENABLESTATE = 0x0211
     MOD_GET_CHANENABLESTATE = 0x0212
-    MOT_SET_VELPARAMS = 0x0413, 14
+    MOT_SET_VELPARAMS = 0x0413
     MOT_REQ_VELPARAMS = 0x0414
-    MOT_GET_VELPARAMS = 0x0415, 14
-    MOT_SET_HOMEPARAMS = 0x0440, 14
+    MOT_GET_VELPARAMS = 0x0415
+    MOT_SET_HOMEPARAMS = 0x0440
     MOT_REQ_HOMEPARAMS = 0x0441
-    MOT_GET_HOMEPARAMS = 0x0442, 14
+    MOT_GET_HOMEPARAMS = 0x0442
     MOT_MOVE_HOME = 0x0443
     MOT_MOVE_HOMED = 0x0444
-    MOT_MOVE_ABSOLUTE = 0x0453, 0, 6
-    MOT_MOVE_COMPLETED = 0x0464, 0, 14
+    MOT_MOVE_ABSOLUTE = 0x0453
+    MOT_MOVE_COMPLETED = 0x0464
     MOT_MOVE_STOP = 0x0465  # value 1 at once, 2 by a ramp
-    MOT_MOVE_STOPPED = 0x0466, 0, 14
+    MOT_MOVE_STOPPED = 0x0466
     MOT_REQ_STATUSUPDATE = 0x0480
-    MOT_GET_STATUSUPDATE = 0x0481, 14, 28
+    MOT_GET_STATUSUPDATE = 0x0481
 
 
-_LENGTHS = {int(identifier): identifier.lengths for identifier in Id}
+# Lengths that the data of a message can have [byte].
+LENGTHS: Final[dict[int, tuple[int, ...]]] = {
+    **dict.fromkeys(Id, (0,)),
+    **dict.fromkeys((Id.MOT_SET_VELPARAMS, Id.MOT_GET_VELPARAMS), (14,)),
+    **dict.fromkeys((Id.MOT_SET_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS), (14,)),
+    **dict.fromkeys((Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED), (0, 14)),
+    **{Id.HW_GET_INFO: (84,), Id.HW_RICHRESPONSE: (68,)},
+    **{Id.MOT_MOVE_ABSOLUTE: (0, 6), Id.MOT_GET_STATUSUPDATE: (14, 28)},
+}
 
 
 class StatusBits(IntFlag):
@@ -101,10 +100,10 @@ class Message(NamedTuple):
     """A message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
 
     id: int
-    param1: int
-    param2: int
-    destination: int
-    source: int
+    param1: int = 0  # mostly the channel
+    param2: int = 0
+    destination: int = HOST
+    source: int = HOST
     data: bytes = b""
 
 
@@ -185,8 +184,12 @@ def parse(kind: type[Record], message: Message) -> Record:
 
 def pack(record: tuple[Any, ...]) -> bytes:
     """Data of a message; ValueError if a number does not fit its field."""
+    return _packed(_LAYOUTS[type(record)], record, *record)
+
+
+def _packed(layout: struct.Struct, record: tuple[Any, ...], *values: Any) -> bytes:
     try:
-        return _LAYOUTS[type(record)].pack(*record)
+        return layout.pack(*values)
     except struct.error as error:
         raise ValueError(f"Invalid {record}. Its fields must hold it: {error}.") from error
 
@@ -199,38 +202,26 @@ def text(raw: bytes) -> str:
 def encode(message: Message) -> bytes:
     """Bytes of a message to send; with data in the long form, which has no parameters.
 
-    ValueError if a number is not whole, or does not fit its field, or the data are too long.
+    A controller silently ignores messages to another destination than its own; a channel is 1 in
+    every bay of a rack. ValueError if a number is not whole, or does not fit its field, or the data
+    are too long, or have a length that messages of this `Id` never have.
     """
-    size = len(message.data)
+    size, lengths = len(message.data), LENGTHS.get(message.id)
+    if lengths is not None and size not in lengths:
+        name = Id(message.id).name
+        raise ValueError(f"Invalid data of {size} bytes of {name}. Must be one of {lengths}.")
     if size > _LONGEST or message.destination & _HAS_DATA:
         rule = f"Must have at most {_LONGEST} bytes of data, and a destination below {_HAS_DATA}"
         raise ValueError(f"Invalid {message}. {rule}.")
     if size and (message.param1 or message.param2):
         raise ValueError(f"Invalid {message} with data. Its parameters must be 0.")
-    try:
-        if not size:
-            return _SHORT.pack(*message[:-1])
-        destination = message.destination | _HAS_DATA
-        return _LONG.pack(message.id, size, destination, message.source) + message.data
-    except struct.error as error:
-        raise ValueError(f"Invalid {message}. Its fields must hold it: {error}.") from error
+    if not size:
+        return _packed(_SHORT, message, *message[:-1])
+    destination = message.destination | _HAS_DATA
+    return _packed(_LONG, message, message.id, size, destination, message.source) + message.data
 
 
-def command(
-    identifier: Id, channel: int = 0, value: int = 0, *, data: bytes = b"", destination: int
-) -> bytes:
-    """Bytes of a message from the computer to a controller.
-
-    Short, it has the `channel` from 1, which in a rack is 1 in every bay, and a `value`; long, the
-    `data` of a record. A controller silently ignores messages to another `destination`. ValueError
-    if a number does not fit its field, or the data have no such length.
-    """
-    if len(data) not in identifier.lengths:
-        rule = f"Must be one of {identifier.lengths}"
-        raise ValueError(f"Invalid data of {len(data)} bytes of {identifier.name}. {rule}.")
-    return encode(Message(identifier, channel, value, destination, HOST, data))
-
-
+@dataclass
 class Decoder:
     """Finds the messages in a stream of bytes, however it is cut into pieces.
 
@@ -247,14 +238,10 @@ class Decoder:
     ('MOT_MOVE_HOMED', 1)
     """
 
-    def __init__(
-        self,
-        destinations: Collection[int] = CONTROLLERS | {HOST},
-        sources: Collection[int] = CONTROLLERS | {HOST},
-    ) -> None:
-        self.dropped = 0
-        self.pending = bytearray()  # may begin a message whose end has not come
-        self._destinations, self._sources = frozenset(destinations), frozenset(sources)
+    destinations: Collection[int] = CONTROLLERS | {HOST}
+    sources: Collection[int] = CONTROLLERS | {HOST}
+    dropped: int = field(default=0, init=False)
+    pending: bytearray = field(default_factory=bytearray, init=False)  # beginning of a message
 
     def feed(self, received: bytes) -> list[Message]:
         """Messages that the next bytes of the stream complete.
@@ -293,10 +280,10 @@ class Decoder:
         # The long form is marked in the destination.
         is_long = bool(destination & _HAS_DATA)
         length = length if is_long else 0
-        lengths = _LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())
+        lengths = LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())
         possible = (
-            destination & ~_HAS_DATA in self._destinations
-            and source in self._sources
+            destination & ~_HAS_DATA in self.destinations
+            and source in self.sources
             and length in lengths
             and bool(length) == is_long
         )

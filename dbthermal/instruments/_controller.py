@@ -2,7 +2,7 @@
 
 A controller that is addressed wrongly says nothing: its address is searched for. APT has no
 sequence numbers, and a controller reports the end of a move at any time: the next message is not
-always the reply. So messages are told apart by identifier, source and channel.
+always the reply. So messages are identified by identifier, source and channel.
 """
 
 import logging
@@ -24,8 +24,6 @@ ATTEMPTS: Final = 2  # number of times that a request is sent before its reply c
 MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
 
 _READ_SIZE = 256  # largest number of bytes that are read at once
-_EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
-_NOTICES = (Id.HW_RESPONSE, Id.HW_RICHRESPONSE)
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -38,7 +36,10 @@ class NoReplyError(WheelError, TimeoutError):
 
 
 class Controller:
-    """Requests to a controller and its replies, with what it reports by itself."""
+    """Requests to a controller and its replies, with what it reports by itself.
+
+    The reply to a request has the next number, see `Id`.
+    """
 
     def __init__(self, transport: Transport) -> None:
         self.unit, self.motor = SEARCHED[0]
@@ -46,32 +47,18 @@ class Controller:
         self._transport, self._clock = transport, transport.clock
         # A recorder asks for the position in one thread while another turns the wheel.
         self._lock = threading.Lock()
-        self._events: list[Message] = []
+        self._ended: set[tuple[int, int]] = set()  # identifier and source of ends of a motion
         self._notices: list[str] = []  # a sentence each
-
-    def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
-        """Send a message without a reply to the motor."""
-        message = apt.command(identifier, channel, value, data=data, destination=self.motor)
-        self._transport.write(message)
-
-    def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
-        """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
-        with self._clock.hold(self._lock):
-            self._collect()
-        self._events.clear()
-        self.check()
-        self.send(identifier, channel, data=data)
 
     def connect(self) -> apt.Info:
         """Find the address of the controller, and return its identity."""
         for self.unit, self.motor in SEARCHED:
             for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
-                self._transport.write(apt.command(identifier, destination=self.unit))
+                self._transport.write(apt.encode(Message(identifier, destination=self.unit)))
             try:
-                reply = self._exchange(Id.HW_REQ_INFO, Id.HW_GET_INFO, self.unit, 0, attempts=1)
+                reply = self.request(Id.HW_REQ_INFO, self.unit, 0, attempts=1)
             except NoReplyError:
                 continue
-            # Whatever it said of the greeting is forgotten.
             self._collect()
             self._notices.clear()  # it need not know all messages of the greeting
             return apt.parse(apt.Info, reply)
@@ -83,17 +70,22 @@ class Controller:
         tried = ", ".join(f"0x{unit:02X}" for unit, _ in SEARCHED)
         raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
 
-    def request(self, identifier: Id, reply: Id) -> Message:
-        """Reply of the motor to a request; NoReplyError without a reply.
+    def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
+        """Send a message without a reply to the motor."""
+        message = Message(identifier, channel, value, self.motor, apt.HOST, data)
+        self._transport.write(apt.encode(message))
 
-        Only requests are repeated, never what moves the wheel. A late reply may be taken for that
-        of the repetition, and is older than it seems, but replies stay in order.
-        """
-        return self._exchange(identifier, reply, self.motor, CHANNEL, attempts=ATTEMPTS)
+    def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
+        """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
+        with self._clock.hold(self._lock):
+            self._collect()
+        self._ended.clear()
+        self.check()
+        self.send(identifier, channel, data=data)
 
     def has_reported(self, identifier: Id) -> bool:
         """True if the motor reported this since the last start of a motion."""
-        return (identifier, self.motor) in {(event.id, event.source) for event in self._events}
+        return (identifier, self.motor) in self._ended
 
     def check(self) -> None:
         """WheelError with the text of the errors that the controller reported by itself."""
@@ -102,35 +94,40 @@ class Controller:
             self._notices.clear()
             raise WheelError(f"The controller is not well.{reported}")
 
-    def _exchange(
-        self, identifier: Id, reply: Id, source: int, channel: int, attempts: int
+    def request(
+        self,
+        identifier: Id,
+        unit: int | None = None,
+        channel: int = CHANNEL,
+        *,
+        attempts: int = ATTEMPTS,
     ) -> Message:
-        """Reply to a request; what came before the request is not its reply."""
-        request = apt.command(identifier, channel, destination=source)
+        """Reply to a request, of the motor by default, of any channel if 0; or NoReplyError.
+
+        Only requests are repeated, never what moves the wheel. What came before is not the reply; a
+        late one may be taken for that of the repetition, and is older than it seems, but replies
+        stay in order.
+        """
+        unit, reply = unit or self.motor, Id(identifier + 1)
+        request = apt.encode(Message(identifier, channel, 0, unit))
         with self._clock.hold(self._lock):
             for _ in range(attempts):
                 self._collect()
                 self._transport.write(request)
-                if (message := self._wait(reply, source, channel)) is not None:
-                    return message
+                deadline = self._clock() + REPLY_TIMEOUT
+                while (remaining := deadline - self._clock()) > 0:
+                    if not (received := self._transport.read(_READ_SIZE, remaining)):
+                        break
+                    for message in reversed(self._replies(received)):
+                        data = message.data
+                        about = int.from_bytes(data[:2], "little") if data else message.param1
+                        if (message.id, message.source) == (reply, unit) and channel in {0, about}:
+                            return message
                 self.decoder.discard()  # half a message whose rest did not come in time
         raise NoReplyError(
-            f"No answer {reply.name} from address 0x{source:02X} in {REPLY_TIMEOUT} s. "
+            f"No answer {reply.name} from address 0x{unit:02X} in {REPLY_TIMEOUT} s. "
             f"The controller must be on and in no other program's use.{''.join(self._notices)}"
         )
-
-    def _wait(self, reply: Id, source: int, channel: int) -> Message | None:
-        """Read until the reply comes, of a channel unless 0; None if it does not in time."""
-        deadline = self._clock() + REPLY_TIMEOUT
-        while (remaining := deadline - self._clock()) > 0:
-            if not (received := self._transport.read(_READ_SIZE, remaining)):
-                return None
-            for message in reversed(self._replies(received)):
-                data = message.data
-                about = int.from_bytes(data[:2], "little") if data else message.param1
-                if (message.id, message.source) == (reply, source) and channel in {0, about}:
-                    return message
-        return None
 
     def _collect(self) -> None:
         """Take in all bytes that have come so far."""
@@ -143,17 +140,17 @@ class Controller:
                 raise WheelError(f"{came}. Must be an APT controller.")
 
     def _replies(self, received: bytes) -> list[Message]:
-        """Messages that may be replies; events and notices are kept."""
+        """Messages that may be replies; ends of a motion and notices are kept."""
         replies = []
         for message in self.decoder.feed(received):
-            if message.id in _EVENTS:
-                self._events.append(message)
-            elif message.id in _NOTICES:
-                error = apt.parse(apt.Notice, message) if message.data else apt.Notice()
-                about = f"error {error.code} of message 0x{error.id:04X}"
-                notice = f" It reported {about}: {apt.text(error.notes)}."
-                _LOGGER.warning("Controller of the filter wheel:%s", notice)
-                self._notices.append(notice)
-            else:
-                replies.append(message)
+            match message.id:
+                case Id.MOT_MOVE_COMPLETED | Id.MOT_MOVE_STOPPED | Id.MOT_MOVE_HOMED:
+                    self._ended.add((message.id, message.source))
+                case Id.HW_RESPONSE | Id.HW_RICHRESPONSE:
+                    error = apt.parse(apt.Notice, message) if message.data else apt.Notice()
+                    about = f"error {error.code} of message 0x{error.id:04X}"
+                    self._notices.append(f" It reported {about}: {apt.text(error.notes)}.")
+                    _LOGGER.warning("Controller of the filter wheel:%s", self._notices[-1])
+                case _:
+                    replies.append(message)
         return replies

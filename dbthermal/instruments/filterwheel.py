@@ -27,21 +27,12 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments._controller import (
-    CHANNEL,
-    Controller,
-    NoReplyError,
-    WheelError,
-)
+from dbthermal.instruments._controller import CHANNEL, Controller, NoReplyError, WheelError
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = [
-    "FilterWheel",
-    "NoReplyError",
-    "NotHomedError",
-    "Settings",
-    "StalledWheelError",
+    *("FilterWheel", "NoReplyError", "NotHomedError", "Settings", "StalledWheelError"),
     "WheelError",
 ]
 __dir__ = __all__.copy
@@ -180,8 +171,7 @@ class FilterWheel(Closing):
 
     def status(self) -> apt.Status:
         """Position [count] and state of the motor."""
-        request = Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE
-        return apt.parse(apt.Status, self._controller.request(*request))
+        return apt.parse(apt.Status, self._controller.request(Id.MOT_REQ_STATUSUPDATE))
 
     def home(self) -> None:
         """Search for the home switch, from which all places count; the speeds are set before.
@@ -271,7 +261,7 @@ class FilterWheel(Closing):
         speeds = apt.Speeds(CHANNEL, 0, acceleration, round(settings.velocity * speed))
         self._set("", Id.MOT_SET_VELPARAMS, speeds)
         # The speed of homing, and direction and switch where the settings have them.
-        before = apt.parse(apt.Home, request(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS))
+        before = apt.parse(apt.Home, request(Id.MOT_REQ_HOMEPARAMS))
         home = before._replace(
             direction=settings.home_direction or before.direction,
             limit_switch=settings.home_limit_switch or before.limit_switch,
@@ -280,7 +270,7 @@ class FilterWheel(Closing):
         self._set("home ", Id.MOT_SET_HOMEPARAMS, home)
         # The motor's current.
         self._controller.send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
-        state = request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE).param2
+        state = request(Id.MOD_REQ_CHANENABLESTATE).param2
         if state not in {apt.YES, apt.NO}:
             raise WheelError(f"Unknown state {state} of the motor. Must be 1 or 2.")
         if state == apt.NO:
@@ -290,8 +280,7 @@ class FilterWheel(Closing):
     def _set(self, prefix: str, identifier: Id, wanted: apt.Speeds | apt.Home) -> None:
         """Set a record of numbers, and read it back; WheelError if the controller has others."""
         self._controller.send(identifier, data=apt.pack(wanted))
-        reply = self._controller.request(Id(identifier + 1), Id(identifier + 2))
-        actual = apt.parse(type(wanted), reply)
+        actual = apt.parse(type(wanted), self._controller.request(Id(identifier + 1)))
         for name in reversed(wanted._fields):
             value, expected = getattr(actual, name), getattr(wanted, name)
             is_used = name != "minimum"  # the controllers ignore this speed
