@@ -73,8 +73,10 @@ LENGTHS: Final[dict[int, tuple[int, ...]]] = {
     **dict.fromkeys((Id.MOT_SET_VELPARAMS, Id.MOT_GET_VELPARAMS), (14,)),
     **dict.fromkeys((Id.MOT_SET_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS), (14,)),
     **dict.fromkeys((Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED), (0, 14)),
-    **{Id.HW_GET_INFO: (84,), Id.HW_RICHRESPONSE: (68,)},
-    **{Id.MOT_MOVE_ABSOLUTE: (0, 6), Id.MOT_GET_STATUSUPDATE: (14, 28)},
+    Id.HW_GET_INFO: (84,),
+    Id.HW_RICHRESPONSE: (68,),
+    Id.MOT_MOVE_ABSOLUTE: (0, 6),
+    Id.MOT_GET_STATUSUPDATE: (14, 28),
 }
 
 

@@ -161,10 +161,10 @@ class Boson(Closing):
 
     Examples
     --------
-    >>> from dbthermal.instruments.emulated import World, camera
+    >>> from dbthermal.instruments.emulated import World, devices
     >>> bench = World()
     >>> state = bench.add_camera("8-14", 93588)
-    >>> with Boson(camera.EmulatedBoson(bench, "8-14")) as port:
+    >>> with Boson(devices.EmulatedBoson(bench, "8-14")) as port:
     ...     port.fpa_temperature(), port.identity()["is_simulated"]  # K
     (308.15, True)
     """

@@ -172,7 +172,7 @@ def open_devices(
     if session.simulated and world is None:
         world = _emulated().emulated_world(session, waits=True)
         if pictures is None:
-            pictures = _emulated(".camera").blackbody_pictures(session, world)
+            pictures = _emulated().blackbody_pictures(session, world)
     if not session.simulated and (world is not None or pictures):
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
@@ -187,7 +187,7 @@ def open_devices(
             else:
                 beam = None if band == session.filtered else band
                 view = world, band, pictures or {}, beam, *form
-                source = _emulated(".camera").EmulatedCamera(*view, kind=camera.kind)
+                source = _emulated().EmulatedCamera(*view, kind=camera.kind)
             sources[band] = stack.enter_context(source)
             if camera.control is not None and kind.control is not None:
                 line = _line(world, camera.kind, camera.control, band, baudrate=kind.baudrate)

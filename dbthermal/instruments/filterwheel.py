@@ -32,7 +32,11 @@ from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = [
-    *("FilterWheel", "NoReplyError", "NotHomedError", "Settings", "StalledWheelError"),
+    "FilterWheel",
+    "NoReplyError",
+    "NotHomedError",
+    "Settings",
+    "StalledWheelError",
     "WheelError",
 ]
 __dir__ = __all__.copy

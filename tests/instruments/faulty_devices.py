@@ -19,8 +19,13 @@ from dbthermal.instruments._apt import Id, StatusBits
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
+from dbthermal.instruments.emulated.devices import (
+    Drive,
+    EmulatedApt,
+    EmulatedBoson,
+    EmulatedTC08,
+    Numbers,
+)
 from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
@@ -89,7 +94,9 @@ class FaultyApt(EmulatedApt):
     def turn_to(self, position: int) -> None:
         """Begin a move to a place [count] without the driver."""
         data = apt.pack(apt.Position(1, position))
-        self.receive(apt.command(Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
+        self.receive(
+            apt.encode(apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data))
+        )
 
     def obey(self, message: apt.Message) -> None:
         """Carry out a message, or ignore it by a fault."""
@@ -133,7 +140,7 @@ class FaultyApt(EmulatedApt):
         if self.faults.noise:
             self._replies.append(self.faults.noise)
         if self.faults.stray_completed:
-            super().reply(Id.MOT_MOVE_COMPLETED, param1=1)
+            super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
 
     def report(self, identifier: Id) -> None:

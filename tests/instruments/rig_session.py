@@ -11,8 +11,7 @@ import numpy as np
 
 from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.emulated import World, emulated_world
-from dbthermal.instruments.emulated.camera import Picture
+from dbthermal.instruments.emulated import Picture, World, emulated_world
 from dbthermal.instruments.recording import Limits
 from dbthermal.instruments.session import Session
 

@@ -24,7 +24,7 @@ from dbthermal.instruments.boson import (
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.clock import SYSTEM
 from dbthermal.instruments.emulated import FFC_DURATION, World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
+from dbthermal.instruments.emulated.devices import EmulatedBoson
 from dbthermal.instruments.transport import TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and

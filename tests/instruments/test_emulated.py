@@ -10,9 +10,7 @@ from faulty_camera import frames
 from faulty_devices import Clock
 
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated import camera as emulated
-from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
+from dbthermal.instruments.emulated import CLOSED, EmulatedCamera, Picture, World
 
 SHAPE, RATE = (8, 80), 10.0
 
@@ -42,7 +40,7 @@ def test_wheel_changes_what_is_seen() -> None:
     for position in (2, None, 3):
         behind.world.wheel_position = position
         counts += shown(behind)
-    assert counts == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
+    assert counts == [2000, 3001, CLOSED, CLOSED]
 
 
 def test_telemetry_says_what_the_camera_is_about() -> None:
