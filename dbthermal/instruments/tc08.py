@@ -139,7 +139,9 @@ class TC08(Closing):
 
     def __init__(self, library: Library) -> None:
         self._library = library
-        self.clock: Clock = getattr(library, "clock", SYSTEM)  # an emulated library has its own
+        # The vendor's library has neither of these attributes.
+        self.is_simulated = bool(getattr(library, "is_simulated", False))
+        self.clock: Clock = getattr(library, "clock", SYSTEM)
         self.channels: Mapping[int, str] = {}  # place of the tip by channel
         self._handle = 0
         self._lock = threading.Lock()
@@ -154,11 +156,6 @@ class TC08(Closing):
         """
         parse(url, "tc08")
         return cls(load()).open()
-
-    @property
-    def is_simulated(self) -> bool:
-        """True if the library is an emulated one; the vendor's has no such attribute."""
-        return bool(getattr(self._library, "is_simulated", False))
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
         """Open the first free unit, within `timeout` [s].

@@ -103,31 +103,24 @@ class SerialTransport(Closing):
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
-        with self._named("write to"):
+        with self.named("write to"):
             self._port.write(data)
 
     def read(self, size: int, timeout: float) -> bytes:
         """Wait for bytes, at most `timeout` [s]; see `Transport.read`."""
-        with self._named("read from"):
+        with self.named("read from"):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
             waiting = min(size - 1, self._port.in_waiting) if first else 0
             return first + (self._port.read(waiting) if waiting else b"")
 
-    def pulse_rts(self) -> None:
-        """Take the line RTS down and up again."""
-        with self._named("set RTS of"):
-            self._port.rts = False
-            self.clock.sleep(SETTLING)
-            self._port.rts = True
-
     def close(self) -> None:
         """Release the port."""
-        with self._named("close"):
+        with self.named("close"):
             self._port.close()
 
     @contextmanager
-    def _named(self, action: str) -> Iterator[None]:
+    def named(self, action: str) -> Iterator[None]:
         """Name port and action in the errors of pyserial, which are OSError."""
         try:
             yield
@@ -158,6 +151,9 @@ def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTrans
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:
-            line.pulse_rts()
+            with line.named("set RTS of"):
+                port.rts = False
+                line.clock.sleep(SETTLING)
+                port.rts = True
         stack.pop_all()
     return line
