@@ -77,15 +77,11 @@ class FaultyApt(EmulatedApt):
         if model.startswith(("BSC10", "KDC")):
             self.model, self.unit, self.address = BSC10X, apt.UNIT, apt.UNIT
         self.info = self.info._replace(model=model.encode())
-        self.slot_offset, self.plugged = slot_offset, True
+        self.slot_offset = slot_offset
         super().__init__(world)
         self.faults = WheelFaults()
         self.received: list[apt.Message] = []
         self._waiting: list[tuple[float, bytes]] = []
-
-    def is_plugged(self) -> bool:
-        """False once it was pulled out."""
-        return self.plugged
 
     def sent(self, name: str) -> list[bytes]:
         """Data of the messages of a name that a driver has sent."""
@@ -213,7 +209,7 @@ class FaultyBoson(EmulatedBoson):
         """Time until a reply is due [s]; infinite without a request."""
         if not self._inbox:
             return math.inf
-        return self.camera.ffc_until - self.world.time if self.stalls else 0.0
+        return self.camera.ffc_until - self.clock() if self.stalls else 0.0
 
 
 @dataclass

@@ -7,8 +7,8 @@ descriptions; real devices may do more than these say.
 The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
 camera's emulator starts a flat-field correction, and its frames freeze; a program sets
 `World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
-Temperatures are in kelvin, times in seconds since the world began, on its clock; the scene has a
-time of its own, so that a recording can begin with it.
+Temperatures are in kelvin, times in seconds on the world's clock; the scene has a time of its own,
+so that a recording can begin with it.
 
 A picture is a function of the scene's time that gives the counts of a band, noise and response
 included. The camera adds a frame rate, a clock, buffers that overflow if no program reads, a
@@ -70,7 +70,7 @@ class CameraState:
 
 
 class World:
-    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
+    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s].
 
     Its clock is an `EmulatedClock`, or `dbthermal.instruments.clock.SYSTEM` for real time.
     `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
@@ -97,24 +97,17 @@ class World:
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
         self.blackbody_temperature = blackbody_temperature
-        self.epoch = self.clock()
-        self.scene_began = math.inf if waits else self.epoch
+        self.scene_began = math.inf if waits else self.clock()
         self._scene = scene
         self.wheel_position: int | None = wheel_position
-
-    @property
-    def time(self) -> float:
-        """Time since the world began [s]."""
-        return self.clock() - self.epoch
 
     def begin(self) -> None:
         """Let the scene begin now, or anew."""
         self.scene_began = self.clock()
 
     def scene_time(self, time: float | None = None) -> float:
-        """Time since the scene began [s], 0 before; at a time since the world began, or now."""
-        now = self.time if time is None else time
-        return max(0.0, self.epoch + now - self.scene_began)
+        """Time since the scene began [s], 0 before; at a time on the clock, or now."""
+        return max(0.0, (self.clock() if time is None else time) - self.scene_began)
 
     @property
     def filter_name(self) -> str | None:
@@ -165,13 +158,13 @@ class World:
         with self.lock:
             state = self.camera(name)
             state.ffc_count += 1
-            state.ffc_until = self.time + duration
+            state.ffc_until = self.clock() + duration
             state.last_ffc_frame = state.frame_count
             state.last_ffc_temperature = state.fpa_temperature
 
     def ffc_in_progress(self, name: str) -> bool:
         """True while a camera's shutter is closed for a correction."""
-        return self.time < self.camera(name).ffc_until
+        return self.clock() < self.camera(name).ffc_until
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
@@ -214,10 +207,9 @@ class EmulatedCamera(Closing):
             "model": MODELS[self.kind][0],
             "serial_number": str(self._state.serial_number),
         }
-        self._number = 0
-        self._start: float | None = None
+        self._number, self._start, self._open = 0, math.nan, True
+        self._corrected = self.clock()  # end of the last correction, or power-on
         self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
-        self._open = True
 
     def close(self) -> None:
         """Give no more frames; a second call does nothing."""
@@ -225,11 +217,11 @@ class EmulatedCamera(Closing):
 
     def read(self, timeout: float = camera.FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame; see `camera.FrameSource.read`."""
-        if self._start is None:
-            self._start = self.world.time + self._state.phase / self.frame_rate
-        self._number = self.next_number(self._number, self.world.time - self._start)
+        if math.isnan(self._start):
+            self._start = self.clock() + self._state.phase / self.frame_rate
+        self._number = self.next_number(self._number, self.clock() - self._start)
         due = self._start + self._number / self.frame_rate
-        wait = due - self.world.time
+        wait = due - self.clock()
         if wait > timeout:
             self.clock.sleep(timeout)
             raise camera.NoFrameError(
@@ -251,10 +243,11 @@ class EmulatedCamera(Closing):
         return latest if latest - number >= BUFFERS else number
 
     def frame(self, number: int, due: float) -> Frame:
-        """Frame of a number, exposed at a time since the world began [s]."""
+        """Frame of a number, exposed at a time [s]."""
         with self.world.lock:
             self._state.frame_count = number
-            if due >= max(self._state.ffc_until, 0.0) + MODELS[self.kind][1]:
+            self._corrected = max(self._corrected, self._state.ffc_until)
+            if due >= self._corrected + MODELS[self.kind][1]:
                 self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
         # The image, unless the shutter is closed.
@@ -274,11 +267,10 @@ class EmulatedCamera(Closing):
             }
             rows = telemetry.encode(values, self.shape[1], self.telemetry_rows)
             metadata = telemetry.metadata(rows)
-        stamp, now = self.world.epoch + due, self.world.clock()
-        return Frame(self._last.copy(), stamp, now, number, camera.GOOD, rows, metadata)
+        return Frame(self._last.copy(), due, self.clock(), number, camera.GOOD, rows, metadata)
 
     def image(self, time: float) -> Counts:
-        """Counts through the filter in the beam at a time since the world began [s]."""
+        """Counts through the filter in the beam at a time [s]."""
         band = self.band or self.world.filter_name
         if band is None:
             return np.full(self.shape, CLOSED, dtype=np.uint16)

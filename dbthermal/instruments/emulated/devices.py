@@ -58,16 +58,12 @@ class Line(Closing):
     read are kept. `TransportError` once the device is pulled out.
     """
 
-    is_simulated = True
+    is_simulated, plugged = True, True  # False once it was pulled out
 
     def __init__(self, world: World) -> None:
         self.world, self.clock = world, world.clock
         self._replies, self._pieces = list[bytes](), list[bytes]()
         self._lock, self._closed = threading.Lock(), False
-
-    def is_plugged(self) -> bool:
-        """False once it was pulled out."""
-        return True
 
     def receive(self, data: bytes) -> None:
         """Take in bytes from the driver."""
@@ -111,7 +107,7 @@ class Line(Closing):
         self._closed = True
 
     def _check(self) -> None:
-        if self._closed or not self.is_plugged():
+        if self._closed or not self.plugged:
             raise TransportError("Lost the emulated device. It must stay connected and open.")
 
 
@@ -126,7 +122,8 @@ class EmulatedBoson(Line):
         self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
         self._name, self._decoder = name, fslp.Decoder()
 
-    def is_plugged(self) -> bool:
+    @property
+    def plugged(self) -> bool:  # type: ignore[override]
         """False once the camera was pulled out."""
         return self.camera.plugged
 
@@ -145,7 +142,7 @@ class EmulatedBoson(Line):
         command, data, status, answer = request.command, request.data, 0, b""
         with self.world.lock:
             if not self.camera.has_frames:
-                self.camera.frame_count = math.floor(self.world.time * FRAME_RATE)
+                self.camera.frame_count = math.floor(self.clock() * FRAME_RATE)
             readings = self._readings()
             sizes = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4)}
             sizes |= dict.fromkeys(readings, 0)
