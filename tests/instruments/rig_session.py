@@ -22,6 +22,8 @@ LEVELS = {"8-14": 1000, "9.5": 20_000, "11": 40_000}
 QUICK = Limits(chunk=5, reserve=0, reading_period=0.05, preview_period=0.02)
 """No space is kept free, and readings come often."""
 
+LIMIT = 600.0  # how long a process may take on a busy machine [s]
+
 TEXT = """
 name: plate
 simulated: true
