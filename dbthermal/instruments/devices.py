@@ -14,12 +14,11 @@ from typing import Any, Final
 
 from dbthermal.instruments import camera as interface
 from dbthermal.instruments.camera import CameraControl, Counts, FrameSource, Identity
-from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.filterwheel import BAUDRATE, FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import LOGGER, WHEEL, Session
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.transport import Transport, open_serial
+from dbthermal.instruments.transport import SYSTEM, Clock, Transport, open_serial
 
 __all__ = ["Devices", "open_devices"]
 __dir__ = __all__.copy

@@ -20,14 +20,14 @@ units, and addresses). Facts alone, no code.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import IntFlag
 from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments._controller import CHANNEL, Controller, NoReplyError, WheelError
+from dbthermal.instruments._apt import CHANNEL, Controller, Id, NoReplyError, WheelError
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport
 
@@ -52,6 +52,25 @@ START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
 STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
 POLL_INTERVAL: Final = 0.05  # between two status requests [s]
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
+
+
+class StatusBits(IntFlag):
+    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
+
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
+    """
+
+    MOVING_FORWARD = 1 << 4
+    MOVING_REVERSE = 1 << 5
+    JOGGING_FORWARD = 1 << 6
+    JOGGING_REVERSE = 1 << 7
+    CONNECTED = 1 << 8
+    HOMING = 1 << 9
+    HOMED = 1 << 10
+    POSITION_ERROR = 1 << 14
+    OVERLOAD = 1 << 24
+    ENABLED = 1 << 31
+
 
 # State that is an error; it is uncertain if a wheel's controller sets these bits.
 FAULTS: Final = StatusBits.POSITION_ERROR | StatusBits.OVERLOAD

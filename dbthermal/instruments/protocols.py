@@ -16,10 +16,10 @@ from scipy.constants import zero_Celsius
 from dbthermal import store
 from dbthermal.instruments import recording
 from dbthermal.instruments.camera import SourceLostError
-from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary
 from dbthermal.instruments.session import BLACKBODY, Session
+from dbthermal.instruments.transport import SYSTEM, Clock
 
 __all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.clock import SYSTEM, Clock
-from dbthermal.instruments.transport import Closing, parse
+from dbthermal.instruments.transport import SYSTEM, Clock, Closing, parse
 
 __all__ = ["ERRORS", "TC08", "ReadingError", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy

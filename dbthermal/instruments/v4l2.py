@@ -26,8 +26,7 @@ import numpy as np
 
 from dbthermal.instruments import camera
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, Metadata, Stream
-from dbthermal.instruments.clock import SYSTEM, Clock
-from dbthermal.instruments.transport import Closing, parse
+from dbthermal.instruments.transport import SYSTEM, Clock, Closing, parse
 
 __all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy

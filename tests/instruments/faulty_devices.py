@@ -15,9 +15,8 @@ import numpy as np
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.devices import (
     Drive,
@@ -26,8 +25,9 @@ from dbthermal.instruments.emulated.devices import (
     EmulatedTC08,
     Numbers,
 )
-from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings
+from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.transport import EmulatedClock
 
 
 @dataclass

@@ -11,6 +11,7 @@ from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments._apt import Id, Message
 from dbthermal.instruments._fslp import Frame
+from dbthermal.instruments.filterwheel import StatusBits
 
 # Requests quoted in the tests of PnPQ, many of them from the maker's documentation; that of 0018
 # from the maker's example program.
@@ -35,7 +36,7 @@ STATUS = "81 04 0E 00 81 22 01 00 01 00 00 00 00 00 00 00 07 00 00 00"
 LONG_STATUS = STATUS.replace("0E", "1C") + " 01 00" + " 00" * 12
 LONG_COMPLETED = "64 04 0E 00 81 50 01 00 68 AA A0 01 00 00 00 00 30 00 00 80"
 ENDS = [first + end for first in ("64 04", "66 04") for end in (" 01 00 01 22", LONG_COMPLETED[5:])]
-LIMITS = apt.StatusBits(0b111)
+LIMITS = StatusBits(0b111)
 RECORDS: list[tuple[str, tuple[Any, ...]]] = [
     (STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
     (LONG_STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
@@ -108,7 +109,7 @@ def test_messages_have_the_published_bytes() -> None:
         f"{sample.name} {sample:04X} " + " ".join(map(str, apt.LENGTHS[sample])) for sample in Id
     ]
     assert entries == PUBLISHED.strip().replace(",\n", ", ").split(", ")
-    assert [bit.bit_length() - 1 for bit in apt.StatusBits] == BITS
+    assert [bit.bit_length() - 1 for bit in StatusBits] == BITS
 
 
 def test_frames_have_the_published_bytes() -> None:

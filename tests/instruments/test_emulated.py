@@ -22,10 +22,10 @@ from faulty_devices import Clock
 from rig_session import LIMIT, bench, from_yaml, replaced, rig, scene_text
 
 from dbthermal.instruments import protocols, telemetry
-from dbthermal.instruments.clock import START, SYSTEM, EmulatedClock, Task
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import CLOSED, EmulatedCamera, Picture, World
 from dbthermal.instruments.recording import Limits, Preview, open_capture
+from dbthermal.instruments.transport import START, SYSTEM, EmulatedClock, Task
 
 SHAPE, RATE = (8, 80), 10.0
 

@@ -25,10 +25,10 @@ from rig_session import (
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
-from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
+from dbthermal.instruments.transport import EmulatedClock
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)

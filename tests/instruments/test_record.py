@@ -19,10 +19,10 @@ from test_capture_file import CaptureFile
 
 from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
-from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, notes, open_capture, record
 from dbthermal.instruments.session import Camera, Session
+from dbthermal.instruments.transport import EmulatedClock
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 SMALL = Limits(chunk=CHUNK, reserve=0, silence=0.1, reading_period=0.05, preview_period=0.0)

@@ -31,9 +31,8 @@ from dbthermal import simulation
 from dbthermal.bands import FILTERS
 from dbthermal.instruments import camera, telemetry
 from dbthermal.instruments.camera import Counts, Frame
-from dbthermal.instruments.clock import Clock, EmulatedClock
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Clock, Closing, EmulatedClock
 
 Picture = Callable[[float], Counts]
 
@@ -72,7 +71,7 @@ class CameraState:
 class World:
     """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s].
 
-    Its clock is an `EmulatedClock`, or `dbthermal.instruments.clock.SYSTEM` for real time.
+    Its clock is an `EmulatedClock`, or `dbthermal.instruments.transport.SYSTEM` for real time.
     `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
     the beam, None while the wheel turns or is between two slots. `scene` has temperatures [K] by
     name at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.

@@ -29,14 +29,13 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
 from dbthermal.instruments import boson
-from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments._apt import Id
 from dbthermal.instruments.camera import FfcMode, FfcStatus
-from dbthermal.instruments.clock import Clock
 from dbthermal.instruments.emulated import ROOM, World
-from dbthermal.instruments.filterwheel import BSC20X
+from dbthermal.instruments.filterwheel import BSC20X, StatusBits
 from dbthermal.instruments.session import WHEEL
 from dbthermal.instruments.tc08 import CHANNELS
-from dbthermal.instruments.transport import Closing, TransportError
+from dbthermal.instruments.transport import Clock, Closing, TransportError
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 

@@ -22,9 +22,9 @@ from typing import Final
 
 from dbthermal import store
 from dbthermal.instruments import camera
-from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.transport import Clock, Task
 from dbthermal.store._signals import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
