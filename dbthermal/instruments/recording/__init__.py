@@ -40,6 +40,7 @@ __all__ = [
 __dir__ = __all__.copy
 
 Region = tuple[slice, slice]
+Valid = npt.NDArray[np.bool_]
 
 # Attribute of a sweep, as of `calibration.fit_response`, by the key of the session's blackbody.
 _ACCURACY: Final = {
@@ -171,10 +172,11 @@ def overview(folder: str | Path) -> xr.Dataset:
     return table.set_coords(["recording", "band"])
 
 
-def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> npt.NDArray[np.bool_]:
+def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Valid:
     """True for the frames that have a stamp and none of the flags."""
-    unflagged: npt.NDArray[np.bool_] = (frames["frame_flags"].values & int(bad)) == 0
-    return unflagged & np.isfinite(frames[stamp].values)
+    flags, stamps = frames["frame_flags"].values, frames[stamp].values
+    valid: Valid = np.isfinite(stamps) & ((flags & int(bad)) == 0)
+    return valid
 
 
 def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
@@ -276,8 +278,7 @@ def bench_series(
         dataset = xr.concat(measurements, "measurement").transpose("band", "measurement")
         for variable, described in schema.STAGES["contact"].items():
             dataset[variable].attrs = described.attrs
-        dataset.attrs = {**shared, "material": material}
-        joined[material] = schema.check(dataset, "contact")
+        joined[material] = schema.check(dataset.assign_attrs(shared, material=material), "contact")
     return joined
 
 
@@ -339,10 +340,10 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
                 rule = "Must be recorded to its end"
                 raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
             require_filter(path, band)
-    shared = {key: attrs[key] for key in ("is_simulated", "origin")}
-    named = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
-    shared |= {key: value for key, value in named.items() if value is not None}
-    return steps, blackbody["stability"], shared
+    stated = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
+    shared = {key: attrs[key] for key in ("is_simulated", "origin")} | stated
+    valid = {key: value for key, value in shared.items() if value is not None}
+    return steps, blackbody["stability"], valid
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:
@@ -362,7 +363,8 @@ def _bands(paths: list[Path]) -> dict[str, xr.Dataset]:
     captures: dict[str, xr.Dataset] = {}
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
-        captures = {**dict.fromkeys(map(str, capture["band"].values), capture), **captures}
+        for band in map(str, capture["band"].values):
+            captures.setdefault(band, capture)
     return captures
 
 
