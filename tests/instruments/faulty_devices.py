@@ -9,6 +9,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -169,14 +170,8 @@ class FaultyApt(EmulatedApt):
         return status._replace(bits=status.bits | sum(stuck))
 
 
-def request(sequence: int, command: int, data: bytes = b"", *, status: int = fslp.REQUEST) -> bytes:
-    """Bytes of a request to a Boson."""
-    return fslp.encode(sequence, command, data, status)
-
-
-def reply(sequence: int, command: int, data: bytes = b"", *, status: int = 0) -> bytes:
-    """Bytes of a reply of a Boson."""
-    return fslp.encode(sequence, command, data, status)
+request, reply = fslp.encode, partial(fslp.encode, status=0)
+"""Bytes of a request to a Boson, and of its reply."""
 
 
 def text(sequence: int, command: int) -> bytes:

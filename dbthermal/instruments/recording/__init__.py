@@ -91,8 +91,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
-    if fitted:
-        opened = _fitted(opened)
+    opened = _fitted(opened) if fitted else opened
     # Exposure times are checked against a coordinate, which is made of them.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
     time = fill_times(exposure_times(numbered)[0])
@@ -266,12 +265,10 @@ def bench_series(
         captures = _bands(paths)
         for material, place in region.items():
             means = [_mean(captures[band], band, place, correction) for band in captures]
-            values = {
-                "counts": ("band", means),
-                "object_temperature": _agreed(paths, material, stability),
-                "background_temperature": background,
-            }
-            series[material].append(xr.Dataset(values, {"band": list(captures)}))
+            temperature = _agreed(paths, material, stability)
+            values = {"object_temperature": temperature, "background_temperature": background}
+            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*captures]})
+            series[material].append(measurement)
     # All steps of a material together.
     joined = {}
     for material, measurements in series.items():
@@ -314,8 +311,7 @@ def mean_reading(path: str | Path, source: str) -> float:
 
     FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
     """
-    values = [note[3] for note in notes(path) if note[1:3] == ("reading", source)]
-    if not values:
+    if not (values := [note[3] for note in notes(path) if note[1:3] == ("reading", source)]):
         raise ValueError(f"No reading of '{source}' in the recording '{path}'. Must have one.")
     return float(np.mean(values))
 
@@ -336,9 +332,8 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
         steps.append([step_path(folder, name, number, band) for band in bands])
         for path, band in zip(steps[-1], bands, strict=True):
             if not is_complete(path):
-                state = "Incomplete" if path.exists() else "Missing"
-                rule = "Must be recorded to its end"
-                raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
+                state = f"{'Incomplete' if path.exists() else 'Missing'} recording '{path}'"
+                raise ValueError(f"{state} of the sweep. Must be recorded to its end.")
             require_filter(path, band)
     stated = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
     shared = {key: attrs[key] for key in ("is_simulated", "origin")} | stated
@@ -370,8 +365,8 @@ def _bands(paths: list[Path]) -> dict[str, xr.Dataset]:
 
 def _good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
     """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
-    frames = capture.sel(band=band)
-    return np.flatnonzero(_good(frames, FrameFlag.SHUTTER_CLOSED, "exposure_time"))
+    good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
+    return np.flatnonzero(good)
 
 
 def _movie(paths: list[Path], frames: int) -> xr.DataArray:
@@ -393,10 +388,9 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     place = {"y": region[0], "x": region[1]}
     good = _good_frames(capture, band)
     cropped = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
-    source = f"of band '{band}' in '{capture.attrs['path']}'"
-    if cropped["counts"].size == 0:
+    counts, source = cropped["counts"], f"of band '{band}' in '{capture.attrs['path']}'"
+    if counts.size == 0:
         raise ValueError(f"No frame or no pixel {source}. Must have one.")
-    counts = cropped["counts"]
     if correction is not None:
         corrected = correct(cropped, correction.isel(place))
         counts = corrected["counts"].where(corrected["status"] == 0)
