@@ -1,9 +1,13 @@
-"""Thorlabs APT, the binary protocol of stepper controllers: bytes to messages, and back.
+"""Thorlabs APT, the binary protocol of stepper controllers, and a controller at the end of a line.
 
 A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
 ``id, id, length, length, destination | 0x80, source`` followed by data; all little-endian, without
 checksum or start byte. A receiver therefore drops bytes until identifier, length and both addresses
 are possible. Positions are in counts, speeds in the device's units, channels count from 1.
+
+A controller that is addressed wrongly says nothing: its address is searched for. APT has no
+sequence numbers, and a controller reports the end of a move at any time: the next message is not
+always the reply. So messages are identified by identifier, source and channel.
 
 References
 ----------
@@ -12,10 +16,15 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 (scale of the FW103 wheel), thorlabs_apt_device 0.3.8 (addresses of racks).
 """
 
+import logging
 import struct
+import threading
 from collections.abc import Collection
-from enum import IntEnum, IntFlag
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Final, NamedTuple, TypeVar
+
+from dbthermal.instruments.transport import Transport
 
 # Addresses: computer, a rack's own board (a BSC20x counts as a rack), the first of its ten bays,
 # and a controller that is not a rack.
@@ -25,9 +34,17 @@ BAY_1: Final = 0x21
 UNIT: Final = 0x50
 CONTROLLERS: Final = frozenset({RACK, *range(BAY_1, BAY_1 + 10), UNIT})
 
-YES: Final = 1
-NO: Final = 2
+YES, NO = 1, 2
+CHANNEL: Final = 1  # of the motor at its address
+# Where a controller is looked for, in order: address of its identity, and of its motor. A BSC20x
+# is a rack and silently ignores messages to a unit.
+SEARCHED: Final = ((RACK, BAY_1), (UNIT, UNIT))
+REPLY_TIMEOUT: Final = 1.0  # [s]
+ATTEMPTS: Final = 2  # number of times that a request is sent before its reply counts as missing
+MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
 
+_READ_SIZE = 256  # largest number of bytes that are read at once
+_LOGGER = logging.getLogger(__name__)
 _SHORT = struct.Struct("<HBBBB")
 _LONG = struct.Struct("<HHBB")
 _HEADER = _SHORT.size
@@ -39,72 +56,55 @@ _IDENTIFIERS = 0x1000  # all documented identifiers of controllers are below
 class Id(IntEnum):
     """Messages that a filter wheel needs, and that a controller may send, by the maker's names.
 
-    `lengths` are those that the data of a message can have [byte], 0 without data. After
-    ``SET`` comes the number of the request of the same parameters, then that of its reply.
+    After ``SET`` comes the number of the request of the same parameters, then that of its reply.
     """
 
-    lengths: tuple[int, ...]
-
-    def __new__(cls, value: int, *lengths: int) -> Self:
-        """Make an identifier from its number and its lengths."""
-        member = int.__new__(cls, value)
-        member._value_, member.lengths = value, lengths or (0,)
-        return member
-
     HW_REQ_INFO = 0x0005
-    HW_GET_INFO = 0x0006, 84
+    HW_GET_INFO = 0x0006
     HW_STOP_UPDATEMSGS = 0x0012  # nothing starts them: some BSC then stop answering after 5 s
     HW_NO_FLASH_PROGRAMMING = 0x0018  # first of all messages
     HW_RESPONSE = 0x0080
-    HW_RICHRESPONSE = 0x0081, 68
+    HW_RICHRESPONSE = 0x0081
     MOD_SET_CHANENABLESTATE = 0x0210
     MOD_REQ_CHANENABLESTATE = 0x0211
     MOD_GET_CHANENABLESTATE = 0x0212
-    MOT_SET_VELPARAMS = 0x0413, 14
+    MOT_SET_VELPARAMS = 0x0413
     MOT_REQ_VELPARAMS = 0x0414
-    MOT_GET_VELPARAMS = 0x0415, 14
-    MOT_SET_HOMEPARAMS = 0x0440, 14
+    MOT_GET_VELPARAMS = 0x0415
+    MOT_SET_HOMEPARAMS = 0x0440
     MOT_REQ_HOMEPARAMS = 0x0441
-    MOT_GET_HOMEPARAMS = 0x0442, 14
+    MOT_GET_HOMEPARAMS = 0x0442
     MOT_MOVE_HOME = 0x0443
     MOT_MOVE_HOMED = 0x0444
-    MOT_MOVE_ABSOLUTE = 0x0453, 0, 6
-    MOT_MOVE_COMPLETED = 0x0464, 0, 14
+    MOT_MOVE_ABSOLUTE = 0x0453
+    MOT_MOVE_COMPLETED = 0x0464
     MOT_MOVE_STOP = 0x0465  # value 1 at once, 2 by a ramp
-    MOT_MOVE_STOPPED = 0x0466, 0, 14
+    MOT_MOVE_STOPPED = 0x0466
     MOT_REQ_STATUSUPDATE = 0x0480
-    MOT_GET_STATUSUPDATE = 0x0481, 14, 28
+    MOT_GET_STATUSUPDATE = 0x0481
 
 
-_LENGTHS = {int(identifier): identifier.lengths for identifier in Id}
-
-
-class StatusBits(IntFlag):
-    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
-
-    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
-    """
-
-    MOVING_FORWARD = 1 << 4
-    MOVING_REVERSE = 1 << 5
-    JOGGING_FORWARD = 1 << 6
-    JOGGING_REVERSE = 1 << 7
-    CONNECTED = 1 << 8
-    HOMING = 1 << 9
-    HOMED = 1 << 10
-    POSITION_ERROR = 1 << 14
-    OVERLOAD = 1 << 24
-    ENABLED = 1 << 31
+# Lengths that the data of a message can have [byte].
+_PARAMETERS = (Id.MOT_SET_VELPARAMS, Id.MOT_GET_VELPARAMS, Id.MOT_SET_HOMEPARAMS)
+LENGTHS: Final[dict[int, tuple[int, ...]]] = {
+    **dict.fromkeys(Id, (0,)),
+    **dict.fromkeys((*_PARAMETERS, Id.MOT_GET_HOMEPARAMS), (14,)),
+    **dict.fromkeys((Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED), (0, 14)),
+    Id.MOT_MOVE_ABSOLUTE: (0, 6),
+    Id.MOT_GET_STATUSUPDATE: (14, 28),
+    Id.HW_GET_INFO: (84,),
+    Id.HW_RICHRESPONSE: (68,),
+}
 
 
 class Message(NamedTuple):
     """A message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
 
     id: int
-    param1: int
-    param2: int
-    destination: int
-    source: int
+    param1: int = 0  # mostly the channel
+    param2: int = 0
+    destination: int = HOST
+    source: int = HOST
     data: bytes = b""
 
 
@@ -135,7 +135,7 @@ class Home(NamedTuple):
 
 
 class Status(NamedTuple):
-    """Position counter, encoder counter (a filter wheel has none) [count] and `StatusBits`."""
+    """Position counter, encoder counter (a filter wheel has none) [count] and bits of its state."""
 
     channel: int
     position: int
@@ -185,8 +185,12 @@ def parse(kind: type[Record], message: Message) -> Record:
 
 def pack(record: tuple[Any, ...]) -> bytes:
     """Data of a message; ValueError if a number does not fit its field."""
+    return _packed(_LAYOUTS[type(record)], record, *record)
+
+
+def _packed(layout: struct.Struct, record: tuple[Any, ...], *values: Any) -> bytes:
     try:
-        return _LAYOUTS[type(record)].pack(*record)
+        return layout.pack(*values)
     except struct.error as error:
         raise ValueError(f"Invalid {record}. Its fields must hold it: {error}.") from error
 
@@ -199,38 +203,26 @@ def text(raw: bytes) -> str:
 def encode(message: Message) -> bytes:
     """Bytes of a message to send; with data in the long form, which has no parameters.
 
-    ValueError if a number is not whole, or does not fit its field, or the data are too long.
+    A controller silently ignores messages to another destination than its own; a channel is 1 in
+    every bay of a rack. ValueError if a number is not whole, or does not fit its field, or the data
+    are too long, or have a length that messages of this `Id` never have.
     """
-    size = len(message.data)
+    size, lengths = len(message.data), LENGTHS.get(message.id)
+    if lengths is not None and size not in lengths:
+        name = Id(message.id).name
+        raise ValueError(f"Invalid data of {size} bytes of {name}. Must be one of {lengths}.")
     if size > _LONGEST or message.destination & _HAS_DATA:
         rule = f"Must have at most {_LONGEST} bytes of data, and a destination below {_HAS_DATA}"
         raise ValueError(f"Invalid {message}. {rule}.")
     if size and (message.param1 or message.param2):
         raise ValueError(f"Invalid {message} with data. Its parameters must be 0.")
-    try:
-        if not size:
-            return _SHORT.pack(*message[:-1])
-        destination = message.destination | _HAS_DATA
-        return _LONG.pack(message.id, size, destination, message.source) + message.data
-    except struct.error as error:
-        raise ValueError(f"Invalid {message}. Its fields must hold it: {error}.") from error
+    if not size:
+        return _packed(_SHORT, message, *message[:-1])
+    destination = message.destination | _HAS_DATA
+    return _packed(_LONG, message, message.id, size, destination, message.source) + message.data
 
 
-def command(
-    identifier: Id, channel: int = 0, value: int = 0, *, data: bytes = b"", destination: int
-) -> bytes:
-    """Bytes of a message from the computer to a controller.
-
-    Short, it has the `channel` from 1, which in a rack is 1 in every bay, and a `value`; long, the
-    `data` of a record. A controller silently ignores messages to another `destination`. ValueError
-    if a number does not fit its field, or the data have no such length.
-    """
-    if len(data) not in identifier.lengths:
-        rule = f"Must be one of {identifier.lengths}"
-        raise ValueError(f"Invalid data of {len(data)} bytes of {identifier.name}. {rule}.")
-    return encode(Message(identifier, channel, value, destination, HOST, data))
-
-
+@dataclass
 class Decoder:
     """Finds the messages in a stream of bytes, however it is cut into pieces.
 
@@ -247,14 +239,10 @@ class Decoder:
     ('MOT_MOVE_HOMED', 1)
     """
 
-    def __init__(
-        self,
-        destinations: Collection[int] = CONTROLLERS | {HOST},
-        sources: Collection[int] = CONTROLLERS | {HOST},
-    ) -> None:
-        self.dropped = 0
-        self.pending = bytearray()  # may begin a message whose end has not come
-        self._destinations, self._sources = frozenset(destinations), frozenset(sources)
+    destinations: Collection[int] = CONTROLLERS | {HOST}
+    sources: Collection[int] = CONTROLLERS | {HOST}
+    dropped: int = field(default=0, init=False)
+    pending: bytearray = field(default_factory=bytearray, init=False)  # beginning of a message
 
     def feed(self, received: bytes) -> list[Message]:
         """Messages that the next bytes of the stream complete.
@@ -265,18 +253,21 @@ class Decoder:
         self.pending += received
         messages, start = [], 0
         while len(self.pending) - start >= _HEADER:
-            length = self._data_length(start)
-            if length is None:
+            identifier, size, destination, source = _LONG.unpack_from(self.pending, start)
+            # The long form, with the length of its data, is marked in the destination.
+            is_long, address = bool(destination & _HAS_DATA), destination & ~_HAS_DATA
+            size, every = size if is_long else 0, range(_LONGEST + 1)
+            sizes = LENGTHS.get(identifier, every if identifier < _IDENTIFIERS else ())
+            possible = address in self.destinations and source in self.sources
+            if not possible or size not in sizes or bool(size) != is_long:
                 start, self.dropped = start + 1, self.dropped + 1
                 continue
             # A message, or its beginning.
-            end = start + _HEADER + length
+            end = start + _HEADER + size
             if len(self.pending) < end:
                 break
-            identifier, *params, destination, source = _SHORT.unpack_from(self.pending, start)
-            first, second = (0, 0) if length else params
+            first, second = (0, 0) if size else self.pending[start + 2 : start + 4]
             data = bytes(self.pending[start + _HEADER : end])
-            address = destination & ~_HAS_DATA
             messages.append(Message(identifier, first, second, address, source, data))
             start = end
         del self.pending[:start]
@@ -287,17 +278,121 @@ class Decoder:
         self.dropped += len(self.pending)
         self.pending.clear()
 
-    def _data_length(self, start: int) -> int | None:
-        """Length of the data after a header [byte], None if the header is impossible."""
-        identifier, length, destination, source = _LONG.unpack_from(self.pending, start)
-        # The long form is marked in the destination.
-        is_long = bool(destination & _HAS_DATA)
-        length = length if is_long else 0
-        lengths = _LENGTHS.get(identifier, range(_LONGEST + 1) if identifier < _IDENTIFIERS else ())
-        possible = (
-            destination & ~_HAS_DATA in self._destinations
-            and source in self._sources
-            and length in lengths
-            and bool(length) == is_long
+
+class WheelError(RuntimeError):
+    """The wheel or its controller does not do what it should."""
+
+
+class NoReplyError(WheelError, TimeoutError):
+    """The controller did not reply in time."""
+
+
+class Controller:
+    """Requests to a controller, its replies, of the next number, and its reports by itself."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.unit, self.motor = SEARCHED[0]
+        self.decoder = Decoder((HOST,), CONTROLLERS)
+        self._transport, self._clock = transport, transport.clock
+        # A recorder asks for the position in one thread while another turns the wheel.
+        self._lock = threading.Lock()
+        self._ended: set[tuple[int, int]] = set()  # identifier and source of ends of a motion
+        self._notices: list[str] = []  # a sentence each
+
+    def connect(self) -> Info:
+        """Find the address of the controller, and return its identity."""
+        for self.unit, self.motor in SEARCHED:
+            for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
+                self._transport.write(encode(Message(identifier, destination=self.unit)))
+            try:
+                reply = self.request(Id.HW_REQ_INFO, self.unit, 0, attempts=1)
+            except NoReplyError:
+                continue
+            self._collect()
+            self._notices.clear()  # it need not know all messages of the greeting
+            return parse(Info, reply)
+        if self.decoder.dropped:
+            came = f"{self.decoder.dropped} bytes came that are no APT messages"
+            raise WheelError(f"{came}. Must be an APT controller.")
+        tried = ", ".join(f"0x{unit:02X}" for unit, _ in SEARCHED)
+        raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
+
+    def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
+        """Send a message without a reply to the motor."""
+        message = Message(identifier, channel, value, self.motor, HOST, data)
+        self._transport.write(encode(message))
+
+    def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
+        """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
+        with self._clock.hold(self._lock):
+            self._collect()
+        self._ended.clear()
+        self.check()
+        self.send(identifier, channel, data=data)
+
+    def has_reported(self, identifier: Id) -> bool:
+        """True if the motor reported this since the last start of a motion."""
+        return (identifier, self.motor) in self._ended
+
+    def check(self) -> None:
+        """WheelError with the text of the errors that the controller reported by itself."""
+        if self._notices:
+            reported = "".join(self._notices)
+            self._notices.clear()
+            raise WheelError(f"The controller is not well.{reported}")
+
+    def request(
+        self, identifier: Id, unit: int = 0, channel: int = CHANNEL, *, attempts: int = ATTEMPTS
+    ) -> Message:
+        """Reply to a request, of the motor by default, of any channel if 0; or NoReplyError.
+
+        Only requests are repeated, never what moves the wheel. What came before is not the reply; a
+        late one may be taken for that of the repetition, and is older than it seems, but replies
+        stay in order.
+        """
+        unit, reply = unit or self.motor, Id(identifier + 1)
+        request = encode(Message(identifier, channel, 0, unit))
+        with self._clock.hold(self._lock):
+            for _ in range(attempts):
+                self._collect()
+                self._transport.write(request)
+                deadline = self._clock() + REPLY_TIMEOUT
+                while (remaining := deadline - self._clock()) > 0:
+                    if not (received := self._transport.read(_READ_SIZE, remaining)):
+                        break
+                    for message in reversed(self._replies(received)):
+                        data = message.data
+                        about = int.from_bytes(data[:2], "little") if data else message.param1
+                        if (message.id, message.source) == (reply, unit) and channel in {0, about}:
+                            return message
+                self.decoder.discard()  # half a message whose rest did not come in time
+        raise NoReplyError(
+            f"No answer {reply.name} from address 0x{unit:02X} in {REPLY_TIMEOUT} s. "
+            f"The controller must be on and in no other program's use.{''.join(self._notices)}"
         )
-        return length if possible else None
+
+    def _collect(self) -> None:
+        """Take in all bytes that have come so far."""
+        count = 0
+        while received := self._transport.read(_READ_SIZE, 0.0):
+            self._replies(received)
+            count += len(received)
+            if count > MAXIMUM_UNSOLICITED:
+                came = f"More than {MAXIMUM_UNSOLICITED} unsolicited bytes came"
+                raise WheelError(f"{came}. Must be an APT controller.")
+
+    def _replies(self, received: bytes) -> list[Message]:
+        """Messages that may be replies; ends of a motion and notices are kept."""
+        replies = []
+        for message in self.decoder.feed(received):
+            match message.id:
+                case Id.MOT_MOVE_COMPLETED | Id.MOT_MOVE_STOPPED | Id.MOT_MOVE_HOMED:
+                    self._ended.add((message.id, message.source))
+                case Id.HW_RESPONSE | Id.HW_RICHRESPONSE:
+                    error = parse(Notice, message) if message.data else Notice()
+                    about = f"error {error.code} of message 0x{error.id:04X}"
+                    self._notices.append(f" It reported {about}: {text(error.notes)}.")
+                    _LOGGER.warning("Controller of the filter wheel:%s", self._notices[-1])
+                case _:
+                    replies.append(message)
+        return replies

@@ -11,7 +11,6 @@ Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/inclu
 cbbb877). Facts alone, none of the vendor's text or code.
 """
 
-import contextlib
 import struct
 import threading
 from collections.abc import Callable
@@ -28,12 +27,7 @@ from dbthermal.instruments import telemetry, v4l2
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
 from dbthermal.instruments.transport import Closing, Transport
 
-__all__ = [
-    "KIND",
-    "Boson",
-    "BosonError",
-    "BosonTimeoutError",
-]
+__all__ = ["KIND", "Boson", "BosonError", "BosonTimeoutError"]
 __dir__ = __all__.copy
 
 BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
@@ -167,25 +161,19 @@ class Boson(Closing):
 
     Examples
     --------
-    >>> from dbthermal.instruments.emulated import World, camera
+    >>> from dbthermal.instruments.emulated import World, devices
     >>> bench = World()
     >>> state = bench.add_camera("8-14", 93588)
-    >>> with Boson(camera.EmulatedBoson(bench, "8-14")) as port:
+    >>> with Boson(devices.EmulatedBoson(bench, "8-14")) as port:
     ...     port.fpa_temperature(), port.identity()["is_simulated"]  # K
     (308.15, True)
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        timeout: float = REPLY_TIMEOUT,
-        first_sequence: int | None = None,
-    ) -> None:
+    def __init__(self, transport: Transport, *, first_sequence: int | None = None) -> None:
         # From the time of day, so that a reply to a program that ended is not taken for a new one.
         moment = int(1e6 * transport.clock.utc().timestamp())
         first = moment if first_sequence is None else first_sequence
-        self.is_simulated, self.timeout = transport.is_simulated, timeout
+        self.is_simulated = transport.is_simulated
         self._transport, self._clock = transport, transport.clock
         self._decoder = fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
@@ -292,15 +280,16 @@ class Boson(Closing):
             raise BosonError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
-        """Send a request, again if no reply comes, and return the data of its reply."""
-        for _ in range(repeats):
-            with contextlib.suppress(BosonTimeoutError):
-                return self._exchange(name, command, data)
-        # The exchange, under a new number.
-        with self._clock.hold(self._lock):
-            self._sequence = fslp.next_sequence(self._sequence)
-            self._transport.write(fslp.encode(self._sequence, command, data))
-            reply = self._reply(name)
+        """Send a request, again under a new number if no reply comes; return the reply's data."""
+        for _ in range(repeats + 1):
+            with self._clock.hold(self._lock):
+                self._sequence = fslp.next_sequence(self._sequence)
+                self._transport.write(fslp.encode(self._sequence, command, data))
+                if reply := self._reply(name):
+                    break
+        else:
+            rule = "Must be a Boson's command port, and the camera through with booting"
+            raise BosonTimeoutError(f"No reply to '{name}' within {REPLY_TIMEOUT:g} s. {rule}.")
         # What the reply says.
         if reply.command != command:
             raise BosonError(
@@ -315,11 +304,10 @@ class Boson(Closing):
             )
         return reply.data
 
-    def _reply(self, name: str) -> fslp.Frame:
-        """Wait for the reply to the last request; discard all other frames."""
+    def _reply(self, name: str) -> fslp.Frame | None:
+        """Reply to the last request, None if it does not come in time; other frames are ignored."""
         key = (fslp.COMMAND_CHANNEL, self._sequence)
-        deadline = self._clock() + self.timeout
-        received = 0
+        deadline, received = self._clock() + REPLY_TIMEOUT, 0
         while (remaining := deadline - self._clock()) > 0:
             if not (piece := self._transport.read(_READ_SIZE, remaining)):
                 break
@@ -332,8 +320,7 @@ class Boson(Closing):
             for frame in self._decoder.feed(piece):
                 if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
                     return frame
-        rule = "Must be a Boson's command port, and the camera through with booting"
-        raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
+        return None
 
 
 # Of a session's ``kind: boson``.

@@ -20,8 +20,7 @@ import numpy.typing as npt
 
 from dbthermal import _text as texts
 from dbthermal.correction._shutter import FEWEST_COPIES
-from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.transport import Transport
+from dbthermal.instruments.transport import Clock, Transport
 from dbthermal.schema import Flags
 
 __all__ = ["KINDS", "CameraControl", "CameraKind", "Frame", "FrameFlag", "FrameSource", "Metadata"]

@@ -14,12 +14,11 @@ from typing import Any, Final
 
 from dbthermal.instruments import camera as interface
 from dbthermal.instruments.camera import CameraControl, Counts, FrameSource, Identity
-from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.filterwheel import BAUDRATE, FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import LOGGER, WHEEL, Session
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.transport import Transport, open_serial
+from dbthermal.instruments.transport import SYSTEM, Clock, Transport, open_serial
 
 __all__ = ["Devices", "open_devices"]
 __dir__ = __all__.copy
@@ -172,7 +171,7 @@ def open_devices(
     if session.simulated and world is None:
         world = _emulated().emulated_world(session, waits=True)
         if pictures is None:
-            pictures = _emulated(".camera").blackbody_pictures(session, world)
+            pictures = _emulated().blackbody_pictures(session, world)
     if not session.simulated and (world is not None or pictures):
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
@@ -187,7 +186,7 @@ def open_devices(
             else:
                 beam = None if band == session.filtered else band
                 view = world, band, pictures or {}, beam, *form
-                source = _emulated(".camera").EmulatedCamera(*view, kind=camera.kind)
+                source = _emulated().EmulatedCamera(*view, kind=camera.kind)
             sources[band] = stack.enter_context(source)
             if camera.control is not None and kind.control is not None:
                 line = _line(world, camera.kind, camera.control, band, baudrate=kind.baudrate)

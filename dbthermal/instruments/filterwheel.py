@@ -20,19 +20,14 @@ units, and addresses). Facts alone, no code.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import IntFlag
 from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments._controller import (
-    CHANNEL,
-    Controller,
-    NoReplyError,
-    WheelError,
-)
+from dbthermal.instruments._apt import CHANNEL, Controller, Id, NoReplyError, WheelError
 from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport
 
@@ -57,6 +52,25 @@ START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
 STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
 POLL_INTERVAL: Final = 0.05  # between two status requests [s]
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
+
+
+class StatusBits(IntFlag):
+    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
+
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
+    """
+
+    MOVING_FORWARD = 1 << 4
+    MOVING_REVERSE = 1 << 5
+    JOGGING_FORWARD = 1 << 6
+    JOGGING_REVERSE = 1 << 7
+    CONNECTED = 1 << 8
+    HOMING = 1 << 9
+    HOMED = 1 << 10
+    POSITION_ERROR = 1 << 14
+    OVERLOAD = 1 << 24
+    ENABLED = 1 << 31
+
 
 # State that is an error; it is uncertain if a wheel's controller sets these bits.
 FAULTS: Final = StatusBits.POSITION_ERROR | StatusBits.OVERLOAD
@@ -180,8 +194,7 @@ class FilterWheel(Closing):
 
     def status(self) -> apt.Status:
         """Position [count] and state of the motor."""
-        request = Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE
-        return apt.parse(apt.Status, self._controller.request(*request))
+        return apt.parse(apt.Status, self._controller.request(Id.MOT_REQ_STATUSUPDATE))
 
     def home(self) -> None:
         """Search for the home switch, from which all places count; the speeds are set before.
@@ -271,7 +284,7 @@ class FilterWheel(Closing):
         speeds = apt.Speeds(CHANNEL, 0, acceleration, round(settings.velocity * speed))
         self._set("", Id.MOT_SET_VELPARAMS, speeds)
         # The speed of homing, and direction and switch where the settings have them.
-        before = apt.parse(apt.Home, request(Id.MOT_REQ_HOMEPARAMS, Id.MOT_GET_HOMEPARAMS))
+        before = apt.parse(apt.Home, request(Id.MOT_REQ_HOMEPARAMS))
         home = before._replace(
             direction=settings.home_direction or before.direction,
             limit_switch=settings.home_limit_switch or before.limit_switch,
@@ -280,7 +293,7 @@ class FilterWheel(Closing):
         self._set("home ", Id.MOT_SET_HOMEPARAMS, home)
         # The motor's current.
         self._controller.send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
-        state = request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE).param2
+        state = request(Id.MOD_REQ_CHANENABLESTATE).param2
         if state not in {apt.YES, apt.NO}:
             raise WheelError(f"Unknown state {state} of the motor. Must be 1 or 2.")
         if state == apt.NO:
@@ -290,8 +303,7 @@ class FilterWheel(Closing):
     def _set(self, prefix: str, identifier: Id, wanted: apt.Speeds | apt.Home) -> None:
         """Set a record of numbers, and read it back; WheelError if the controller has others."""
         self._controller.send(identifier, data=apt.pack(wanted))
-        reply = self._controller.request(Id(identifier + 1), Id(identifier + 2))
-        actual = apt.parse(type(wanted), reply)
+        actual = apt.parse(type(wanted), self._controller.request(Id(identifier + 1)))
         for name in reversed(wanted._fields):
             value, expected = getattr(actual, name), getattr(wanted, name)
             is_used = name != "minimum"  # the controllers ignore this speed

@@ -19,7 +19,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal._arrays import Array
 from dbthermal.instruments import camera
-from dbthermal.instruments.camera import FFC_READING, FfcStatus, Frame, FrameFlag
+from dbthermal.instruments.camera import FFC_READING, FfcStatus, FrameFlag
 from dbthermal.instruments.recording import Preview
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
@@ -97,7 +97,12 @@ class Watch:
     def note(self, preview: Preview) -> bool:
         """Take the next preview; return True if it is the first preview of a recording."""
         before, self._last = self._last, preview
-        if before is None or _is_new(before, preview):
+        # Of another recording: other bands, or a time or a number of frames that falls.
+        if before is None or not (
+            tuple(before.totals) == tuple(preview.totals)
+            and before.time <= preview.time
+            and all(before.totals[b]["frames"] <= t["frames"] for b, t in preview.totals.items())
+        ):
             before = None
             self._past.clear()
             self._ffc_times.clear()
@@ -118,20 +123,26 @@ class Watch:
 
     def status(self) -> dict[str, Status]:
         """Band to its `Status` at the last preview; empty before the first one."""
-        last = self._last
-        if last is None:
-            return {}
-        return {
-            band: Status(
-                band,
-                self._rate(band),
-                fpa_temperature=_fpa_temperature(band, last),
-                ffc=_ffc(band, last),
-                ffc_age=last.time - self._ffc_times.get(band, math.nan),
-                **{**_levels(last.frames.get(band)), **totals},
-            )
-            for band, totals in last.totals.items()
-        }
+        statuses: dict[str, Status] = {}
+        if (last := self._last) is None:
+            return statuses
+        for band, totals in last.totals.items():
+            values: dict[str, Any] = {**totals, "ffc": _ffc(band, last)}
+            # The temperature by its reading, else by the telemetry.
+            reading = last.readings.get(camera.FPA_READING + band, math.nan)
+            by_telemetry = _metadata(band, last).fpa_temperature
+            values["fpa_temperature"] = reading if math.isfinite(reading) else by_telemetry
+            values["ffc_age"] = last.time - self._ffc_times.get(band, math.nan)
+            # Range of the counts, and the shares of the pixels at the ends of the range.
+            if (frame := last.frames.get(band)) is not None:
+                counts = frame.counts
+                low, high = np.percentile(counts[::_STRIDE, ::_STRIDE], _PERCENTILES)
+                values["limits"] = float(low), float(high)
+                values |= {"lowest": float(counts.min()), "highest": float(counts.max())}
+                values["dead"] = np.count_nonzero(counts == 0) / counts.size
+                values["saturated"] = np.count_nonzero(counts == 65535) / counts.size
+            statuses[band] = Status(band, self._rate(band), **values)
+        return statuses
 
     def _rate(self, band: str) -> float:
         """Rate by the times at which the frames came: they are written in bursts."""
@@ -143,19 +154,6 @@ class Watch:
             return (now - before) / (stop - start)
         is_old = self._past[-1][0] - self._past[0][0] >= _WINDOW
         return 0.0 if is_old else math.nan
-
-
-def _is_new(before: Preview, now: Preview) -> bool:
-    """True if a preview is of another recording than the preview before it."""
-    if tuple(before.totals) != tuple(now.totals) or now.time < before.time:
-        return True
-    return any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
-
-
-def _fpa_temperature(band: str, preview: Preview) -> float:
-    """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
-    reading = preview.readings.get(camera.FPA_READING + band, math.nan)
-    return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
 
 def _metadata(band: str, preview: Preview | None) -> camera.Metadata:
@@ -171,21 +169,6 @@ def _ffc(band: str, preview: Preview) -> str:
         return _IN_PROGRESS
     reading = preview.readings.get(FFC_READING + band)
     return "unknown" if reading is None else _ffc_state(reading)
-
-
-def _levels(frame: Frame | None) -> dict[str, Any]:
-    """Range of the counts of a frame, and the shares of its pixels at the ends of the range."""
-    if frame is None:
-        return {}
-    counts = frame.counts
-    low, high = np.percentile(counts[::_STRIDE, ::_STRIDE], _PERCENTILES)
-    return {
-        "limits": (float(low), float(high)),
-        "lowest": float(counts.min()),
-        "highest": float(counts.max()),
-        "dead": np.count_nonzero(counts == 0) / counts.size,
-        "saturated": np.count_nonzero(counts == 65535) / counts.size,
-    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,22 +300,18 @@ def _temperature(name: str, separated: xr.Dataset | None, empty: Array) -> "Pane
 
 def _foot(preview: Preview) -> str:
     """Readings that are not of a shown band: of thermocouples, of the blackbody."""
-    used = {
-        prefix + band for prefix in (camera.FPA_READING, FFC_READING) for band in preview.totals
-    }
-    return ", ".join(
-        f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"
-        for name, value in preview.readings.items()
-        if name not in used
-    )
-
-
-def _reading(name: str, value: float, unit: str) -> str:
-    if math.isnan(value) or name.startswith(FFC_READING):
-        return _ffc_state(value)
-    if unit == "K":
-        return _celsius(value)
-    return f"{value:g}" if unit == "1" else f"{value:g} {unit}"
+    texts = []
+    for name, value in preview.readings.items():
+        if name.removeprefix(camera.FPA_READING).removeprefix(FFC_READING) in preview.totals:
+            continue
+        unit = preview.units.get(name, "K")
+        if math.isnan(value) or name.startswith(FFC_READING):
+            texts.append(f"{name} {_ffc_state(value)}")
+        elif unit == "K":
+            texts.append(f"{name} {_celsius(value)}")
+        else:
+            texts.append(f"{name} {value:g}" + (f" {unit}" if unit != "1" else ""))
+    return ", ".join(texts)
 
 
 def _celsius(temperature: float) -> str:

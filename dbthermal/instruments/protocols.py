@@ -16,10 +16,10 @@ from scipy.constants import zero_Celsius
 from dbthermal import store
 from dbthermal.instruments import recording
 from dbthermal.instruments.camera import SourceLostError
-from dbthermal.instruments.clock import SYSTEM, Clock
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary
 from dbthermal.instruments.session import BLACKBODY, Session
+from dbthermal.instruments.transport import SYSTEM, Clock
 
 __all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
@@ -140,21 +140,28 @@ def record_sweep(
         for number, temperature in enumerate(session.blackbody.temperatures)
         for band in session.swept or (None,)
     ]
-    kept = [_kept(*step) for step in plan]
-    summaries: list[Summary] = []
+    summaries = [_kept(*step) for step in plan]
     resting: int | None = None
-    for (number, temperature, band, planned), summary in zip(plan, kept, strict=True):
-        # The blackbody, once for all filters of a temperature.
-        if summary is None and resting != number:
-            set_temperature(temperature)
-            wait_stable(session, temperature, readings[BLACKBODY].read, clock=devices.clock)
-            devices.correct_offsets()
-            resting = number
-        # The recording, which must have a reading of the blackbody.
+    for place, (number, temperature, band, planned) in enumerate(plan):
         path = held.place() / planned.name
-        summaries.append(summary or _record_step(devices, band, path, limits, preview))
-        recording.mean_reading(path if summary else summaries[-1].path, BLACKBODY)
-    return summaries
+        if summaries[place] is None:
+            # The blackbody, once for all filters of a temperature.
+            if resting != number:
+                set_temperature(temperature)
+                wait_stable(session, temperature, readings[BLACKBODY].read, clock=devices.clock)
+                devices.correct_offsets()
+                resting, path = number, held.place() / planned.name
+            # The filter, and the recording to its end.
+            selected = devices if band is None else devices.select(band)
+            summary = _record(selected, path, limits=limits, preview=preview)
+            if summary.ended != "duration":
+                rule = "Must go to its end"
+                raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. {rule}.")
+            path = summary.path
+            recording.require_filter(path, band)
+            summaries[place] = summary
+        recording.mean_reading(path, BLACKBODY)  # it must have a reading of the blackbody
+    return [summary for summary in summaries if summary is not None]
 
 
 def record_scene(
@@ -220,19 +227,3 @@ def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summ
         raise ValueError(f"Recording '{path}' of temperatures {steps} K. {rule}.")
     recording.require_filter(path, band)
     return Summary(path, attrs["ended"], attrs["totals"])
-
-
-def _record_step(
-    devices: Devices,
-    band: str | None,
-    path: Path,
-    limits: Limits | None,
-    preview: Callable[[Preview], None] | None,
-) -> Summary:
-    """Turn the filter into the beam, and record to the end."""
-    selected = devices if band is None else devices.select(band)
-    summary = _record(selected, path, limits=limits, preview=preview)
-    if summary.ended != "duration":
-        raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
-    recording.require_filter(summary.path, band)
-    return summary

@@ -140,13 +140,11 @@ class Session:
 
     Attributes
     ----------
-    name : str
-        Name, of the recordings too.
-    simulated : bool
-        One switch for all devices: True emulates them.
-    protocol : str
+    name, simulated : str, bool
+        Name, of the recordings too; one switch for all devices: True emulates them.
+    protocol, blackbody : str, Blackbody or None
         ``"gain_offset"``, ``"response"``, ``"emissivity_bench"``, which go through the blackbody's
-        temperatures, or ``"scene"``.
+        temperatures, or ``"scene"``, without a blackbody.
     duration, frame_rate : float
         Duration of the recording, or of each of its steps [s]; frame rate [Hz].
     cameras, devices : dict
@@ -157,8 +155,6 @@ class Session:
         Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
-    blackbody : Blackbody or None
-        Temperatures; None for ``"scene"`` alone.
 
     Examples
     --------

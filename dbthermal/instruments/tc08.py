@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.clock import SYSTEM, Clock
-from dbthermal.instruments.transport import Closing, parse
+from dbthermal.instruments.transport import SYSTEM, Clock, Closing, parse
 
 __all__ = ["ERRORS", "TC08", "ReadingError", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
@@ -139,7 +138,9 @@ class TC08(Closing):
 
     def __init__(self, library: Library) -> None:
         self._library = library
-        self.clock: Clock = getattr(library, "clock", SYSTEM)  # an emulated library has its own
+        # The vendor's library has neither of these attributes.
+        self.is_simulated = bool(getattr(library, "is_simulated", False))
+        self.clock: Clock = getattr(library, "clock", SYSTEM)
         self.channels: Mapping[int, str] = {}  # place of the tip by channel
         self._handle = 0
         self._lock = threading.Lock()
@@ -154,11 +155,6 @@ class TC08(Closing):
         """
         parse(url, "tc08")
         return cls(load()).open()
-
-    @property
-    def is_simulated(self) -> bool:
-        """True if the library is an emulated one; the vendor's has no such attribute."""
-        return bool(getattr(self._library, "is_simulated", False))
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
         """Open the first free unit, within `timeout` [s].

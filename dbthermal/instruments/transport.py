@@ -1,26 +1,52 @@
-"""Addresses of devices, and byte streams to those on a serial line.
+"""Addresses of devices, byte streams to those on a serial line, and the clock of all of them.
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows); `parse` has the rules of
 all addresses. An address never names a program or a library: an environment variable names that of
 the TC-08.
+
+Drivers and recorder take the time, wait, and start their threads by a `Clock` alone: `SYSTEM` for
+hardware, an `EmulatedClock` for emulated devices. On the latter a single thread runs at a time.
+When it waits, the next thread is the first in the order of waits whose condition holds or whose
+time has come; if there is none the clock leaps to the earliest end of a wait. So a program, and
+all that it writes, does not depend on the load of the machine, its cores, or the speed of its disk.
 """
 
+import math
+import queue
 import re
-from collections.abc import Iterator, Mapping
+import threading
+import time as system_time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 from dbthermal import _text as texts
-from dbthermal.instruments.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     import serial
 
-__all__ = ["SerialTransport", "Transport", "TransportError", "open_serial", "parse"]
+__all__ = [
+    "START",
+    "SYSTEM",
+    "Clock",
+    "EmulatedClock",
+    "SerialTransport",
+    "Task",
+    "Transport",
+    "TransportError",
+    "open_serial",
+    "parse",
+]
 __dir__ = __all__.copy
 
+Item = TypeVar("Item")
+
+START: Final = datetime(2000, 1, 1, tzinfo=UTC)  # at time 0 of every emulated clock
+_ROOM: Final = 1.0  # emulated wait for a place in a buffer whose reader has ended [s]
+_POLL: Final = 0.05  # between two looks at the waits, by the computer's clock [s]
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 
@@ -33,6 +59,216 @@ _RULES: Final[Mapping[str, tuple[str, str]]] = {
     "tc08": ("tc08:", "tc08:"),
 }
 _LONGEST: Final = 200  # [character]
+
+
+class Clock:
+    """The computer's clock: called, it returns the monotonic time [s]."""
+
+    def __call__(self) -> float:
+        """Time [s] since an arbitrary start."""
+        return system_time.monotonic()
+
+    def utc(self) -> datetime:
+        """Date and time of day."""
+        return datetime.now(UTC)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait for a time [s]."""
+        system_time.sleep(seconds)
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Wait until an event is set, at most `timeout` [s]; True if it is."""
+        return event.wait(timeout)
+
+    def get(self, items: "queue.SimpleQueue[Item]", timeout: float) -> Item:
+        """Wait at most `timeout` [s] for the next item of a queue; `queue.Empty` without any."""
+        return items.get(timeout=timeout)
+
+    def has_room(self, room: threading.Semaphore) -> bool:
+        """Take a place in a buffer; False if it is full."""
+        return room.acquire(blocking=False)
+
+    @contextmanager
+    def hold(self, lock: threading.Lock) -> Iterator[None]:
+        """Hold a lock while a block lasts, in which the thread may wait on this clock."""
+        with lock:
+            yield
+
+    @contextmanager
+    def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
+        """Let this thread take part in the order of a clock that has an order.
+
+        The event is for a new thread: it is set when the thread has its place in the order.
+        """
+        if entered is not None:
+            entered.set()
+        yield
+
+
+SYSTEM: Final = Clock()
+
+
+class Task(threading.Thread):
+    """A thread that waits on a clock; the event `ended` is set at the end of its work."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        name: str,
+        work: Callable[..., object],
+        *values: Any,
+        daemon: bool = True,
+    ) -> None:
+        super().__init__(name=name, daemon=daemon)
+        self.ended = threading.Event()
+        self._clock, self._work, self._values = clock, work, values
+        self._entered = threading.Event()
+
+    def start(self) -> None:
+        """Begin; the thread has its place in the order of the clock when this returns."""
+        super().start()
+        self._entered.wait()
+
+    def run(self) -> None:
+        """Work until the end."""
+        with self._clock.joined(self._entered):
+            try:
+                self._work(*self._values)
+            finally:
+                self.ended.set()
+
+
+class _Wait:
+    """Wait of a thread until a condition holds, or until a time [s]."""
+
+    def __init__(self, condition: Callable[[], bool], end: float) -> None:
+        self.condition, self.end, self.thread = condition, end, threading.get_ident()
+        self.held = False  # True if the condition held before the end
+        self.over = threading.Event()
+
+
+class EmulatedClock(Clock):
+    """Clock of an emulated bench, which begins at time 0, on 1 January 2000.
+
+    Threads take part in its order if they are a `Task`, or inside `joined`. Any thread may wait on
+    it, but those outside the order run beside it, and what they do depends on the computer.
+    """
+
+    def __init__(self) -> None:
+        self._now = 0.0
+        self._lock = threading.Lock()
+        self._waits: list[_Wait] = []
+        self._members, self._running = set[int](), set[int]()  # of the order; that do not wait
+
+    def __call__(self) -> float:
+        """Time since the start [s]."""
+        return self._now
+
+    def utc(self) -> datetime:
+        """Emulated date and time of day."""
+        return START + timedelta(seconds=self._now)
+
+    def sleep(self, seconds: float) -> None:
+        """Let the other threads run until a time has passed [s]."""
+        self._wait(lambda: False, seconds)
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Let the other threads run until an event is set, at most `timeout` [s]."""
+        return self._wait(event.is_set, timeout)
+
+    def get(self, items: "queue.SimpleQueue[Item]", timeout: float) -> Item:
+        """Let the other threads run until a queue has an item; `queue.Empty` if it gets none."""
+        self._wait(lambda: not items.empty(), timeout)
+        return items.get_nowait()
+
+    def has_room(self, room: threading.Semaphore) -> bool:
+        """Wait for a place in a buffer: its reader is awaited in emulated time."""
+        return self._wait(lambda: room.acquire(blocking=False), _ROOM)
+
+    @contextmanager
+    def hold(self, lock: threading.Lock) -> Iterator[None]:
+        """Hold a lock while a block lasts; the other threads run until it is free."""
+        taken = threading.Event()  # the condition may be evaluated by another thread
+
+        def take() -> bool:
+            if lock.acquire(blocking=False):
+                taken.set()
+            return taken.is_set()
+
+        try:
+            self._wait(take)
+            yield
+        finally:
+            if taken.is_set():
+                lock.release()
+
+    @contextmanager
+    def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
+        """Take part in the order while a block lasts.
+
+        The thread runs now; a new one, with an event, after all that wait.
+        """
+        # A place in the order.
+        turn = _Wait(lambda: True, self._now)
+        with self._lock:
+            is_member = turn.thread in self._members
+            self._members.add(turn.thread)
+            if entered is None:
+                self._running.add(turn.thread)
+            else:
+                self._waits.append(turn)
+        if entered is not None:
+            entered.set()
+            self._await(turn)
+        try:
+            yield
+        finally:
+            if not is_member:  # the next thread runs
+                with self._lock:
+                    self._members.discard(turn.thread)
+                    self._running.discard(turn.thread)
+                    self._next()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float = math.inf) -> bool:
+        """Wait until a condition holds, at most `timeout` [s]; True if it does."""
+        turn = _Wait(condition, self._now + timeout)
+        try:
+            with self._lock:
+                self._waits.append(turn)
+                self._running.discard(turn.thread)
+                self._next()
+            self._await(turn)
+        except BaseException:  # an interrupt: this thread goes on
+            with self._lock:
+                self._waits = [wait for wait in self._waits if wait is not turn]
+                self._run(turn)
+            raise
+        return turn.held
+
+    def _await(self, turn: _Wait) -> None:
+        while not turn.over.wait(_POLL):
+            with self._lock:
+                self._next()
+
+    def _next(self) -> None:
+        """Let the next thread run, if none does."""
+        while self._waits and not self._running:
+            for chosen in self._waits:
+                chosen.held = chosen.condition()
+                if chosen.held or chosen.end <= self._now:
+                    break
+            else:  # no condition holds: the clock leaps to the earliest end
+                chosen = min(self._waits, key=lambda wait: wait.end)
+                if math.isinf(chosen.end):
+                    return  # a thread outside the order has what all wait for
+                self._now = chosen.end
+            self._run(chosen)
+            self._waits.remove(chosen)
+
+    def _run(self, wait: _Wait) -> None:
+        if wait.thread in self._members:
+            self._running.add(wait.thread)
+        wait.over.set()
 
 
 def parse(url: str, scheme: str) -> str:
@@ -103,31 +339,24 @@ class SerialTransport(Closing):
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
-        with self._named("write to"):
+        with self.named("write to"):
             self._port.write(data)
 
     def read(self, size: int, timeout: float) -> bytes:
         """Wait for bytes, at most `timeout` [s]; see `Transport.read`."""
-        with self._named("read from"):
+        with self.named("read from"):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
             waiting = min(size - 1, self._port.in_waiting) if first else 0
             return first + (self._port.read(waiting) if waiting else b"")
 
-    def pulse_rts(self) -> None:
-        """Take the line RTS down and up again."""
-        with self._named("set RTS of"):
-            self._port.rts = False
-            self.clock.sleep(SETTLING)
-            self._port.rts = True
-
     def close(self) -> None:
         """Release the port."""
-        with self._named("close"):
+        with self.named("close"):
             self._port.close()
 
     @contextmanager
-    def _named(self, action: str) -> Iterator[None]:
+    def named(self, action: str) -> Iterator[None]:
         """Name port and action in the errors of pyserial, which are OSError."""
         try:
             yield
@@ -158,6 +387,9 @@ def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTrans
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:
-            line.pulse_rts()
+            with line.named("set RTS of"):
+                port.rts = False
+                line.clock.sleep(SETTLING)
+                port.rts = True
         stack.pop_all()
     return line

@@ -18,6 +18,7 @@ import select
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -25,8 +26,7 @@ import numpy as np
 
 from dbthermal.instruments import camera
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, Metadata, Stream
-from dbthermal.instruments.clock import SYSTEM, Clock
-from dbthermal.instruments.transport import Closing, parse
+from dbthermal.instruments.transport import SYSTEM, Clock, Closing, parse
 
 __all__ = ["BUFFERS", "KIND", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
@@ -85,16 +85,6 @@ class Kernel:
     select: Callable[..., tuple[Sequence[Any], Sequence[Any], Sequence[Any]]] = select.select
     clock: Clock = SYSTEM
 
-    def ask(self, file: int, number: int, layout: struct.Struct, *values: Any) -> tuple[Any, ...]:
-        """Answer to a call, made again where a signal came between; OSError if it is refused."""
-        argument = bytearray(layout.pack(*values))
-        while True:
-            try:
-                self.ioctl(file, number, argument)
-            except InterruptedError:
-                continue
-            return layout.unpack(argument)
-
 
 class Capture(Closing):
     """A camera's node that streams Y16 frames, a `camera.FrameSource`; nothing is reset.
@@ -151,7 +141,11 @@ class Capture(Closing):
             try:
                 return self._frame(buffer, self.clock())
             finally:
-                self._give_back(buffer[0])
+                try:
+                    self._ask(QBUF, BUFFER, *_buffer(buffer[0]))
+                except OSError as error:
+                    if error.errno not in _GONE:  # else the next `read` reports the loss
+                        raise
         raise camera.NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
 
     def close(self) -> None:
@@ -171,9 +165,14 @@ class Capture(Closing):
             self._kernel.close(file)
 
     def _ask(self, number: int, layout: struct.Struct, *values: Any) -> tuple[Any, ...]:
+        """Answer to a call, made again where a signal came between; OSError if it is refused."""
         if self._file is None:
             raise camera.SourceLostError(f"No frames from '{self.path}': it is closed.")
-        return self._kernel.ask(self._file, number, layout, *values)
+        argument = bytearray(layout.pack(*values))
+        while True:
+            with suppress(InterruptedError):
+                self._kernel.ioctl(self._file, number, argument)
+                return layout.unpack(argument)
 
     def _capability(self) -> dict[str, str]:
         """Identity of the node, which must give video in the format."""
@@ -217,13 +216,6 @@ class Capture(Closing):
         if numerator == 0 or abs(denominator / numerator - rate) > _RATE_TOLERANCE * rate:
             period_text = f"Invalid frame period {numerator}/{denominator} s of '{self.path}'"
             raise ValueError(f"{period_text}. Must be 1/{rate} s.")
-
-    def _give_back(self, index: int) -> None:
-        try:
-            self._ask(QBUF, BUFFER, *_buffer(index))
-        except OSError as error:
-            if error.errno not in _GONE:  # else the next `read` reports the loss
-                raise
 
     def _frame(self, buffer: tuple[int, ...], host_time: float) -> Frame:
         """Copy a frame out of its buffer and translate the kernel's flags."""

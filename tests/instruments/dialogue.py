@@ -5,8 +5,7 @@ The idea is pymeasure's ``expected_protocol``.
 
 from collections.abc import Iterable, Sequence
 
-from dbthermal.instruments.clock import Clock, EmulatedClock
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Clock, Closing, EmulatedClock
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
 """What a driver must write, or None, and what the device answers, in one piece or in several."""

@@ -15,8 +15,7 @@ from dbthermal.instruments.camera import (
     FrameSource,
     NoFrameError,
 )
-from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
+from dbthermal.instruments.emulated import EmulatedCamera, Picture, World
 from dbthermal.instruments.session import Camera, Session
 
 LIMITS = np.iinfo(np.uint16)

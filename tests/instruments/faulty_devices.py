@@ -9,20 +9,26 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments._apt import Id, StatusBits
+from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.clock import EmulatedClock
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedTC08, Numbers
-from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings
+from dbthermal.instruments.emulated.devices import (
+    Drive,
+    EmulatedApt,
+    EmulatedBoson,
+    EmulatedTC08,
+    Numbers,
+)
+from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.transport import EmulatedClock
 
 
 @dataclass
@@ -72,15 +78,11 @@ class FaultyApt(EmulatedApt):
         if model.startswith(("BSC10", "KDC")):
             self.model, self.unit, self.address = BSC10X, apt.UNIT, apt.UNIT
         self.info = self.info._replace(model=model.encode())
-        self.slot_offset, self.plugged = slot_offset, True
+        self.slot_offset = slot_offset
         super().__init__(world)
         self.faults = WheelFaults()
         self.received: list[apt.Message] = []
         self._waiting: list[tuple[float, bytes]] = []
-
-    def is_plugged(self) -> bool:
-        """False once it was pulled out."""
-        return self.plugged
 
     def sent(self, name: str) -> list[bytes]:
         """Data of the messages of a name that a driver has sent."""
@@ -89,7 +91,9 @@ class FaultyApt(EmulatedApt):
     def turn_to(self, position: int) -> None:
         """Begin a move to a place [count] without the driver."""
         data = apt.pack(apt.Position(1, position))
-        self.receive(apt.command(Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
+        self.receive(
+            apt.encode(apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data))
+        )
 
     def obey(self, message: apt.Message) -> None:
         """Carry out a message, or ignore it by a fault."""
@@ -133,7 +137,7 @@ class FaultyApt(EmulatedApt):
         if self.faults.noise:
             self._replies.append(self.faults.noise)
         if self.faults.stray_completed:
-            super().reply(Id.MOT_MOVE_COMPLETED, param1=1)
+            super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
 
     def report(self, identifier: Id) -> None:
@@ -166,14 +170,8 @@ class FaultyApt(EmulatedApt):
         return status._replace(bits=status.bits | sum(stuck))
 
 
-def request(sequence: int, command: int, data: bytes = b"", *, status: int = fslp.REQUEST) -> bytes:
-    """Bytes of a request to a Boson."""
-    return fslp.encode(sequence, command, data, status)
-
-
-def reply(sequence: int, command: int, data: bytes = b"", *, status: int = 0) -> bytes:
-    """Bytes of a reply of a Boson."""
-    return fslp.encode(sequence, command, data, status)
+request, reply = fslp.encode, partial(fslp.encode, status=0)
+"""Bytes of a request to a Boson, and of its reply."""
 
 
 def text(sequence: int, command: int) -> bytes:
@@ -206,7 +204,7 @@ class FaultyBoson(EmulatedBoson):
         """Time until a reply is due [s]; infinite without a request."""
         if not self._inbox:
             return math.inf
-        return self.camera.ffc_until - self.world.time if self.stalls else 0.0
+        return self.camera.ffc_until - self.clock() if self.stalls else 0.0
 
 
 @dataclass

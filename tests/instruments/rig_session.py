@@ -11,8 +11,7 @@ import numpy as np
 
 from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.emulated import World, emulated_world
-from dbthermal.instruments.emulated.camera import Picture
+from dbthermal.instruments.emulated import Picture, World, emulated_world
 from dbthermal.instruments.recording import Limits
 from dbthermal.instruments.session import Session
 
@@ -22,6 +21,8 @@ LEVELS = {"8-14": 1000, "9.5": 20_000, "11": 40_000}
 
 QUICK = Limits(chunk=5, reserve=0, reading_period=0.05, preview_period=0.02)
 """No space is kept free, and readings come often."""
+
+LIMIT = 600.0  # how long a process may take on a busy machine [s]
 
 TEXT = """
 name: plate

@@ -22,10 +22,9 @@ from dbthermal.instruments.boson import (
     Setting,
 )
 from dbthermal.instruments.camera import FfcStatus, GainMode
-from dbthermal.instruments.clock import SYSTEM
 from dbthermal.instruments.emulated import FFC_DURATION, World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.emulated.devices import EmulatedBoson
+from dbthermal.instruments.transport import SYSTEM, TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
 # the values from 0; the states of a correction; the error numbers.

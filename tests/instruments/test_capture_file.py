@@ -39,7 +39,7 @@ COLUMNS = 640
 def begun(path: Path, telemetry_rows: int = 0, chunk: int = 4) -> CaptureFile:
     """A capture file of two bands in chunks of a few frames."""
     sources = dict(two_cameras(lambda _: IMAGE, SHAPE, RATE, telemetry_rows))
-    return CaptureFile(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=chunk)
+    return CaptureFile(path, sources, {"plate": "K"}, {}, chunk)
 
 
 def shot(number: int, **changes: Any) -> Frame:

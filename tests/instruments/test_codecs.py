@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments._apt import Id, Message, command
+from dbthermal.instruments._apt import Id, Message
 from dbthermal.instruments._fslp import Frame
+from dbthermal.instruments.filterwheel import StatusBits
 
 # Requests quoted in the tests of PnPQ, many of them from the maker's documentation; that of 0018
 # from the maker's example program.
@@ -35,7 +36,7 @@ STATUS = "81 04 0E 00 81 22 01 00 01 00 00 00 00 00 00 00 07 00 00 00"
 LONG_STATUS = STATUS.replace("0E", "1C") + " 01 00" + " 00" * 12
 LONG_COMPLETED = "64 04 0E 00 81 50 01 00 68 AA A0 01 00 00 00 00 30 00 00 80"
 ENDS = [first + end for first in ("64 04", "66 04") for end in (" 01 00 01 22", LONG_COMPLETED[5:])]
-LIMITS = apt.StatusBits(0b111)
+LIMITS = StatusBits(0b111)
 RECORDS: list[tuple[str, tuple[Any, ...]]] = [
     (STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
     (LONG_STATUS, apt.Status(1, position=1, encoder=0, bits=LIMITS)),
@@ -96,7 +97,7 @@ def cut(stream: bytes, places: list[int]) -> list[bytes]:
 def test_messages_have_the_published_bytes() -> None:
     """Requests, ends of a move in both forms, identities and states are those of others."""
     built = {
-        command(name, channel, value, data=data, destination=unit).hex(" ").upper()
+        apt.encode(Message(name, channel, value, unit, apt.HOST, data)).hex(" ").upper()
         for name, channel, value, data, unit in REQUESTS.values()
     }
     assert built == {*REQUESTS}
@@ -104,9 +105,11 @@ def test_messages_have_the_published_bytes() -> None:
     assert decode(ENDS[0]) == Message(Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, 0x22)
     for line, record in RECORDS:
         assert apt.parse(type(record), decode(line)) == record
-    entries = [f"{sample.name} {sample:04X} " + " ".join(map(str, sample.lengths)) for sample in Id]
+    entries = [
+        f"{sample.name} {sample:04X} " + " ".join(map(str, apt.LENGTHS[sample])) for sample in Id
+    ]
     assert entries == PUBLISHED.strip().replace(",\n", ", ").split(", ")
-    assert [bit.bit_length() - 1 for bit in apt.StatusBits] == BITS
+    assert [bit.bit_length() - 1 for bit in StatusBits] == BITS
 
 
 def test_frames_have_the_published_bytes() -> None:
@@ -201,7 +204,7 @@ def test_parsers_meet_arbitrary_data(content: bytes) -> None:
     """A parser returns its record of any data of each length that the decoder lets pass."""
     parsers = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
     for parser, identifier in parsers.items():
-        for length in filter(None, identifier.lengths):
+        for length in filter(None, apt.LENGTHS[identifier]):
             message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
             assert isinstance(apt.parse(parser, message), parser)
 
@@ -272,7 +275,7 @@ UNFIT: list[tuple[Any, str]] = [
     (lambda: apt.encode(Message(1, 0, 0, 1, 1, bytes(256))), "at most 255 bytes of data"),
     (lambda: apt.encode(Message(1, 0, 1, 1, 1, b"x")), "parameters must be 0"),
     (lambda: apt.pack(apt.Position(1, 2**31)), r"Position\(channel=1, position=2147483648\)"),
-    (lambda: command(Id.MOT_SET_VELPARAMS, destination=1), "0 bytes of MOT_SET_VELPARAMS"),
+    (lambda: apt.encode(Message(Id.MOT_SET_VELPARAMS)), "0 bytes of MOT_SET_VELPARAMS"),
     (lambda: fslp.encode(1 << 32, 0), "sequence number 4294967296"),
     (lambda: fslp.encode(0, -1), "command -1. Must lie in 0 to 4294967295"),
     (lambda: fslp.encode(0, 0, bytes(752)), "data of 752 bytes. Must be at most 751"),

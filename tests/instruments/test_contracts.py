@@ -33,8 +33,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.devices import EmulatedApt
+from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08

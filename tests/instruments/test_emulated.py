@@ -1,18 +1,31 @@
-"""The emulated camera shows its world; `test_faults` has what a camera does wrong."""
+"""The emulated camera shows its world, and emulated time gives the same bytes on any computer.
 
+`test_faults` has what a camera does wrong.
+"""
+
+import hashlib
 import math
+import multiprocessing
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import rig_session
 from faulty_camera import frames
 from faulty_devices import Clock
+from rig_session import LIMIT, bench, from_yaml, replaced, rig, scene_text
 
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated import camera as emulated
-from dbthermal.instruments.emulated.camera import EmulatedCamera, Picture
+from dbthermal.instruments import protocols, telemetry
+from dbthermal.instruments.devices import open_devices
+from dbthermal.instruments.emulated import CLOSED, EmulatedCamera, Picture, World
+from dbthermal.instruments.recording import Limits, Preview, open_capture
+from dbthermal.instruments.transport import START, SYSTEM, EmulatedClock, Task
 
 SHAPE, RATE = (8, 80), 10.0
 
@@ -42,7 +55,7 @@ def test_wheel_changes_what_is_seen() -> None:
     for position in (2, None, 3):
         behind.world.wheel_position = position
         counts += shown(behind)
-    assert counts == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
+    assert counts == [2000, 3001, CLOSED, CLOSED]
 
 
 def test_telemetry_says_what_the_camera_is_about() -> None:
@@ -84,7 +97,7 @@ def test_scene_begins_when_it_is_told() -> None:
     assert shown(source, 3) == [1001, 1002, 1003]
     assert world.thermocouple_temperature(1) == pytest.approx(300.3)
     world.begin()
-    assert (world.scene_time(), world.scene_time(1.0)) == (0.0, 0.0)
+    assert (world.scene_time(), world.scene_time(world.clock() - 1.0)) == (0.0, 0.0)
 
 
 def test_what_does_not_fit_the_bench_is_named() -> None:
@@ -106,3 +119,141 @@ def test_what_does_not_fit_the_bench_is_named() -> None:
     assert np.isnan(world.thermocouple_temperature(3))
     with pytest.raises(KeyError, match="Unknown place 'moon' of thermocouple 4"):
         world.thermocouple_temperature(4)
+
+
+LIMITS = Limits(chunk=30, reserve=0, queue=3)
+SWEEP = from_yaml(
+    replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.6"))
+)
+SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text()))
+
+
+def recorded(folder: Path) -> dict[str, str]:
+    """Record a sweep and a scene with a preview; names and checksums of all files."""
+    order: list[float] = []
+
+    def show(preview: Preview) -> None:
+        order.append(preview.time)
+
+    with rig(SWEEP) as devices:
+        devices.prepare()
+        protocols.record_sweep(
+            devices,
+            folder,
+            set_temperature=lambda kelvin: vars(devices.world).update(blackbody_temperature=kelvin),
+            limits=LIMITS,
+            preview=show,
+        )
+    with rig(SCENE) as devices:
+        devices.prepare()
+        protocols.record_scene(devices, folder / "scene.zarr", limits=LIMITS, preview=show)
+    files = {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+    return {**files, "previews": str(order)}
+
+
+def spin() -> None:
+    """Keep a core busy."""
+    while True:
+        pass
+
+
+@contextmanager
+def load(processes: int) -> Iterator[None]:
+    """Keep the computer busy with some processes."""
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=spin, daemon=True) for _ in range(processes)]
+    for process in busy:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.join()
+
+
+@contextmanager
+def single_core() -> Iterator[None]:
+    """Run on one core, where the system can tell a process so."""
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("the system does not bind a process to a core")
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Path) -> None:
+    """Every file of a sweep and of a scene is the same, at rest, under load and on one core."""
+    first = recorded(tmp_path / "rest")
+    assert len(first) > 100
+    with load(2):
+        assert recorded(tmp_path / "load") == first
+    with single_core():
+        assert recorded(tmp_path / "core") == first
+    capture = open_capture(tmp_path / "load" / "scene.zarr")
+    assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
+    totals = capture.attrs["totals"]
+    assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}
+    assert all(total["refused"] == total["lost"] == 0 for total in totals.values())
+
+
+def test_real_time_is_an_option() -> None:
+    """A bench on the computer's clock takes the time that it says."""
+    world = bench(SCENE, clock=SYSTEM)
+    with open_devices(SCENE, world, rig_session.pictures(world)) as devices:
+        assert devices.clock is SYSTEM
+        start = SYSTEM()
+        devices.clock.sleep(0.05)
+        assert SYSTEM() - start >= 0.05
+        assert start <= devices.sources["9.5"].read().host_time <= SYSTEM()
+
+
+def test_tasks_take_turns_in_the_order_of_their_times() -> None:
+    """One thread runs at a time; equal times keep the order of the waits; sleeping costs none."""
+    clock, order = EmulatedClock(), list[str]()
+
+    def work(name: str, period: float) -> None:
+        for number in range(3):
+            clock.sleep(period)
+            order.append(f"{name}{number} at {clock():g}")
+
+    with clock.joined():
+        tasks = [Task(clock, name, work, name, period) for name, period in (("a", 6e6), ("b", 9e6))]
+        for task in tasks:
+            task.start()
+        assert order == []
+        assert all(clock.wait(task.ended, 1e9) for task in tasks)
+    steps = ["a0 at 6e+06", "b0 at 9e+06", "a1 at 1.2e+07", "b1 at 1.8e+07", "a2 at 1.8e+07"]
+    assert order == [*steps, "b2 at 2.7e+07"]
+    assert not clock.wait(threading.Event(), 5.0)
+    assert (clock(), (clock.utc() - START).total_seconds()) == (27_000_005.0, 27_000_005.0)
+
+
+def test_a_lock_and_an_interrupt_stop_no_other_thread() -> None:
+    """A held lock is awaited in emulated time; a thread that left by an error blocks nobody."""
+    clock, lock, order = EmulatedClock(), threading.Lock(), list[float]()
+
+    def hold() -> None:
+        with clock.hold(lock):
+            clock.sleep(2.0)
+
+    def leave() -> None:
+        with clock.joined():
+            task.start()
+            clock.sleep(1.0)
+            raise ZeroDivisionError
+
+    task = Task(clock, "holder", hold)
+    with pytest.raises(ZeroDivisionError):
+        leave()
+    with clock.hold(lock):
+        order.append(clock())
+    assert task.ended.wait(LIMIT)
+    assert order == [2.0]

@@ -357,7 +357,7 @@ def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench.world.wheel_position == wheel.position() == 3
     with pytest.raises(StalledWheelError, match="did not start"):
         wheel.move_to(6)
-    monkeypatch.setattr("dbthermal.instruments._controller.REPLY_TIMEOUT", 1.5)
+    monkeypatch.setattr("dbthermal.instruments._apt.REPLY_TIMEOUT", 1.5)
     patient.homed().move_to(6)
     assert patient.world.wheel_position == 6
 

@@ -15,8 +15,7 @@ import pytest
 from faulty_devices import FILTERS
 
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.emulated.devices import EmulatedApt
+from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 
 RACK, CHANNEL = {"dest": 0x11}, {"dest": 0x21, "chan_ident": 1}

@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from faulty_camera import BANDS, two_bands, two_cameras
 from file_operations import before_operation, operations_of
+from rig_session import LIMIT
 from test_capture_file import CaptureFile, Note, begun, shot
 
 from dbthermal import store
@@ -22,7 +23,6 @@ from dbthermal.instruments.recording import Limits, Reading, notes, open_capture
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
 MOMENTS = (0.7, 0.999)  # parts of a recording's file operations
-LIMIT = 600.0  # how long a process may take on a busy machine [s]
 Names = list[tuple[str, int, bool]]
 
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -58,15 +58,6 @@ def texts(view: live.View) -> list[str]:
     below = [axis.get_xlabel() for axis in figure.axes]
     across = [text.get_text() for axis in figure.axes for text in axis.texts]
     return [figure.get_suptitle(), *below, *across, figure.get_supxlabel()]
-
-
-class Recorder:
-    """A display that keeps what it is handed."""
-
-    def __init__(self) -> None:
-        self.displayed: list[Any] = []
-        self.updated: list[Any] = []
-        self.display, self.update = self.displayed.append, self.updated.append
 
 
 def test_numbers_of_a_preview() -> None:
@@ -179,7 +170,7 @@ def test_title_and_readings() -> None:
 
 def test_pictures_of_the_bands() -> None:
     """Each band has its last counts between their percentiles, or none with a warning."""
-    display = Recorder()
+    display = Mock()
     view = live.View(display, is_simulated=True)
     view(preview(2.0, frame(RAMP + 100)))
     assert view.figure is not None
@@ -192,24 +183,23 @@ def test_pictures_of_the_bands() -> None:
     shown = view.figure.axes[1].images[0].get_array()
     assert np.isnan(np.asarray(shown, dtype=float)).all()
     assert texts(view)[-2] == "no frame has come"
-    assert (len(display.displayed), len(display.updated)) == (1, 1)
+    assert (display.display.call_count, display.update.call_count) == (1, 1)
 
 
 def test_updates_keep_the_period() -> None:
     """A PNG and words for a terminal come at most once a period, or for another recording."""
-    display = Recorder()
+    display, shown = Mock(), []
     view = live.View(display, title="pot", is_simulated=True)
-    shown = []
     for at in (0.0, 0.4, 0.9, 1.0, 1.9, 2.1, 0.3, 0.5):
-        before = len(display.displayed + display.updated)
+        before = len(display.method_calls)
         view(preview(at, plate=303.15))
-        shown += [at] * (len(display.displayed + display.updated) - before)
+        shown += [at] * (len(display.method_calls) - before)
     assert shown == [0.0, 1.0, 2.1, 0.3]
     view(replace(preview(0.1), frames={}))
     view(preview(0.2))
-    assert "2 lost" in repr(display.updated[-1])
-    assert len(display.updated) == 4
-    picture = display.displayed[0]
+    assert "2 lost" in repr(display.update.call_args[0][0])
+    assert display.update.call_count == 4
+    picture = display.display.call_args[0][0]
     assert picture._repr_png_().startswith(b"\x89PNG\r\n")
     assert repr(picture).startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
     assert repr(picture).endswith(f"plate 30.0 {DEGREE}")

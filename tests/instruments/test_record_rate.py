@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from faulty_camera import two_bands, two_cameras
 
-from dbthermal.instruments.clock import SYSTEM
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import record
+from dbthermal.instruments.transport import SYSTEM
 
 SHAPE, RATE, MINUTE = (512, 640), 60.0, 60.0
 

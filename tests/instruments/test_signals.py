@@ -15,16 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from file_operations import before_operation, operations_of
-from rig_session import replaced, scene_text
+from rig_session import LIMIT, replaced, scene_text
 from test_capture_file import CaptureFile
-from test_record import SMALL, bench, session
+from test_record import SMALL, bench, session, written
 
 from dbthermal import store
 from dbthermal.instruments.recording import Preview, SignalExit, raised_signals, record
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 SCENE = scene_text().replace('3: "11"', "3: 10.6")
-LIMIT = 600.0  # how long a process may take on a busy machine [s]
 
 
 @pytest.fixture(autouse=True)
@@ -57,14 +56,6 @@ def acquiring(
     finally:
         process.kill()
         process.wait()
-
-
-def written(path: Path) -> int:
-    """Frames of all bands that a recording says it has; 0 before it is begun."""
-    try:
-        return int(sum(store.open_dataset(path).attrs["frames_written"].values()))
-    except FileNotFoundError:
-        return 0
 
 
 def test_the_command_ends_as_by_the_keyboard(tmp_path: Path) -> None:

@@ -322,7 +322,7 @@ def test_its_shutter_is_told_by_frozen_images(
 ) -> None:
     """A correction of its own is flagged from the third copy on, and found whole afterwards."""
     models = {"y16": ("emulated Y16 camera", 1.0)}  # corrects its offsets every second
-    monkeypatch.setattr("dbthermal.instruments.emulated.camera.MODELS", models)
+    monkeypatch.setattr("dbthermal.instruments.emulated.MODELS", models)
     camera = {"kind": "y16", "video": "v4l2:///dev/video0"}
     short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=RATE)
     with open_devices(short) as devices:

@@ -1,32 +1,55 @@
 """Emulated devices at the other end of the drivers' lines, and the bench that all of them share.
 
-`World` is the bench. `camera` and `devices` answer as the devices do, byte for byte where the
-protocol is public; `camera` gives frames, too. All say that they are emulated. They were built from
-public descriptions; real devices may do more than these say.
+`World` is the bench, `EmulatedCamera` gives frames, and `devices` answer as the devices do, byte
+for byte where the protocol is public. All say that they are emulated. They were built from public
+descriptions; real devices may do more than these say.
 
 The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
 camera's emulator starts a flat-field correction, and its frames freeze; a program sets
 `World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
-Temperatures are in kelvin, times in seconds since the world began, on its clock; the scene has a
-time of its own, so that a recording can begin with it.
+Temperatures are in kelvin, times in seconds on the world's clock; the scene has a time of its own,
+so that a recording can begin with it.
+
+A picture is a function of the scene's time that gives the counts of a band, noise and response
+included. The camera adds a frame rate, a clock, buffers that overflow if no program reads, a
+shutter that freezes the image, and telemetry. It never flags its shutter: as with a real camera,
+that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
 """
 
 import math
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
 from typing import Any, Final
 
-from dbthermal.instruments.clock import Clock, EmulatedClock
+import numpy as np
+
+from dbthermal import response as responses
+from dbthermal import simulation
+from dbthermal.bands import FILTERS
+from dbthermal.instruments import camera, telemetry
+from dbthermal.instruments.camera import Counts, Frame
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.transport import Closing, TransportError
+from dbthermal.instruments.transport import Clock, Closing, EmulatedClock
+
+Picture = Callable[[float], Counts]
 
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 FFC_DURATION: Final = 0.5  # of a flat-field correction [s]; the real one is not documented publicly
 PHASE: Final = 0.382  # by which each camera of a session is exposed after the one before [frame]
 SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the next follow
-TICK: Final = 0.01  # shortest wait until a device is asked again if it has something to say [s]
+NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
+BUFFERS: Final = 32  # frames that are held while no program reads, as by the V4L2 driver
+CLOSED: Final = 10_000  # of every pixel where no filter is in the beam [count]
+
+MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
+    {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
+)
+"""Kind of camera to its model, and the time between the flat-field corrections that it starts by
+itself [s]."""
 
 
 @dataclass
@@ -46,9 +69,9 @@ class CameraState:
 
 
 class World:
-    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
+    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s].
 
-    Its clock is an `EmulatedClock`, or `dbthermal.instruments.clock.SYSTEM` for real time.
+    Its clock is an `EmulatedClock`, or `dbthermal.instruments.transport.SYSTEM` for real time.
     `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
     the beam, None while the wheel turns or is between two slots. `scene` has temperatures [K] by
     name at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
@@ -73,24 +96,17 @@ class World:
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
         self.blackbody_temperature = blackbody_temperature
-        self.epoch = self.clock()
-        self.scene_began = math.inf if waits else self.epoch
+        self.scene_began = math.inf if waits else self.clock()
         self._scene = scene
         self.wheel_position: int | None = wheel_position
-
-    @property
-    def time(self) -> float:
-        """Time since the world began [s]."""
-        return self.clock() - self.epoch
 
     def begin(self) -> None:
         """Let the scene begin now, or anew."""
         self.scene_began = self.clock()
 
     def scene_time(self, time: float | None = None) -> float:
-        """Time since the scene began [s], 0 before; at a time since the world began, or now."""
-        now = self.time if time is None else time
-        return max(0.0, self.epoch + now - self.scene_began)
+        """Time since the scene began [s], 0 before; at a time on the clock, or now."""
+        return max(0.0, (self.clock() if time is None else time) - self.scene_began)
 
     @property
     def filter_name(self) -> str | None:
@@ -141,13 +157,13 @@ class World:
         with self.lock:
             state = self.camera(name)
             state.ffc_count += 1
-            state.ffc_until = self.time + duration
+            state.ffc_until = self.clock() + duration
             state.last_ffc_frame = state.frame_count
             state.last_ffc_temperature = state.fpa_temperature
 
     def ffc_in_progress(self, name: str) -> bool:
         """True while a camera's shutter is closed for a correction."""
-        return self.time < self.camera(name).ffc_until
+        return self.clock() < self.camera(name).ffc_until
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
@@ -161,65 +177,138 @@ def emulated_world(session: Session, **settings: Any) -> World:
     return world
 
 
-class Line(Closing):
-    """An emulated device at the end of a line: a `transport.Transport`, for any number of threads.
+@dataclass
+class EmulatedCamera(Closing):
+    """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
-    A device takes bytes by `receive`, and `poll` gives its replies. Bytes that a driver does not
-    read are kept. `TransportError` once the device is pulled out.
+    It looks through the filter of its `band`, or, where that is None, through the wheel's.
     """
 
-    is_simulated = True
+    world: World
+    name: str
+    pictures: Mapping[str, Picture]  # band to the counts that are seen in it
+    band: str | None = None
+    shape: tuple[int, int] = (512, 640)
+    frame_rate: float = 60.0  # [Hz]
+    telemetry_rows: int = 0
+    kind: str = "boson"  # of `MODELS`
 
-    def __init__(self, world: World) -> None:
-        self.world, self.clock = world, world.clock
-        self._replies, self._pieces = list[bytes](), list[bytes]()
-        self._lock, self._closed = threading.Lock(), False
+    is_simulated: bool = field(default=True, init=False)
 
-    def is_plugged(self) -> bool:
-        """False once it was pulled out."""
-        return True
-
-    def receive(self, data: bytes) -> None:
-        """Take in bytes from the driver."""
-        raise NotImplementedError
-
-    def poll(self) -> list[bytes]:
-        """Give the replies that are due, each piece to be read by itself."""
-        replies, self._replies = self._replies, []
-        return replies
-
-    def next_due(self) -> float:
-        """Time until something may be due [s]; infinite if it waits for bytes."""
-        return 0.0 if self._replies else math.inf
-
-    def write(self, data: bytes) -> None:
-        """Give bytes to the device; see `Transport.write`."""
-        with self._lock:
-            self._check()
-            self.receive(data)
-
-    def read(self, size: int, timeout: float) -> bytes:
-        """Give one piece of the device's output; see `Transport.read`."""
-        deadline = self.clock() + timeout
-        while True:
-            with self._lock:
-                self._check()
-                self._pieces += self.poll()
-                if self._pieces:
-                    piece = self._pieces.pop(0)
-                    if piece[size:]:
-                        self._pieces.insert(0, piece[size:])
-                    return piece[:size]
-                pause = max(self.next_due(), TICK)
-            remaining = deadline - self.clock()
-            if remaining <= 0:
-                return b""
-            self.clock.sleep(min(remaining, pause))
+    def __post_init__(self) -> None:
+        if self.kind not in MODELS:
+            rule = f"Must be one of {sorted(MODELS)}"
+            raise ValueError(f"Unknown emulated camera '{self.kind}'. {rule}.")
+        self.clock, self._state = self.world.clock, self.world.camera(self.name)
+        self._state.has_frames = True
+        self.identity: Mapping[str, str] = {
+            "device": f"sim://{self.kind}/{self.name}",
+            "model": MODELS[self.kind][0],
+            "serial_number": str(self._state.serial_number),
+        }
+        self._number, self._start, self._open = 0, math.nan, True
+        self._corrected = self.clock()  # end of the last correction, or power-on
+        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
 
     def close(self) -> None:
-        """End; a second call does nothing."""
-        self._closed = True
+        """Give no more frames; a second call does nothing."""
+        self._open = False
 
-    def _check(self) -> None:
-        if self._closed or not self.is_plugged():
-            raise TransportError("Lost the emulated device. It must stay connected and open.")
+    def read(self, timeout: float = camera.FRAME_TIMEOUT) -> Frame:
+        """Wait for the next frame; see `camera.FrameSource.read`."""
+        if math.isnan(self._start):
+            self._start = self.clock() + self._state.phase / self.frame_rate
+        self._number = self.next_number(self._number, self.clock() - self._start)
+        due = self._start + self._number / self.frame_rate
+        wait = due - self.clock()
+        if wait > timeout:
+            self.clock.sleep(timeout)
+            raise camera.NoFrameError(
+                f"No frame from emulated camera '{self.name}' in {timeout} s."
+            )
+        if wait > 0:
+            self.clock.sleep(wait)
+        if not (self._open and self._state.plugged):
+            state = "it is unplugged" if self._open else "it is closed"
+            raise camera.SourceLostError(
+                f"No more frames from emulated camera '{self.name}': {state}."
+            )
+        number, self._number = self._number, self._number + 1
+        return self.frame(number, due)
+
+    def next_number(self, number: int, elapsed: float) -> int:
+        """Number of the next frame, some time [s] after the first; full buffers drop frames."""
+        latest = math.floor(elapsed * self.frame_rate)
+        return latest if latest - number >= BUFFERS else number
+
+    def frame(self, number: int, due: float) -> Frame:
+        """Frame of a number, exposed at a time [s]."""
+        with self.world.lock:
+            self._state.frame_count = number
+            self._corrected = max(self._corrected, self._state.ffc_until)
+            if due >= self._corrected + MODELS[self.kind][1]:
+                self.world.start_ffc(self.name)
+            frozen = self.world.ffc_in_progress(self.name)
+        # The image, unless the shutter is closed.
+        if not frozen:
+            self._last = self.image(due)
+        # The telemetry.
+        rows = metadata = None
+        if self.telemetry_rows:
+            values = {
+                "camera_serial": self._state.serial_number,
+                "frame_rate": round(self.frame_rate),
+                "frame_counter": self._state.frame_count,
+                "last_ffc_frame": self._state.last_ffc_frame,
+                "fpa_temperature": self._state.fpa_temperature,
+                "last_ffc_temperature": self._state.last_ffc_temperature,
+                "uptime": due,
+            }
+            rows = telemetry.encode(values, self.shape[1], self.telemetry_rows)
+            metadata = telemetry.metadata(rows)
+        return Frame(self._last.copy(), due, self.clock(), number, camera.GOOD, rows, metadata)
+
+    def image(self, time: float) -> Counts:
+        """Counts through the filter in the beam at a time [s]."""
+        band = self.band or self.world.filter_name
+        if band is None:
+            return np.full(self.shape, CLOSED, dtype=np.uint16)
+        if band not in self.pictures:
+            raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
+        image = self.pictures[band](self.world.scene_time(time))
+        if image.shape != self.shape or image.dtype != np.uint16:
+            raise ValueError(
+                f"Invalid picture {image.shape} of {image.dtype} in band '{band}'. "
+                f"Must be {self.shape} of uint16."
+            )
+        return image
+
+
+def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
+    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
+
+    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise of `NETD`,
+    a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
+    `dbthermal.bands.FILTERS` get no picture.
+    """
+    names = dict.fromkeys((*session.bands, *session.filters.values()))
+    bands = tuple(name for name in names if name in FILTERS)
+    if not bands:
+        return {}
+    # The cameras, with noise and a fixed pattern.
+    rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
+    detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
+    response = rig.response()
+
+    curves = {band: responses.curve(response, band) for band in bands}
+    generators = {band: np.random.default_rng([0, number]) for number, band in enumerate(bands)}
+    patterns = {band: detector.sel(band=band) for band in bands}
+    deviations = {band: float(response["noise"].sel(band=band)) for band in bands}
+
+    def picture(band: str, _: float) -> Counts:
+        """Picture of the blackbody in a band, at any time of the scene."""
+        level = float(curves[band].counts(np.array(world.blackbody_temperature)))
+        noise = generators[band].normal(0.0, deviations[band], session.shape)
+        return simulation.digitise(level + noise, patterns[band])
+
+    return {band: partial(picture, band) for band in bands}

@@ -1,10 +1,14 @@
-"""Emulated filter wheel FW103 on an emulated APT controller, and an emulated TC-08.
+"""Emulated devices at the end of a line: a Boson's command port, an APT controller, a TC-08.
+
+The command port answers every command of `boson` after the public descriptions, refuses all others,
+and runs the shutter on command only. The duration of a correction and the settings at
+power-on, which the descriptions leave open, are choices made here.
 
 The controller answers below the real driver, byte for byte, with the quirks that users report:
 speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly, and
-reports of moves at any time. Its counter of commanded steps agrees with the wheel only once the
-home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of AlexShkarin/pyLabLib and the
-documentation of thorlabs_apt_device; the rest as in `_apt`.
+reports of moves at any time. Its counter of commanded steps agrees with the wheel, an FW103, only
+once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
+AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
 
 The TC-08 has the functions of the vendor's library, and none of its code: it writes into the
 caller's ctypes buffers. Signatures, error numbers and NaN for channels that are off are those of
@@ -13,27 +17,162 @@ certain.
 """
 
 import math
+import struct
+import threading
 from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
+from scipy.constants import zero_Celsius
+
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments._apt import Id, StatusBits
-from dbthermal.instruments.clock import Clock
-from dbthermal.instruments.emulated import ROOM, Line, World
-from dbthermal.instruments.emulated.camera import EmulatedBoson
-from dbthermal.instruments.filterwheel import BSC20X
+from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments import boson
+from dbthermal.instruments._apt import Id
+from dbthermal.instruments.camera import FfcMode, FfcStatus
+from dbthermal.instruments.emulated import ROOM, World
+from dbthermal.instruments.filterwheel import BSC20X, StatusBits
 from dbthermal.instruments.session import WHEEL
 from dbthermal.instruments.tc08 import CHANNELS
+from dbthermal.instruments.transport import Clock, Closing, TransportError
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
+TICK: Final = 0.01  # shortest wait until a device is asked again if it has something to say [s]
+FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 SERIAL_NUMBER: Final = 40_000_000
 SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
 CONVERSION: Final = 0.1  # conversion time of one channel of the TC-08 [s]
 RANGE: Final = (3.15, 673.15)  # of its thermocouples of type T [K]
 WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
+
+_REFUSED: Final = 0x161  # of `boson.STATUSES`: of every request that the driver does not send
+
+
+class Line(Closing):
+    """An emulated device at the end of a line: a `transport.Transport`, for any number of threads.
+
+    A device takes bytes by `receive`, and `poll` gives its replies. Bytes that a driver does not
+    read are kept. `TransportError` once the device is pulled out.
+    """
+
+    is_simulated, plugged = True, True  # False once it was pulled out
+
+    def __init__(self, world: World) -> None:
+        self.world, self.clock = world, world.clock
+        self._replies, self._pieces = list[bytes](), list[bytes]()
+        self._lock, self._closed = threading.Lock(), False
+
+    def receive(self, data: bytes) -> None:
+        """Take in bytes from the driver."""
+        raise NotImplementedError
+
+    def poll(self) -> list[bytes]:
+        """Give the replies that are due, each piece to be read by itself."""
+        replies, self._replies = self._replies, []
+        return replies
+
+    def next_due(self) -> float:
+        """Time until something may be due [s]; infinite if it waits for bytes."""
+        return 0.0 if self._replies else math.inf
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the device; see `Transport.write`."""
+        with self._lock:
+            self._check()
+            self.receive(data)
+
+    def read(self, size: int, timeout: float) -> bytes:
+        """Give one piece of the device's output; see `Transport.read`."""
+        deadline = self.clock() + timeout
+        while True:
+            with self._lock:
+                self._check()
+                self._pieces += self.poll()
+                if self._pieces:
+                    piece = self._pieces.pop(0)
+                    if piece[size:]:
+                        self._pieces.insert(0, piece[size:])
+                    return piece[:size]
+                pause = max(self.next_due(), TICK)
+            remaining = deadline - self.clock()
+            if remaining <= 0:
+                return b""
+            self.clock.sleep(min(remaining, pause))
+
+    def close(self) -> None:
+        """End; a second call does nothing."""
+        self._closed = True
+
+    def _check(self) -> None:
+        if self._closed or not self.plugged:
+            raise TransportError("Lost the emulated device. It must stay connected and open.")
+
+
+class EmulatedBoson(Line):
+    """The command port of a camera of a world; KeyError if there is no camera of this name."""
+
+    def __init__(self, world: World, name: str) -> None:
+        super().__init__(world)
+        self.camera = world.camera(name)
+        # At power-on, by the identifier that sets them; not those of a real camera.
+        self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
+        self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
+        self._name, self._decoder = name, fslp.Decoder()
+
+    @property
+    def plugged(self) -> bool:  # type: ignore[override]
+        """False once the camera was pulled out."""
+        return self.camera.plugged
+
+    def receive(self, data: bytes) -> None:
+        """Take in bytes; frames of channels that have no commands are ignored."""
+        for frame in self._decoder.feed(data):
+            if frame.channel == fslp.COMMAND_CHANNEL:
+                self.request(frame)
+
+    def request(self, frame: fslp.Frame) -> None:
+        """Take in one request, and answer at once."""
+        self._replies.append(self.reply(frame))
+
+    def reply(self, request: fslp.Frame) -> bytes:
+        """Bytes of the reply to a request, with status and data."""
+        command, data, status, answer = request.command, request.data, 0, b""
+        with self.world.lock:
+            if not self.camera.has_frames:
+                self.camera.frame_count = math.floor(self.clock() * FRAME_RATE)
+            readings = self._readings()
+            sizes = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4)}
+            sizes |= dict.fromkeys(readings, 0)
+            if request.status != fslp.REQUEST or len(data) != sizes.get(command):
+                status = _REFUSED
+            elif command == boson.RUN_FFC:
+                self.world.start_ffc(self._name)
+            elif command in self.settings:
+                (self.settings[command],) = struct.unpack(">i", data)
+            else:
+                answer = readings[command]
+        return fslp.encode(request.sequence, command, answer, status)
+
+    def _readings(self) -> dict[int, bytes]:
+        """Data of every reading and setting, by the identifier that reads it."""
+        camera = self.camera
+        status = FfcStatus.COMPLETE if camera.ffc_count else FfcStatus.NONE_PERFORMED
+        if self.world.ffc_in_progress(self._name):
+            status = FfcStatus.IN_PROGRESS
+        values: dict[boson.Reading[Any], tuple[int | bytes, ...]] = {
+            boson.SERIAL_NUMBER: (camera.serial_number,),
+            boson.PART_NUMBER: (b"EMULATED-BOSON-640",),
+            boson.SENSOR_SERIAL_NUMBER: (camera.serial_number,),
+            boson.SOFTWARE_REVISION: (0, 0, 0),
+            boson.FPA_TEMPERATURE: (round(10 * (camera.fpa_temperature - zero_Celsius)),),
+            boson.FFC_IN_PROGRESS: (status == FfcStatus.IN_PROGRESS,),
+            boson.FFC_STATUS: (status,),
+            boson.LAST_FFC_FRAME: (camera.last_ffc_frame,),
+        }
+        values |= {key.reading: (self.settings[key.set_command],) for key in boson.SETTINGS}
+        return {key.command: struct.pack(key.layout, *value) for key, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -85,7 +224,10 @@ class EmulatedApt(Line):
         slot = 1 if world.wheel_position is None else world.wheel_position
         self.wheel = ((slot - 1) / 6 + self.slot_offset / 360.0) * self.model.turn
         self._drive: Drive | None = None
-        self._speeds, self._home = apt.Speeds(1, 0, 0, 0), apt.Home(1, 2, 1, 0, 0)
+        self._kept: dict[int, Any] = {
+            Id.MOT_SET_VELPARAMS: apt.Speeds(1, 0, 0, 0),
+            Id.MOT_SET_HOMEPARAMS: apt.Home(1, 2, 1, 0, 0),
+        }
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
 
     def receive(self, data: bytes) -> None:
@@ -114,44 +256,34 @@ class EmulatedApt(Line):
             case Id.MOD_SET_CHANENABLESTATE:
                 self.enabled = message.param2 == apt.YES
             case Id.MOD_REQ_CHANENABLESTATE:
-                state = apt.YES if self.enabled else apt.NO
-                self.reply(Id.MOD_GET_CHANENABLESTATE, param1=1, param2=state)
-            case Id.MOT_SET_VELPARAMS:
-                self._speeds = apt.parse(apt.Speeds, message)
-            case Id.MOT_REQ_VELPARAMS:
-                self.reply(Id.MOT_GET_VELPARAMS, apt.pack(self._speeds))
-            case Id.MOT_SET_HOMEPARAMS:
-                self._home = apt.parse(apt.Home, message)
-            case Id.MOT_REQ_HOMEPARAMS:
-                self.reply(Id.MOT_GET_HOMEPARAMS, apt.pack(self._home))
+                self.reply(Id.MOD_GET_CHANENABLESTATE, value=apt.YES if self.enabled else apt.NO)
+            case Id.MOT_SET_VELPARAMS | Id.MOT_SET_HOMEPARAMS:
+                self._kept[message.id] = apt.parse(type(self._kept[message.id]), message)
+            case Id.MOT_REQ_VELPARAMS | Id.MOT_REQ_HOMEPARAMS:
+                self.reply(Id(message.id + 1), apt.pack(self._kept[message.id - 1]))
             case Id.MOT_REQ_STATUSUPDATE:
                 self.reply(Id.MOT_GET_STATUSUPDATE, apt.pack(self.status()))
-            case _:
-                self._move(message)
-
-    def _move(self, message: apt.Message) -> None:
-        """Begin or end a motion."""
-        if message.id == Id.MOT_MOVE_HOME:
-            # Back to the home switch, or on to it, and further by the controller's own offset.
-            forward = self._home.direction == 1
-            way = -self.wheel % self.model.turn if forward else -(self.wheel % self.model.turn)
-            self.start(way + self._home.offset, self._home.velocity, homing=True)
-        elif message.id == Id.MOT_MOVE_ABSOLUTE and message.data:
-            target = apt.parse(apt.Position, message).position
-            self.start(target - self.position, self._speeds.velocity)
-        elif message.id == Id.MOT_MOVE_STOP:  # at once, ramps are left out
-            self._drive = None
-            self.report(Id.MOT_MOVE_STOPPED)
+            case Id.MOT_MOVE_HOME:
+                # Back to the home switch, or on to it, and further by the controller's own offset.
+                way, home = -(self.wheel % self.model.turn), self._kept[Id.MOT_SET_HOMEPARAMS]
+                way += self.model.turn if home.direction == 1 and way else 0
+                self.start(way + home.offset, home.velocity, homing=True)
+            case Id.MOT_MOVE_ABSOLUTE if message.data:
+                target = apt.parse(apt.Position, message).position
+                velocity = self._kept[Id.MOT_SET_VELPARAMS].velocity
+                self.start(target - self.position, velocity)
+            case Id.MOT_MOVE_STOP:  # at once, ramps are left out
+                self._drive = None
+                self.report(Id.MOT_MOVE_STOPPED)
 
     def start(self, distance: float, velocity: float, *, homing: bool = False) -> None:
         """Begin a motion [count], unless the motor has no current or is too slow [device units]."""
         speed = velocity / self.model.velocity
-        acceleration = self._speeds.acceleration / self.model.acceleration
+        acceleration = self._kept[Id.MOT_SET_VELPARAMS].acceleration / self.model.acceleration
         if self.enabled and speed >= SLOWEST and acceleration > 0:
             now = self.world.clock()
-            self._drive = self.plan(
-                Drive(now, self.position, distance, speed, acceleration, homing)
-            )
+            drive = Drive(now, self.position, distance, speed, acceleration, homing)
+            self._drive = self.plan(drive)
             self.homed &= not homing
             self._advance()
 
@@ -161,32 +293,22 @@ class EmulatedApt(Line):
 
     def report(self, identifier: Id) -> None:
         """Report the end of a motion, without a request."""
-        self.reply(identifier, param1=1)
+        self.reply(identifier)
 
-    def reply(
-        self,
-        identifier: Id,
-        data: bytes = b"",
-        *,
-        param1: int = 0,
-        param2: int = 0,
-        source: int = 0,
-    ) -> None:
-        """Send a message; its source is the motor's address by default."""
-        address = source or self.address
-        message = apt.Message(identifier, param1, param2, apt.HOST, address, data)
+    def reply(self, identifier: Id, data: bytes = b"", value: int = 0, source: int = 0) -> None:
+        """Send a message, of channel 1 without data; by default from the motor's address."""
+        address, channel = source or self.address, 0 if data else 1
+        message = apt.Message(identifier, channel, value, apt.HOST, address, data)
         self._replies.append(apt.encode(message))
 
     def status(self) -> apt.Status:
         """State of the motor, as the controller reports it."""
-        # The state at rest, and of a motion.
-        bits = StatusBits.CONNECTED
+        bits, drive = StatusBits.CONNECTED, self._drive
         bits |= StatusBits.ENABLED if self.enabled else 0
         bits |= StatusBits.HOMED if self.homed else 0
-        if self._drive is not None:
-            forward = self._drive.distance > 0
-            bits |= StatusBits.MOVING_FORWARD if forward else StatusBits.MOVING_REVERSE
-            bits |= StatusBits.HOMING if self._drive.homing else 0
+        if drive is not None:
+            bits |= StatusBits.MOVING_FORWARD if drive.distance > 0 else StatusBits.MOVING_REVERSE
+            bits |= StatusBits.HOMING if drive.homing else 0
         return apt.Status(1, self.position, 0, bits)
 
     def _advance(self) -> None:

@@ -5,7 +5,7 @@ recording, `notes` its log, `overview` a folder of recordings, and `open_sweep` 
 those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +40,7 @@ __all__ = [
 __dir__ = __all__.copy
 
 Region = tuple[slice, slice]
+Valid = npt.NDArray[np.bool_]
 
 # Attribute of a sweep, as of `calibration.fit_response`, by the key of the session's blackbody.
 _ACCURACY: Final = {
@@ -90,8 +91,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
-    if fitted:
-        opened = _fitted(opened)
+    opened = _fitted(opened) if fitted else opened
     # Exposure times are checked against a coordinate, which is made of them.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
     time = fill_times(exposure_times(numbered)[0])
@@ -101,11 +101,9 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
 
 def _fitted(recording: xr.Dataset) -> xr.Dataset:
     """Put exposure times of good frames on the host's clock by a line through both."""
-    unusable = recording["frame_flags"].values & int(UNTIMED)
     device, host = recording["device_time"].values, recording["host_time"].values
-    stamps, rates = np.full(device.shape, np.nan), []
-    for place, band in enumerate(recording["band"].values):
-        good = (unusable[place] == 0) & np.isfinite(device[place])
+    stamps, rates, valid = np.full(device.shape, np.nan), [], _good(recording, UNTIMED)
+    for place, (band, good) in enumerate(zip(recording["band"].values, valid, strict=True)):
         if np.count_nonzero(good) < 2:
             raise ValueError(f"Invalid band '{band}' without two good frames. Must have two.")
         line = np.polynomial.Polynomial.fit(device[place, good], host[place, good], 1)
@@ -153,31 +151,31 @@ def overview(folder: str | Path) -> xr.Dataset:
         NaN without two; `complete`, whether the recording went to its planned end. Coordinates
         `recording` and `band`.
     """
-    rows = [
-        {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}
-        for path in sorted(Path(folder).glob("*.zarr"))
-        if "frames_written" in (opened := store.open_dataset(path)).attrs
-        for band, totals in opened.attrs["totals"].items()
-    ]
+    rows = []
+    for path in sorted(Path(folder).glob("*.zarr")):
+        attrs = (recording := store.open_dataset(path)).attrs
+        for band, number in attrs.get("frames_written", {}).items():
+            frames = recording.sel(band=band).isel(time=slice(0, number))
+            steps = np.diff(frames["device_time"].values[_good(frames, UNTIMED)])
+            session = attrs["provenance"]["parameters"]
+            row = {
+                "good": np.count_nonzero(_good(frames, UNTIMED | FrameFlag.SHUTTER_CLOSED)),
+                "promised": round(session["duration"] * session["frame_rate"]),
+                "frame_rate": 1.0 / float(np.median(steps)) if steps.size else np.nan,
+                "complete": bool(attrs["complete"]),
+            }
+            rows.append({"recording": path.stem, "band": band, **attrs["totals"][band], **row})
     if not rows:
         raise ValueError(f"Invalid folder '{folder}' without recordings. Must have one.")
     table = xr.Dataset({name: ("row", [row[name] for row in rows]) for name in rows[0]})
     return table.set_coords(["recording", "band"])
 
 
-def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
-    written = slice(0, recording.attrs["frames_written"][band])
-    frames = recording[["device_time", "frame_flags"]].sel(band=band).isel(time=written)
-    stamps, flags = frames["device_time"].values, frames["frame_flags"].values
-    usable = ((flags & int(UNTIMED)) == 0) & np.isfinite(stamps)
-    steps = np.diff(stamps[usable])
-    session = recording.attrs["provenance"]["parameters"]
-    return {
-        "good": np.count_nonzero(usable & ((flags & int(FrameFlag.SHUTTER_CLOSED)) == 0)),
-        "promised": round(session["duration"] * session["frame_rate"]),
-        "frame_rate": 1.0 / float(np.median(steps)) if steps.size else np.nan,
-        "complete": bool(recording.attrs["complete"]),
-    }
+def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Valid:
+    """True for the frames that have a stamp and none of the flags."""
+    flags, stamps = frames["frame_flags"].values, frames[stamp].values
+    valid: Valid = np.isfinite(stamps) & ((flags & int(bad)) == 0)
+    return valid
 
 
 def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
@@ -264,23 +262,20 @@ def bench_series(
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in steps:
         background = _agreed(paths, BLACKBODY, stability)
-        captures = dict(_bands(paths))
+        captures = _bands(paths)
         for material, place in region.items():
             means = [_mean(captures[band], band, place, correction) for band in captures]
-            values = {
-                "counts": ("band", means),
-                "object_temperature": _agreed(paths, material, stability),
-                "background_temperature": background,
-            }
-            series[material].append(xr.Dataset(values, {"band": list(captures)}))
+            temperature = _agreed(paths, material, stability)
+            values = {"object_temperature": temperature, "background_temperature": background}
+            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*captures]})
+            series[material].append(measurement)
     # All steps of a material together.
     joined = {}
     for material, measurements in series.items():
         dataset = xr.concat(measurements, "measurement").transpose("band", "measurement")
         for variable, described in schema.STAGES["contact"].items():
             dataset[variable].attrs = described.attrs
-        dataset.attrs = {**shared, "material": material}
-        joined[material] = schema.check(dataset, "contact")
+        joined[material] = schema.check(dataset.assign_attrs(shared, material=material), "contact")
     return joined
 
 
@@ -316,8 +311,7 @@ def mean_reading(path: str | Path, source: str) -> float:
 
     FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
     """
-    values = [note[3] for note in notes(path) if note[1:3] == ("reading", source)]
-    if not values:
+    if not (values := [note[3] for note in notes(path) if note[1:3] == ("reading", source)]):
         raise ValueError(f"No reading of '{source}' in the recording '{path}'. Must have one.")
     return float(np.mean(values))
 
@@ -338,14 +332,13 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
         steps.append([step_path(folder, name, number, band) for band in bands])
         for path, band in zip(steps[-1], bands, strict=True):
             if not is_complete(path):
-                state = "Incomplete" if path.exists() else "Missing"
-                rule = "Must be recorded to its end"
-                raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
+                state = f"{'Incomplete' if path.exists() else 'Missing'} recording '{path}'"
+                raise ValueError(f"{state} of the sweep. Must be recorded to its end.")
             require_filter(path, band)
-    shared = {key: attrs[key] for key in ("is_simulated", "origin")}
-    named = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
-    shared |= {key: value for key, value in named.items() if value is not None}
-    return steps, blackbody["stability"], shared
+    stated = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
+    shared = {key: attrs[key] for key in ("is_simulated", "origin")} | stated
+    valid = {key: value for key, value in shared.items() if value is not None}
+    return steps, blackbody["stability"], valid
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:
@@ -360,28 +353,26 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
     return float(np.mean(means))
 
 
-def _bands(paths: list[Path]) -> Iterator[tuple[str, xr.Dataset]]:
+def _bands(paths: list[Path]) -> dict[str, xr.Dataset]:
     """Each band with the first recording that has it."""
-    yielded: set[str] = set()
+    captures: dict[str, xr.Dataset] = {}
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
         for band in map(str, capture["band"].values):
-            if band not in yielded:
-                yielded.add(band)
-                yield band, capture
+            captures.setdefault(band, capture)
+    return captures
 
 
 def _good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
     """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
-    frames = capture.sel(band=band)
-    has_view = (frames["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) == 0
-    return np.flatnonzero(np.isfinite(frames["exposure_time"].values) & has_view)
+    good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
+    return np.flatnonzero(good)
 
 
 def _movie(paths: list[Path], frames: int) -> xr.DataArray:
     """Counts (band, frame, y, x) of a step."""
     films = []
-    for band, capture in _bands(paths):
+    for band, capture in _bands(paths).items():
         good = _good_frames(capture, band)
         if good.size < frames:
             text = f"with {good.size} good frames in band '{band}'. Must have {frames}"
@@ -397,10 +388,9 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     place = {"y": region[0], "x": region[1]}
     good = _good_frames(capture, band)
     cropped = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
-    source = f"of band '{band}' in '{capture.attrs['path']}'"
-    if cropped["counts"].size == 0:
+    counts, source = cropped["counts"], f"of band '{band}' in '{capture.attrs['path']}'"
+    if counts.size == 0:
         raise ValueError(f"No frame or no pixel {source}. Must have one.")
-    counts = cropped["counts"]
     if correction is not None:
         corrected = correct(cropped, correction.isel(place))
         counts = corrected["counts"].where(corrected["status"] == 0)

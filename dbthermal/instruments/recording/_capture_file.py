@@ -138,21 +138,19 @@ class _Band:
 class CaptureFile:
     """A new recording at `path` that takes frames and notes in the order in which they come.
 
-    `readings` has the unit of each instrument, `origin` is the host's clock at time 0 [s], `chunk`
-    the number of frames that are written together. FileExistsError if `path` exists; ValueError if
-    the sources differ in shape or telemetry. After a failed write `broken` is True: what was
-    written before is valid, and nothing more may be written.
+    `readings` has the unit of each instrument, `chunk` is the number of frames that are written
+    together. FileExistsError if `path` exists; ValueError if the sources differ in shape or
+    telemetry. After a failed write `broken` is True: what was written before is valid, and nothing
+    more may be written.
     """
 
     def __init__(
         self,
         path: str | Path,
         sources: Mapping[str, FrameSource],
-        *,
         readings: Mapping[str, str],
-        origin: float,
         attrs: Mapping[str, Any],
-        chunk: int = CHUNK,
+        chunk: int,
     ) -> None:
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
@@ -160,9 +158,8 @@ class CaptureFile:
         (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
-        self._origin, self._chunk = origin, chunk
-        self._clock = next(iter(sources.values())).clock
-        self._start: dict[str, Any] = {}  # attributes of `begin`
+        self._clock, self._chunk = next(iter(sources.values())).clock, chunk
+        self.begin()
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []  # rows of the log that are not written yet
         self.broken = False
@@ -175,8 +172,8 @@ class CaptureFile:
             chunk=chunk,
             attrs={
                 **attrs,
+                **self._start,
                 "comment": ABOUT,
-                "clock_origin": origin,
                 "log_sources": self._names,
                 "log_units": dict(readings),
                 "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
@@ -191,9 +188,11 @@ class CaptureFile:
         """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
         return {band: dict(state.totals) for band, state in self._bands.items()}
 
-    def begin(self, origin: float, started: str) -> None:
-        """Let the recording begin at a time on the host's clock [s], `started` in UTC."""
-        self._origin, self._start = origin, {"clock_origin": origin, "started": started}
+    def begin(self) -> float:
+        """Let the recording begin now, at the time on the host's clock [s] that is returned."""
+        self._origin, started = self._clock(), self._clock.utc().isoformat(timespec="milliseconds")
+        self._start = {"clock_origin": self._origin, "started": started}
+        return self._origin
 
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
         """Take a frame, write the chunk if it is full, and return all flags of the frame.
@@ -264,6 +263,7 @@ class CaptureFile:
         """Flags from the frame before, with notes of the frames that are missing between them."""
         state, flags = self._bands[band], camera.GOOD
         self.refused(band, refused, frame.host_time)
+        # The number.
         step = 1 if state.last is None else frame.sequence - state.last.sequence
         lost = step - 1 - refused
         if step < 1:
@@ -273,39 +273,36 @@ class CaptureFile:
             state.totals["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
         flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else camera.GOOD
+        # The image.
         if state.last is not None and np.array_equal(frame.counts, state.last.counts):
             flags |= FrameFlag.IMAGE_REPEATED
         state.last = frame
-        return flags | self._timed(state, frame)
-
-    def _timed(self, state: _Band, frame: Frame) -> FrameFlag:
-        """Flag of an invalid stamp; one of the future must not spoil those that follow."""
+        # The stamp, of which one of the future must not spoil those that follow.
         has_own_clock, time = FrameFlag.FOREIGN_CLOCK in frame.flags, frame.device_time
         if not has_own_clock and (time < self._origin or time > frame.host_time + _AHEAD):
-            return FrameFlag.TIME_WRONG
-        if not frame.device_time > state.device_time:  # NaN too
-            return FrameFlag.TIME_STANDS
-        state.device_time = frame.device_time
-        return camera.GOOD
+            return flags | FrameFlag.TIME_WRONG
+        if not time > state.device_time:  # NaN too
+            return flags | FrameFlag.TIME_STANDS
+        state.device_time = time
+        return flags
 
     def _watch_shutter(self, band: str, frame: Frame, flags: FrameFlag) -> FrameFlag:
         """Flag of a closed shutter, from telemetry, serial line and image."""
         state = self._bands[band]
-        read_at, status = state.ffc_status
-        before = state.shutter
+        (read_at, status), before = state.ffc_status, state.shutter
         state.shutter = camera.next_shutter(
             before,
             repeated=FrameFlag.IMAGE_REPEATED in flags,
             last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
             ffc_status=status if frame.host_time - read_at <= _STALE else None,
         )
-        if state.shutter.closed != before.closed:
-            kind = Note.SHUTTER_CLOSED if state.shutter.closed else Note.SHUTTER_OPEN
+        closed, renewed = state.shutter.closed, state.shutter.last_ffc_frame
+        if closed != before.closed:
+            kind = Note.SHUTTER_CLOSED if closed else Note.SHUTTER_OPEN
             self.note(kind, band, frame.host_time, frame.sequence)
-        renewed = state.shutter.last_ffc_frame
         if renewed is not None and before.last_ffc_frame not in {None, renewed}:
             self.note(Note.CORRECTION, band, frame.host_time, renewed)
-        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else camera.GOOD
+        return FrameFlag.SHUTTER_CLOSED if closed else camera.GOOD
 
     def _write(self, band: str) -> None:
         state = self._bands[band]

@@ -22,9 +22,9 @@ from typing import Final
 
 from dbthermal import store
 from dbthermal.instruments import camera
-from dbthermal.instruments.clock import Clock, Task
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.transport import Clock, Task
 from dbthermal.store._signals import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
@@ -153,12 +153,10 @@ def record(
         SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
         the wait, not the writing.
     """
-    limits, readings = limits or Limits(), readings or {}
-    clock = _check(session, sources)
+    limits, clock = limits or Limits(), _check(session, sources)
     with raised_signals(), clock.joined():
-        file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
         # The writer starts the other threads, this one shows the preview.
-        run = _Run(file, sources, readings, limits, session.duration)
+        run = _Run(session, sources, Path(path), readings or {}, identities or {}, limits)
         # No daemon: it ends its work whatever becomes of this thread.
         writer = Task(clock, "writer", run.write, daemon=False)
         try:
@@ -174,7 +172,7 @@ def record(
                     pass
     if run.errors:
         raise run.errors[0]
-    return Summary(file.recording.place(), run.ended, file.totals)
+    return Summary(run.file.recording.place(), run.ended, run.file.totals)
 
 
 def _check(session: Session, sources: Mapping[str, camera.FrameSource]) -> Clock:
@@ -193,59 +191,41 @@ def _check(session: Session, sources: Mapping[str, camera.FrameSource]) -> Clock
     return clock
 
 
-def _new_file(
-    session: Session,
-    sources: Mapping[str, camera.FrameSource],
-    readings: Mapping[str, Reading],
-    identities: Identities,
-    path: Path,
-    limits: Limits,
-) -> CaptureFile:
-    """Create the capture file, if the disk has room for all of it, uncompressed."""
-    # Room on the disk.
-    path.absolute().parent.mkdir(parents=True, exist_ok=True)
-    frames = sum(session.duration * source.frame_rate for source in sources.values())
-    size = int(_BYTES * math.prod(session.shape) * frames)
-    _check_space(path.absolute().parent, limits.reserve + size)
-    clock = next(iter(sources.values())).clock
-    # What the recording says of its devices.
-    devices = {band: source.identity for band, source in sources.items()}
-    attrs = {
-        "is_simulated": session.simulated,
-        "origin": "simulated, emulated rig" if session.simulated else "measured",
-        "identities": {
-            name: {**devices.get(name, {}), **identities.get(name, {})}
-            for name in {**devices, **identities}
-        },
-        "frame_rates": {band: source.frame_rate for band, source in sources.items()},
-        "started": _utc(clock),
-        "provenance": store.provenance(asdict(session)),
-    }
-    units = {name: reading.units for name, reading in readings.items()}
-    origin, chunk = clock(), limits.chunk
-    return CaptureFile(path, sources, readings=units, origin=origin, attrs=attrs, chunk=chunk)
-
-
-def _utc(clock: Clock) -> str:
-    return clock.utc().isoformat(timespec="milliseconds")
-
-
 class _Run:
-    """A recording: the threads that fetch, read and write, and their shared state."""
+    """A recording in a new file: the threads that fetch, read and write, and their shared state."""
 
     def __init__(
         self,
-        file: CaptureFile,
+        session: Session,
         sources: Mapping[str, camera.FrameSource],
+        path: Path,
         readings: Mapping[str, Reading],
+        identities: Identities,
         limits: Limits,
-        duration: float,
     ) -> None:
-        self.file, self.readings, self.limits = file, readings, limits
+        self.readings, self.limits = readings, limits
         self.clock = next(iter(sources.values())).clock
-        self.start = self.clock()  # to make the file may have taken a while
-        self.end = self.start + duration
-        file.begin(self.start, _utc(self.clock))
+        # Room on the disk for all frames, uncompressed.
+        folder = path.absolute().parent
+        folder.mkdir(parents=True, exist_ok=True)
+        frames = sum(session.duration * source.frame_rate for source in sources.values())
+        _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
+        # What the recording says of its devices.
+        devices = {band: source.identity for band, source in sources.items()}
+        attrs = {
+            "is_simulated": session.simulated,
+            "origin": "simulated, emulated rig" if session.simulated else "measured",
+            "identities": {
+                name: {**devices.get(name, {}), **identities.get(name, {})}
+                for name in {**devices, **identities}
+            },
+            "frame_rates": {band: source.frame_rate for band, source in sources.items()},
+            "provenance": store.provenance(asdict(session)),
+        }
+        self.units = {name: reading.units for name, reading in readings.items()}
+        self.file = CaptureFile(path, sources, self.units, attrs, chunk=limits.chunk)
+        self.start = self.file.begin()  # to make the file may have taken a while
+        self.end = self.start + session.duration
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
@@ -318,15 +298,13 @@ class _Run:
 
     def show(self, preview: Callable[[Preview], None] | None) -> None:
         """Call the preview at its period, until the last frame is written."""
-        units = {name: reading.units for name, reading in self.readings.items()}
         period = _SHOW_POLL  # until there is something to show
         # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.
         while not self.clock.wait(self.done, period):
             if preview and self.last_frames and self._is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
-                time, totals = self.clock() - self.start, self.totals
-                frames, readings = dict(self.last_frames), dict(self.last_readings)
-                preview(Preview(time, frames, totals, readings, units))
+                time, frames = self.clock() - self.start, dict(self.last_frames)
+                preview(Preview(time, frames, self.totals, dict(self.last_readings), self.units))
 
     def write(self) -> None:
         """Start the other threads, write frames and notes until the end, and close the file.
@@ -353,12 +331,18 @@ class _Run:
                 self.clock.get(self._work, _WRITE_POLL)()
 
     def _finish(self) -> None:
-        """Write what is left in the queue, and close the file."""
+        """Write what is left in the queue, and close the file with the reason of the end."""
         while not self._work.empty():
             self._work.get_nowait()()
         for band, number in self._refused_last.items():
             self.file.refused(band, number, self.clock())
-        self.ended = self._reason()
+        if self.errors:
+            is_full = getattr(self.errors[0], "errno", 0) == errno.ENOSPC
+            self.ended = "no space" if is_full else "error"
+        elif self.interrupted or self._lost_sources:
+            self.ended = self.interrupted or "source lost"
+        else:
+            self.ended = "duration" if len(self.last_frames) == len(self._room) else "no frames"
         self.file.close(complete=self.ended == "duration", ended=self.ended)
 
     def _frame(self, band: str, frame: camera.Frame, refused: int) -> None:
@@ -378,18 +362,6 @@ class _Run:
         self.file.note(kind, source, time, value)
         if kind in {Note.READING, Note.READING_FAILED}:
             self.last_readings[source] = value
-
-    def _reason(self) -> str:
-        """Reason for the end of the recording, in one or two words."""
-        if self.errors:
-            return "no space" if getattr(self.errors[0], "errno", 0) == errno.ENOSPC else "error"
-        if self.interrupted:
-            return self.interrupted
-        if self._lost_sources:
-            return "source lost"
-        if len(self.last_frames) < len(self._room):
-            return "no frames"
-        return "duration"
 
 
 def _check_space(path: Path, least: int) -> None:
