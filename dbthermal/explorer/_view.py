@@ -1,6 +1,6 @@
 """View of a result or a capture: panes, frames, ranges of colour, curves, and code for them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -12,19 +12,22 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal._coordinates import laid_on
-from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
+from dbthermal.explorer._films import (
+    FILMS,
+    Pane,
+    Progress,
+    Values,
+    input_panes,
+    marks,
+    opened,
+    result_panes,
+)
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
 
 COMPLETED: Final = int(schema.COMPLETED)
-FILMS: Final = {
-    "object_temperature": "object temperature",
-    "background_temperature": "reflected temperature",
-}
-_ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 _SAMPLES: Final = 2**22  # of a region's film that are read in one pass
 _RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the range of colour
 
@@ -102,7 +105,10 @@ class View:
             for name, source in sources.items()
             if source is not None
         }
-        self.panes = {pane.name: pane for pane in self._panes(is_capture=is_capture)}
+        reference = self.data if is_capture else self.data.get("object_temperature")
+        inputs = [] if self.capture is None else input_panes(self.capture, self.response, reference)
+        results = [] if is_capture else result_panes(self.data)
+        self.panes = {pane.name: pane for pane in (*inputs, *results)}
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
@@ -114,65 +120,6 @@ class View:
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
-
-    def _panes(self, *, is_capture: bool) -> Iterator[Pane]:
-        """Yield the panes, in the order in which they are shown."""
-        if self.capture is not None:
-            reference = self.data if is_capture else self.data.get("object_temperature")
-            yield from self._inputs(self.capture, reference)
-        if is_capture:
-            return
-        data = self.data
-        if "object_temperature" not in data:
-            raise ValueError(
-                f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}. Must be a "
-                "result of separation, or a capture with 'counts'."
-            )
-        variables = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
-        for name in (name for name in variables if name in data):
-            schema.check_variable(data[name], variables[name], f"'{name}' of the result")
-            laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
-        missing = str(data.attrs.get("not_estimated", "")).split()
-        shown = [name for name in (*FILMS, "emissivity") if name in data and name not in missing]
-        for name in [*shown, *(f"{name}_std" for name in shown if f"{name}_std" in data)]:
-            yield from self._of(name, missing)
-        if "status" in data:
-            yield Pane("status", "status", "1", data["status"])
-
-    def _of(self, name: str, missing: Sequence[str]) -> Iterator[Pane]:
-        """Yield the panes of a variable of a result: one, or one a band."""
-        if name in missing:
-            return
-        array, base = self.data[name], name.removesuffix("_std")
-        words = FILMS.get(base, base) + (", deviation" if name != base else "")
-        std = f"{name}_std" if name == base and f"{name}_std" in self.data else ""
-        std = "" if std in missing else std
-        if base in FILMS:
-            yield Pane(name, words, "K", array, absolute=name == base, std=std)
-            return
-        for place, band in enumerate(map(str, array["band"].values)):
-            std_name = f"{std} {band}" if std else ""
-            title = f"{band} \N{MICRO SIGN}m {words}"
-            yield Pane(f"{name} {band}", title, "1", array.isel(band=place), std=std_name)
-
-    def _inputs(
-        self, capture: xr.Dataset, reference: xr.Dataset | xr.DataArray | None
-    ) -> Iterator[Pane]:
-        """Yield the bands of a capture, as apparent temperatures if there is a response."""
-        if "counts" in capture and "band" not in capture["counts"].dims:  # of one camera
-            schema.check_variable(capture["counts"], _ONE_BAND, "'counts' of the capture")
-            yield Pane("input", "input", "count", capture["counts"])
-            return
-        counts = schema.check(capture, "capture")["counts"]
-        if reference is not None and reference is not capture:
-            counts = laid_on(counts, reference, "the capture", "the result")
-        for place, band in enumerate(map(str, counts["band"].values)):
-            film, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
-            if self.response is None:
-                yield Pane(f"input {band}", label, "count", film)
-            else:
-                curve = responses.curve(self.response, band)
-                yield Pane(f"input {band}", label, "K", film, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
         """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
