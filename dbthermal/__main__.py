@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves, progress
+from dbthermal._cli import is_source, leaves, stage_shown
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -380,8 +380,8 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
-    with progress.shown(options.command):
-        _command("unused", "refuse")(options, arguments)
+    with stage_shown(options.command):
+        _command("files", "refuse_unused")(options, arguments)
         sources, targets = _sources_and_targets(options)
         if options.dry_run:
             summary = _command("steps", "foreseen")(options, sources, targets)

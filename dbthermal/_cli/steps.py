@@ -23,6 +23,7 @@ from dbthermal import (
     separation,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
+from dbthermal._cli.summary import outline
 from dbthermal._warnings import warned
 from dbthermal.limits._planner import SKY_LEVEL
 from dbthermal.response import ACCURACY
@@ -199,10 +200,10 @@ def foreseen(
         contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
         inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
-            inputs[str(path)] |= files.outline(files.opened(path))
+            inputs[str(path)] |= outline(files.opened(path))
     summary: dict[str, Any] = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
+        summary["would_be"] = outline(files.capture(options.files, options, options.offset))
     # Bytes of an output before its compression, and those that the disk has for it.
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
