@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from dbthermal._arrays import Array
@@ -80,17 +81,9 @@ def raw(
     if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
         rule = "Must be rows and columns, two whole numbers"
         raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
-    # Size of the file, which the form must fill.
-    frame = frame_header + 2 * shape[0] * shape[1]
-    frames, remainder = divmod(file.stat().st_size - header, frame)
-    if frames < 1 or remainder:
-        label = f"{file.stat().st_size} bytes of '{name}': {frames} frames and {remainder} bytes"
-        rule = f"Must be {header} + a whole number of {frame}, as shape and headers state"
-        raise ValueError(f"Invalid size {label}. {rule}.")
-    recordings.check_memory((frames, *shape), memory, name)
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = recordings.film(np.memmap(file, form, "r", offset=header)["counts"])
+    counts = recordings.film(_frames(file, form, header, memory)["counts"])
     if (sign := recordings.smoother(counts)) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
@@ -153,6 +146,18 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
     return recordings.clocked(counts, name=path.name, **kind)
 
 
+def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:
+    """Frames, each with its header and counts, behind a start; the file must hold whole ones."""
+    size = path.stat().st_size
+    number, remainder = divmod(size - start, form.itemsize)
+    if number < 1 or remainder:
+        label = f"{size} bytes of '{path.name}': {number} frames and {remainder} bytes"
+        rule = f"Must be whole frames of {form.itemsize} bytes behind {start}, as stated"
+        raise ValueError(f"Truncated or damaged: {label}. {rule}.")
+    recordings.check_memory((number, *form["counts"].shape), memory, path.name, size)
+    return np.memmap(path, form, "r", start)
+
+
 def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts behind the lines of a header, and their times, if an .inc tells the rate."""
     with path.open("rb") as stream:
@@ -190,19 +195,14 @@ def _lines(header: bytes) -> dict[str, str]:
 
 def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts of frames that have a header each, and their times, which may be those of a rate."""
-    size, first = path.stat().st_size, np.fromfile(path, _HEADER, 1)
+    first = np.fromfile(path, _HEADER, 1)
     if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
         raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")
-    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
-    whole = length + 2 * rows * columns
-    recordings.check_memory((size // whole, rows, columns), memory, path.name, size)
-    if size % whole:
-        label = f"{size} bytes of '{path.name}' in frames of {whole}"
-        raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
     # All frames by their headers, which must be alike.
+    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
     between = ("more", f"V{length - _HEADER.itemsize}")
     form: Any = [("header", _HEADER), between, ("counts", "<u2", (rows, columns))]
-    frames = np.memmap(path, form, "r")
+    frames = _frames(path, np.dtype(form), 0, memory)
     headers = frames["header"]
     for name in ("signature", "length", "rows", "columns", "mode"):
         for number in np.flatnonzero(headers[name] != headers[name][0]):
