@@ -1,11 +1,10 @@
 """Films and maps of a view, read frame by frame from memory, a store, or a computation."""
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import gettempdir
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import _rows, schema, store
 from dbthermal import response as responses
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, empty, on_disk, release
 from dbthermal._coordinates import laid_on
 
 Values = npt.NDArray[np.float32]
@@ -63,23 +62,14 @@ class Pane:
         array = self.array
         if "_source" in vars(self) or array.ndim < 3 or array.variable._in_memory:
             return
-        size = array.size * array.dtype.itemsize
-        with TemporaryFile() as file:
-            try:
-                if hasattr(os, "posix_fallocate"):  # or a full disk would end the process later
-                    os.posix_fallocate(file.fileno(), 0, size)
-            except OSError as error:
-                raise OSError(
-                    error.errno,
-                    f"No room for {size / 1e6:.0f} MB of '{self.name}' in the folder of temporary "
-                    "files. Must be free, or TMPDIR name another folder",
-                ) from error
-            copy = np.memmap(file, array.dtype, "r+", shape=array.shape)
+        with on_disk(Path(gettempdir())):
+            copy = empty(array.shape, array.dtype)
         height = array.encoding.get("preferred_chunks", {}).get("y", 1)
         for block in _rows.blocks(array.shape, max(1, height * array.size // array.shape[1])):
             copy[:, block] = array.isel(y=block).values
             if progress is not None:
                 progress(f"reading {self.label}", block.stop / array.shape[1])
+            release()
         vars(self)["_source"] = copy
 
     def read(

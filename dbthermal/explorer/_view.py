@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from pprint import pformat
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
@@ -357,16 +358,10 @@ class View:
             f"frame = view.frame({name!r}, {index})  # (y, x) at {self.time[index]:.3f} s",
         ]
         if name != "status" and regions:
-            lines.append("regions = {")
+            listed = pformat(dict(regions), width=88, sort_dicts=False)
+            curve = f"view.curve({name!r}, region, pixels={pixels!r})"
             lines += [
-                f"    {key!r}: Region({region.kind!r}, {region.points}),"
-                for key, region in regions.items()
-            ]
-            lines += [
-                "}",
-                "curves = {",
-                f"    key: view.curve({name!r}, region, pixels={pixels!r})",
-                "    for key, region in regions.items()",
-                "}",
+                f"regions = {listed}",
+                f"curves = {{key: {curve} for key, region in regions.items()}}",
             ]
         return "\n".join(lines) + "\n"

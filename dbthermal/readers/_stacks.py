@@ -160,15 +160,13 @@ def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Arra
     times = np.array(_TIMES.findall(text), dtype=np.float64)
     times = times if times.size == frames else np.multiply(interval, np.arange(frames))
     if times.any():
-        seconds = recordings.check_times(times, unit, clock, name)
-        return (seconds if clock is None else recordings.stamps(clock, frames, name)), []
+        stated = recordings.check_times(times, unit, clock, name)
+        return recordings.stamps(stated if clock is None else clock, frames, name), []
     seconds = recordings.stamps(clock, frames, name)
-    if rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate:
-        rule = "Must be the rate of recording; that in the file may be of playing it"
-        return seconds, [
-            f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
-        ]
-    return seconds, []
+    differs = rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate
+    rule = "Must be the rate of recording; that in the file may be of playing it"
+    sentence = f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
+    return seconds, [sentence] if differs else []
 
 
 class _Page(NamedTuple):
