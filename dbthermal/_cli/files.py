@@ -92,7 +92,8 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     if kind != "raw files":
         formats.refuse_text(paths[0])  # of a suffix that promises more
     stated = _arguments(reader, options, paths[0].name, camera)
-    selected = {"time": frames_of(options), "y": _rows_of(options)} if "rows" in options else {}
+    dims = {"time": "frames", "y": "rows"} if "rows" in options else {}
+    selected = {dim: between(options, name) for dim, name in dims.items()}
     if stated.pop("frames", None) and selected and "frames" in signature(reader).parameters:
         stated["frames"] = selected.pop("time")
     # Files of the kinds that make one recording together.
@@ -127,23 +128,17 @@ def _arguments(
     return stated
 
 
-def frames_of(options: argparse.Namespace, most: int | None = None) -> slice:
-    """Frames that are selected: the first N, or from A up to B, and every so many of them."""
-    ends: list[int] = options.frames or []
+def between(options: argparse.Namespace, name: str, most: int | None = None) -> slice:
+    """Frames or rows that are selected: the first N, or from A up to B; every so many frames."""
+    ends: list[int] = vars(options).get(name) or []
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
+    every = vars(options).get("every", 1) if name == "frames" else 1
     if len(ends) > 2 or first < 0 or (end is not None and end <= first):
-        raise ValueError(f"Invalid --frames {ends}. Must be a number, or first and end: 100 400.")
-    if (every := vars(options).get("every", 1)) < 1:
+        label = f"Invalid --{name} {' '.join(map(str, ends))}"
+        raise ValueError(f"{label}. Must be a number, or first and end: 100 400.")
+    if every < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
     return slice(first, end, every)
-
-
-def _rows_of(options: argparse.Namespace) -> slice:
-    """Rows of the image that are selected."""
-    first, end = options.rows or (0, None)
-    if first < 0 or (end is not None and end <= first):
-        raise ValueError(f"Invalid --rows {first} {end}. Must be from 0 on, and rise.")
-    return slice(first, end)
 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
@@ -183,7 +178,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
 
     scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
-        scene = scene.isel(time=frames_of(options), y=_rows_of(options))
+        scene = scene.isel(time=between(options, "frames"), y=between(options, "rows"))
     # What speaks against separating it later.
     stamps = scene.get("exposure_time", scene["time"])
     lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))

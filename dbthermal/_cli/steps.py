@@ -72,13 +72,13 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     # A store, or the recordings of a sweep.
-    frames_of = files.frames_of(options, most=_SWEEP)
+    frames = files.between(options, "frames", most=_SWEEP)
     if options.blackbody:
         return files.opened(options.blackbody).load()
     if options.sweep:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
-        return recording.open_sweep(*options.sweep, frames=frames_of.stop)
+        return recording.open_sweep(*options.sweep, frames=frames.stop)
     # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
@@ -89,8 +89,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
-        frames = still["counts"].isel(time=good[frames_of]).load()
-        movie = frames.drop_vars("time").rename(time="frame")
+        movie = still["counts"].isel(time=good[frames]).load()
+        movie = movie.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)

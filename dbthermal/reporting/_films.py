@@ -70,12 +70,6 @@ def video(
     return {"film": film, "still": still, "text": "The scene. Gray: no value."}
 
 
-def _changes(codes: npt.NDArray[np.uint16]) -> bytes:
-    """Changes of codes (time, y, x) from frame to frame, low bytes before high ones."""
-    changes = np.diff(codes, axis=0, prepend=np.zeros_like(codes[:1]))
-    return changes.astype("<u2").view("u1").reshape(-1, 2).T.tobytes()
-
-
 def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
     """Viewer of some frames and pixels of the films, and of the curve of each pixel."""
     quantities, step, time = [], 1, view.time
@@ -91,6 +85,9 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         high = high if high > low else low + 1.0
         scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
         codes = np.where(np.isfinite(values), np.rint(scaled), _NO_VALUE).astype("<u2")
+        # Changes from frame to frame, low bytes before high ones, which compress well.
+        changes = np.diff(codes, axis=0, prepend=np.zeros_like(codes[:1])).astype("<u2")
+        planes = changes.view("u1").reshape(-1, 2).T.tobytes()
         quantities.append(
             {
                 "name": name,
@@ -99,7 +96,7 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
                 "low": float(low),
                 "high": float(high),
                 "shown": shown,
-                "data": base64_text(zlib.compress(_changes(codes), 9)),
+                "data": base64_text(zlib.compress(planes, 9)),
             }
         )
     colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)

@@ -223,7 +223,8 @@ def _check(dataset: xr.Dataset) -> None:
             rule = "Must have known sizes, as from compute_chunk_sizes() of dask"
             raise ValueError(f"Invalid shape {variable.shape} of '{name}'. {rule}.")
         real = variable.dtype.kind in "biuf" and variable.dtype.itemsize <= 8
-        text = variable.dtype.kind == "O" and {*map(type, variable.values.flat)} <= {str}
+        kinds = {*map(type, variable.values.flat)} if variable.dtype.kind == "O" else {object}
+        text = all(issubclass(kind, str) for kind in kinds)
         if not (real or text or variable.dtype.kind in "UTMm"):
             rule = "Must be real numbers of at most 64 bits, truth values, or text"
             raise TypeError(f"Invalid dtype {variable.dtype} of '{name}'. {rule}.")

@@ -154,27 +154,21 @@ def _lock(folder: Path, path: Path) -> int | None:
         with suppress(FileNotFoundError):
             lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                if (holder := _lock_file(lock)) == name:
-                    return None
-                if holder:
+                if not take(lock):
+                    holder = os.read(lock, 200).decode(errors="replace") or "another process"
+                    if holder == name:
+                        return None
                     rule = "Must end first, or another output be named"
                     raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
                 if os.path.samestat(os.fstat(lock), file.stat()):
+                    with suppress(OSError):
+                        os.ftruncate(lock, 0)
                     _sign(lock, name, folder)
                     _LOCKED.add(lock)
                     return lock
             finally:
                 if lock not in _LOCKED:
                     os.close(lock)
-
-
-def _lock_file(lock: int) -> str:
-    """Lock an open file and empty it, or return the name that is written in it."""
-    if not take(lock):
-        return os.read(lock, 200).decode(errors="replace") or "another process"
-    with suppress(OSError):
-        os.ftruncate(lock, 0)
-    return ""
 
 
 def take(descriptor: int, *, shared: bool = False) -> bool:
