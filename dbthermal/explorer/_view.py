@@ -221,22 +221,41 @@ class View:
         # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         where = (mask & self.counted(pixels))[box]
-        gain = self._common(pane, box, where)
+        gain, base = self._common(pane, box, where), name.removesuffix("_std")
+        contrast = [] if gain is None else [self.pane(film) for film in FILMS]
+
+        def statistics_of(frames: slice) -> dict[str, Array]:
+            """Statistics of some frames of the region, at the pixels of its box that count."""
+            values, *films = (it.read(frames, *box)[:, where] for it in (pane, *contrast))
+            if pixels == "measured" and "bridged" in self.data and base in FILMS:
+                bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
+                values = np.where(bridged[:, where], np.float32(np.nan), values)
+            result = statistics(values)
+            std = common = np.full(values.shape, np.nan)
+            if pane.name.startswith("input "):
+                std, common = self._noise(pane, values), np.zeros(values.shape)
+            elif pane.std:
+                std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
+            if gain is not None:
+                common = gain * np.abs(films[0] - films[1])
+            # What the calibration is taken for is an error of all pixels, besides the noise.
+            finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
+            if pane.std:
+                std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
+            std = mean_std(np.where(finite, std, np.nan), common)
+            shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
+            shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
+            return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
+
         count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
-        at_once = [slice(at, at + count) for at in starts]
-        measured = pixels == "measured"
-        chunks = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
+        chunks = [statistics_of(slice(at, at + count)) for at in starts]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
         # Dataset over time, of a map without it.
         units = {"units": pane.units}
-        result = xr.Dataset(
-            {
-                key: ("time", array, {} if key == "pixels" else units)
-                for key, array in values.items()
-            },
-            attrs={"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels},
-        )
+        attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
+        result = xr.Dataset({key: ("time", it, units) for key, it in values.items()}, attrs=attrs)
+        result["pixels"].attrs.clear()
         if pane.kind == "map":
             return result.isel(time=0)
         return result.assign_coords(time=("time", self.time, schema.COORDINATES["time"].attrs))
@@ -259,39 +278,6 @@ class View:
         measured = where & ((self.status[box] & COMPLETED) == 0)
         gains = common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
-
-    def _part(
-        self,
-        pane: Pane,
-        frames: slice,
-        box: tuple[slice, ...],
-        where: Mask,
-        gain: Array | None,
-        *,
-        measured: bool,
-    ) -> dict[str, Array]:
-        """Statistics of some frames of a region, at the pixels of its box that count."""
-        values = pane.read(frames, *box)[:, where]
-        if measured and "bridged" in self.data and pane.name.removesuffix("_std") in FILMS:
-            bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
-            values = np.where(bridged[:, where], np.float32(np.nan), values)
-        result = statistics(values)
-        std = common = np.full(values.shape, np.nan)
-        if pane.name.startswith("input "):
-            std, common = self._noise(pane, values), np.zeros(values.shape)
-        elif pane.std:
-            std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
-        if gain is not None:
-            warm, cold = (self.pane(name).read(frames, *box)[:, where] for name in FILMS)
-            common = gain * np.abs(warm - cold)
-        # What the calibration is taken for is an error of all pixels, beside those of the noise.
-        finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
-        if pane.std:
-            std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
-        std = mean_std(np.where(finite, std, np.nan), common)
-        shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
-        shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
-        return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
 
     def _shared(self, pane: Pane, values: Values, box: tuple[slice, ...], where: Mask) -> Array:
         """Deviation of the samples of a pane by the calibration, which the whole image shares."""

@@ -45,7 +45,7 @@ def video(
     *,
     celsius: bool,
     number: int = _FILMED,
-) -> dict[str, Any]:
+) -> dict[str, str]:
     """Film of the object, what it reflects, and the inputs, with its middle frame."""
     shown = Shown(_films(view), 0, {}, celsius)
     pictures = panels(view, shown, number, number * 100_000)
@@ -67,7 +67,7 @@ def video(
             return video(view, title, codec, celsius=celsius, number=number // 2)
         mpl.image.imsave(poster, middle[0])
         film, still = (base64_text(file.read_bytes()) for file in (path, poster))
-    return {"film": film, "still": still, "text": "The scene. Gray: no value."}
+    return {"film": film, "still": still}
 
 
 def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
@@ -118,4 +118,4 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         "Click a pixel for its curve. White lines: completed, not measured. Black lines: flagged. "
         f"Shown: {share}{time.size} of {view.time.size} frames."
     )
-    return {"viewer": content, "text": note}
+    return {"content": content, "text": note}

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from importlib import resources
 from itertools import cycle
 from pathlib import Path
@@ -17,7 +17,6 @@ from matplotlib.patheffects import withStroke
 
 from dbthermal import _text as texts
 from dbthermal import emissivity, figures, schema, store
-from dbthermal._arrays import Array
 from dbthermal.explorer import Region, View
 from dbthermal.explorer._answer import SPREAD, answer, nearest
 from dbthermal.explorer._export import sampled
@@ -36,27 +35,8 @@ except ImportError as error:
     raise ImportError(texts.missing_library(error.name, "report")) from error
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
-Part = str | dict[str, Any]  # of a section: a paragraph, or what page.html has a form for
 
 _LOGO: Final = 2**20  # largest picture beside the title [byte]
-
-_WORDS: Final = {
-    "method": "method",
-    "settings": "its options",
-    "response_kind": "response of the cameras",
-    "calibration": "calibration",
-    "blackbody": "blackbody of the calibration",
-    "gain_offset_by_camera": "gain and offset corrected by the cameras, as was stated",
-    "noise_source": "noise taken from",
-    "emissivity_source": "emissivities taken from",
-    "not_estimated": "not estimated",
-    "reference_band": "band on whose grid the result is",
-    "reflection_shift": "shift between the cameras' reflections",
-    "time_offset": "clock of the second camera behind the first [s]",
-    "frames_lost": "frames lost",
-    "frames_missing": "frames without data of all bands at any pixel",
-    "frames_bridged": "frames bridged in a pixel that lacks some, mean",
-}
 
 
 def report(  # noqa: PLR0913 - what is shown beside the result, by name
@@ -161,19 +141,14 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
     sentences, numbers["answer"] = answer(result, table_)
     about = [author, *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
+    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
+    if view.capture is not None and view.response is not None:
+        doubts += against_response(view.capture, view.response)
+    unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
+    emissivities = _emissivities(numbers, named=bool(regions))
     picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
     if logo is not None and not picture.startswith(PNG):
         raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
-    # Film, viewer, and the sections of the page.
-    film = video(view, title, codec, celsius=celsius)
-    sections: dict[str, list[Part]] = {
-        "Scene": [f"{sentence}.", film, viewer(view, celsius=celsius)],
-        "Regions": [*_regions(view, chosen, curves, celsius=celsius)],
-        "What can be trusted": [*_trust(view, numbers["validity"])],
-        "Deviation by cause": [*_causes(numbers["uncertainty"])],
-        "Emissivities": [*_emissivities(numbers, named=bool(regions))],
-        "What was assumed": [_assumed(view)],
-    }
     # The page, which asks for nothing else.
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
@@ -186,8 +161,25 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
             for sentence in sentences
         ],
         logo=base64_text(picture),
-        sections={name: parts for name, parts in sections.items() if parts},
         numbers=numbers,
+        scene=sentence,
+        film=video(view, title, codec, celsius=celsius),
+        viewer=viewer(view, celsius=celsius),
+        outlines=_svg(_outlines(view, chosen, celsius=celsius)),
+        curves=_svg(_curves(view, curves, celsius=celsius)),
+        unit=unit,
+        zero=zero,
+        doubts=dict.fromkeys(doubts),
+        status=_svg(figures.status(result)) if "status" in view.panes else "",
+        meanings={bit.label: bit.meaning for bit in Status},
+        percent=drawing.percent,
+        causes=schema.CAUSES,
+        emissivities=emissivities,
+        bands=[drawing.band_label(band) for band in result["band"].values] if emissivities else [],
+        spread=SPREAD,
+        attrs=result.attrs,
+        events=", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items()),
+        text=_text,
         provenance=json.dumps(made_by, indent=2, sort_keys=True),
         script=Markup(script.read_text("utf-8")),
         json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
@@ -197,57 +189,29 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     store.save_text(text, path, made_by)
 
 
-def _picture(figure: Figure, text: str) -> Part:
-    """Figure as a picture of vectors, with its caption."""
+def _svg(figure: Figure) -> str:
+    """Figure as a picture of vectors, in base64."""
     buffer = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "dbthermal", "svg.fonttype": "path"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
-    return {"picture": base64_text(buffer.getvalue()), "text": text}
+    return base64_text(buffer.getvalue())
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]], names: int = 1) -> Part:
-    """Table with columns of names, to the left, and of numbers, to the right."""
-    return {"head": head, "rows": rows, "names": names}
-
-
-def _regions(
-    view: View, chosen: Mapping[str, Region], curves: Curves, *, celsius: bool
-) -> Iterator[Part]:
-    """Yield where the regions are, and their curves with two standard deviations."""
-    yield _picture(
-        _outlines(view, chosen, celsius=celsius), "Object temperature, mean over time; regions."
-    )
+def _curves(view: View, curves: Curves, *, celsius: bool) -> Figure:
+    """Curves of the regions, with two standard deviations."""
     names = [name for name in FILMS if name in view.panes]
     figure, axes = drawing.canvas(len(names), 1, (9.0, 2.9 * len(names)))
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     for axis, name in zip(axes[:, 0], names, strict=True):
-        for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
-            curve = curves[region][name]
-            mean, interval = curve["mean"].values - zero, 2 * curve["std"].values
-            axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
-            axis.fill_between(
-                view.time, mean - interval, mean + interval, color=color, alpha=0.25, linewidth=0
-            )
+        for region, color in zip(curves, cycle(drawing.COLORS), strict=False):
+            mean, std = (curves[region][name][key].values for key in ("mean", "std"))
+            low, high = mean - zero - 2 * std, mean - zero + 2 * std
+            axis.plot(view.time, mean - zero, color=color, label=region, linewidth=1.2)
+            axis.fill_between(view.time, low, high, color=color, alpha=0.25, linewidth=0)
         axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
-    yield _picture(
-        figure, "Means of the regions' measured pixels, and two standard deviations of these means."
-    )
-    head = ["region", "measured pixels", f"object temperature [{unit}]", "its std [K]"]
-    rows = []
-    for region in chosen:
-        curve = curves[region]["object_temperature"]
-        stds = [_text(_plain(curve[key].mean()), 3) for key in ("std", "calibration_std")]
-        rows.append(
-            [region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), *stds]
-        )
-    yield _table([*head, "of it by calibration [K]"], rows)
-    yield (
-        "Of a region only measured pixels and frames count: no pixel with a flag or completed, "
-        "and no frame of a pixel that was bridged in time. "
-        "Errors that the pixels of a region share are not lessened by their number."
-    )
+    return figure
 
 
 def _budget(view: View) -> dict[str, float]:
@@ -293,44 +257,9 @@ def _validity(view: View) -> dict[str, float]:
     return shares | {name: share for name, share in flags.items() if share}
 
 
-def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Part]:
-    """Yield the warnings, the map of the status, and the table of the flags."""
-    doubts = [*view.data.attrs.get("warnings", []), *hardly_measured(view.data)]
-    if view.capture is not None and view.response is not None:
-        doubts += against_response(view.capture, view.response)
-    yield from ({"doubt": doubt} for doubt in dict.fromkeys(doubts))
-    if "status" not in view.panes:
-        yield "The result has no status: nothing is said of what can be trusted."
-        return
-    yield _picture(figures.status(view.data), "Pixels to trust, and the reason of the others.")
-    meaning = {bit.label: bit.meaning for bit in Status}
-    words = {
-        "no_flag": "measured, and nothing speaks against it",
-        "completed": "not measured here, but completed from what else is known",
-        "without_value": "no object temperature at any time",
-    }
-    rows = [
-        [name.replace("_", " "), words.get(name) or meaning[name], drawing.percent(share)]
-        for name, share in shares.items()
-    ]
-    yield _table(["flag", "meaning", "share of the pixels"], rows, names=2)
-
-
-def _causes(budget: Mapping[str, float]) -> Iterator[Part]:
-    """Yield the table of the deviation by cause."""
-    if not budget:
-        return
-    rows = [[cause, schema.CAUSES[cause], _text(std, 3)] for cause, std in budget.items()]
-    yield _table(["cause", "an error is shared by", "standard deviation [K]"], rows, names=2)
-    yield (
-        "Of the object temperature, median over the measured pixels. The bands show noise and "
-        "ratio; all else is what the response of the cameras states."
-    )
-
-
 def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[str, Any]:
     """Numbers of a region: temperatures, emissivities, and the nearest materials."""
-    summary: dict[str, Any] = {}
+    summary: dict[str, Any] = {"pixels": int(curves["object_temperature"]["pixels"].max())}
     for name in (name for name in FILMS if name in curves):
         curve = curves[name]
         keys = ("mean", "std", "calibration_std")
@@ -349,39 +278,20 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
     return summary
 
 
-def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> Iterator[Part]:
-    """Yield the emissivities of materials, and of named regions, beside the nearest known."""
+def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> list[list[str]]:
+    """Emissivities of materials, and of named regions, beside the nearest known: rows of text."""
     places = {f"{entry['pixels']} pixels alike": entry for entry in numbers["answer"]["materials"]}
     if named:
         places |= {name: of for name, of in numbers["regions"].items() if of.get("emissivity")}
-    if not places:
-        return
     rows = []
     for name, of in places.items():
         pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
-        cells = [f"{_text(value, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for value, std in pairs]
+        cells = [f"{_text(value)} \N{PLUS-MINUS SIGN} {_text(std)}" for value, std in pairs]
         steady = of.get("emissivity_steady_std", {}).values()
         cells = [f"{cell} ({std:.4f})" for cell, std in zip(cells, steady, strict=False)] or cells
         near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
         rows.append([name, ", ".join(near) or "many", *cells])
-    head = ["measured pixels", "nearest materials of the table (distance)"]
-    bands = next(iter(places.values()))["emissivity"]
-    yield _table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
-    yield (
-        "Medians of pixels that are alike, and means of regions; in brackets the deviation if the "
-        "surroundings do not drift. The distance is the root mean "
-        "square over the bands, in standard deviations, to which "
-        f"{SPREAD} is added for what samples of a material differ. "
-        "A near material is no identification: many share two emissivities."
-    )
-
-
-def _assumed(view: View) -> Part:
-    """Assumptions of the separation, by the attributes of the result."""
-    attrs = view.data.attrs
-    rows = [[words, str(attrs[name])] for name, words in _WORDS.items() if str(attrs.get(name, ""))]
-    events = ", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items())
-    return _table(["what", "as"], [*rows, ["events", events or "none known"]], names=2)
+    return rows
 
 
 def _plain(value: Any) -> float | None:
@@ -389,11 +299,5 @@ def _plain(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _text(value: float | None, digits: int) -> str:
-    return "no value" if value is None else f"{value:.{digits}f}"
-
-
-def _range(values: Array) -> str:
-    """Least and greatest of some values."""
-    finite = values[np.isfinite(values)]
-    return f"{finite.min():.2f} to {finite.max():.2f}" if finite.size else "no value"
+def _text(value: float | None) -> str:
+    return "no value" if value is None else f"{value:.3f}"
