@@ -133,42 +133,26 @@ def suggestion(reason: str) -> str:
     return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
 
 
-class _Stream:
-    """Stream that notes when something was written."""
-
-    def __init__(self, stream: Any) -> None:
-        self.stream, self.last = stream, time.monotonic()
-
-    def write(self, text: str) -> Any:
-        """Write a text."""
-        self.last = time.monotonic()
-        return self.stream.write(text)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.stream, name)
-
-
 @contextmanager
 def stage_shown(command: str) -> Iterator[None]:
     """Show the stage of this thread on the terminal, and at the end the seconds that it took."""
-    thread, start, ended, plain = (
-        threading.get_ident(),
-        time.monotonic(),
-        threading.Event(),
-        sys.stderr,
-    )
-    stream: Any = _Stream(plain)
+    thread, start, ended = threading.get_ident(), time.monotonic(), threading.Event()
+    stream: Any = sys.stderr
+    write, written = stream.write, [start]  # when something else was written
+
+    def noted(text: str) -> Any:
+        written[0] = time.monotonic()
+        return write(text)
 
     def show() -> None:
         while not ended.wait(_STEP):
-            if time.monotonic() - stream.last > _QUIET:
-                seconds = time.monotonic() - start
-                plain.write(f"\r{command}: {_stage(thread)}, {seconds:.0f} s\x1b[K")
-                plain.flush()
+            if time.monotonic() - written[0] > _QUIET:
+                write(f"\r{command}: {_stage(thread)}, {time.monotonic() - start:.0f} s\x1b[K")
+                stream.flush()
 
     showing = threading.Thread(target=show, daemon=True)
-    if is_terminal := plain.isatty():
-        sys.stderr = stream
+    if is_terminal := stream.isatty():
+        stream.write = noted
         showing.start()
     try:
         yield
@@ -177,9 +161,9 @@ def stage_shown(command: str) -> Iterator[None]:
         ended.set()
         if is_terminal:
             showing.join()
-            sys.stderr = plain
-            plain.write("\r\x1b[K")
-    plain.write(f"{command}: {seconds:.1f} s\n")
+            stream.write = write
+            write("\r\x1b[K")
+    write(f"{command}: {seconds:.1f} s\n")
 
 
 def _stage(thread: int) -> str:

@@ -247,9 +247,7 @@ def _pages(path: Path) -> list[_Page]:
     finally:
         log.removeHandler(handler)
     # Number of the pages, as the description states it.
-    if (
-        len(pages) == 1 and stated > 1 and not pages[0].codec
-    ):  # one page for a stack without gaps: ImageJ beyond 4 GB
+    if len(pages) == 1 and stated > 1 and not pages[0].codec:  # as ImageJ beyond 4 GB, without gaps
         (start, length), *further = pages[0].spans
         if further or start + stated * length > size:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"

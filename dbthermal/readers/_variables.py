@@ -31,7 +31,7 @@ _COMPLEX: Final = 0x800  # flag
 _BEGIN: Final = 128  # header of a file [byte]
 _HEAD: Final = 2**12  # bytes of a variable, within which its numbers begin
 # NetCDF 3: types of numbers, tags of lists.
-_TYPES: Final = ("i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8")  # from 1
+_TYPES: Final = ["-", "i1", "S1", ">i2", ">i4", ">f4", ">f8", "u1", ">u2", ">u4", ">i8", ">u8"]
 _DIMS, _VARIABLES, _ATTRIBUTES = 10, 11, 12  # tags of lists
 _NETCDF_HEADER: Final = 2**20  # at most [byte]
 _MOST_DIMS: Final = 32  # of a variable
@@ -254,7 +254,7 @@ class _Header:
             if number > _MOST_DIMS:
                 raise ValueError(f"{number} dims of '{name}'. Must be at most {_MOST_DIMS}.")
             dims = [self.dims[self.number()] for _ in range(number)]
-            attrs, dtype, _ = self.attributes(), self.dtype(), self.number()
+            attrs, dtype, _ = self.attributes(), np.dtype(_TYPES[self.number(4)]), self.number()
             shape = [size for place, (_, size) in enumerate(dims) if size or place]
             start = self.number(4 if self.content[3] == 1 else 8)
             listed[name] = [dim for dim, _ in dims], attrs, start, shape, dtype
@@ -264,7 +264,7 @@ class _Header:
         """Attributes, texts and numbers, of the file or of a variable."""
         listed = dict[str, Any]()
         for _ in range(self.length(_ATTRIBUTES)):
-            name, dtype, number = self.text(), self.dtype(), self.number()
+            name, dtype, number = self.text(), np.dtype(_TYPES[self.number(4)]), self.number()
             content = self.taken(number * dtype.itemsize)
             is_text, values = dtype.kind == "S", np.squeeze(np.frombuffer(content, dtype))
             listed[name] = content.decode() if is_text else values[()]
@@ -276,10 +276,6 @@ class _Header:
         if length and actual != tag:
             raise ValueError(f"Tag {actual} before byte {self.at}. Must be {tag}.")
         return length
-
-    def dtype(self) -> np.dtype[Any]:
-        """Type of numbers, as NumPy has it."""
-        return np.dtype(dict(enumerate(_TYPES, 1))[self.number(4)])
 
     def text(self) -> str:
         """Name."""
