@@ -321,10 +321,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _reason(error: Exception, options: argparse.Namespace) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
-    command = options.command
-    extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
-    if isinstance(error, ImportError) and extra:
-        extra = command if command == "report" else extra  # which has all that it needs
+    library = str(error.name).split(".")[0] if isinstance(error, ImportError) else ""
+    if isinstance(error, ImportError) and (extra := _EXTRAS.get(library)):
+        extra = "report" if options.command == "report" else extra  # which has all that it needs
         return str(import_module("dbthermal._text").missing_library(error.name, extra))
     if isinstance(error, FileNotFoundError) and error.filename:  # of the system, not of dbthermal
         return f"No file or folder '{error.filename}'. Must exist."

@@ -74,23 +74,21 @@ def stage_of(dataset: xr.Dataset) -> str:
 
 
 def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
-    """Shifts of the views, of which there is a matrix for each band, and of the reflections."""
+    """Rows down and columns to the right by which views and reflections show a point elsewhere.
+
+    Of a view, for which there is a matrix for each band, the centre of the image.
+    """
     lines, views = dict[str, Any](), len(dataset.attrs.get("transform", ())) / 9
     if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
-        lines["view_shift_pixel"] = _view_shifts(dataset)
+        column, row = (0.5 * (dataset.sizes[dim] - 1) for dim in ("x", "y"))
+        matrices = np.reshape(dataset.attrs["transform"], (-1, 3, 3))
+        right, down, scale = (matrices @ [column, row, 1.0]).T
+        shifts = np.stack([down / scale - row, right / scale - column], axis=1).round(2).tolist()
+        lines["view_shift_pixel"] = dict(zip(map(str, dataset["band"].values), shifts, strict=True))
     if "reflection_shift" in dataset:
         shifts = dataset["reflection_shift"].median(("y", "x")).values.round(2).tolist()
         lines["reflection_shift_pixel"] = dict(zip(("rows", "columns"), shifts, strict=True))
     return lines
-
-
-def _view_shifts(dataset: xr.Dataset) -> dict[str, list[float]]:
-    """Rows down and columns to the right, by which each view shows the image's centre elsewhere."""
-    column, row = (0.5 * (dataset.sizes[dim] - 1) for dim in ("x", "y"))
-    matrices = np.reshape(dataset.attrs["transform"], (-1, 3, 3))
-    right, down, scale = (matrices @ [column, row, 1.0]).T
-    shifts = np.stack([down / scale - row, right / scale - column], axis=1).round(2)
-    return dict(zip(map(str, dataset["band"].values), shifts.tolist(), strict=True))
 
 
 def _shares(flags: xr.DataArray) -> dict[str, float]:

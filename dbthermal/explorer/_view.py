@@ -95,11 +95,9 @@ class View:
         self.capture = None if capture is None else opened(capture, "capture")
         self.response = None if response is None else opened(response, "response")
         sources = {"result": data, "capture": capture, "response": response}
+        if is_capture and capture is not None:
+            raise ValueError("Invalid second capture. The data are a capture: must be a result.")
         if is_capture:
-            if capture is not None:
-                raise ValueError(
-                    "Invalid second capture. The data are a capture: must be a result."
-                )
             self.capture, sources = self.data, {"capture": data, "response": response}
         self.sources = {
             name: repr(str(source)) if isinstance(source, str | Path) else name
@@ -114,10 +112,8 @@ class View:
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
-        self.events = {
-            **marks(shown, self.time),
-            **{name: float(moment) for name, moment in events.items()},
-        }
+        stated = {name: float(moment) for name, moment in events.items()}
+        self.events = marks(shown, self.time) | stated
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
