@@ -138,21 +138,21 @@ def stage_shown(command: str) -> Iterator[None]:
     """Show the stage of this thread on the terminal, and at the end the seconds that it took."""
     thread, start, ended = threading.get_ident(), time.monotonic(), threading.Event()
     stream: Any = sys.stderr
-    write, written = stream.write, [start]  # when something else was written
+    write, last = stream.write, [start]  # time of what was written last, beside the stage
 
-    def noted(text: str) -> Any:
-        written[0] = time.monotonic()
+    def write_and_note(text: str) -> Any:
+        last[0] = time.monotonic()
         return write(text)
 
     def show() -> None:
         while not ended.wait(_STEP):
-            if time.monotonic() - written[0] > _QUIET:
+            if time.monotonic() - last[0] > _QUIET:
                 write(f"\r{command}: {_stage(thread)}, {time.monotonic() - start:.0f} s\x1b[K")
                 stream.flush()
 
     showing = threading.Thread(target=show, daemon=True)
     if is_terminal := stream.isatty():
-        stream.write = noted
+        stream.write = write_and_note
         showing.start()
     try:
         yield

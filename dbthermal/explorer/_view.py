@@ -222,7 +222,7 @@ class View:
 
         def statistics_of(frames: slice) -> dict[str, Array]:
             """Statistics of some frames of the region, at the pixels of its box that count."""
-            values, *films = (it.read(frames, *box)[:, where] for it in (pane, *contrast))
+            values, *films = (film.read(frames, *box)[:, where] for film in (pane, *contrast))
             if pixels == "measured" and "bridged" in self.data and base in FILMS:
                 bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
                 values = np.where(bridged[:, where], np.float32(np.nan), values)
@@ -250,7 +250,8 @@ class View:
         # Dataset over time, of a map without it.
         units = {"units": pane.units}
         attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
-        result = xr.Dataset({key: ("time", it, units) for key, it in values.items()}, attrs=attrs)
+        lines = {key: ("time", line, units) for key, line in values.items()}
+        result = xr.Dataset(lines, attrs=attrs)
         result["pixels"].attrs.clear()
         if pane.kind == "map":
             return result.isel(time=0)

@@ -116,7 +116,7 @@ def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[An
         return variables.numpy_array(path, name, stack), []
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     arrays = _OPENED[kind](path, stack)
-    arrays = {key: it for key, it in arrays.items() if it.ndim == 3 or are_times(key, it)}
+    arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
     name = recordings.array_name([key for key in arrays if arrays[key].ndim == 3], name, path)
     return arrays[name], _times_of(arrays, name, arrays[name].shape[0])
 
