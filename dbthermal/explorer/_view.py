@@ -248,9 +248,8 @@ class View:
         chunks = [statistics_of(slice(at, at + count)) for at in starts]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
         # Dataset over time, of a map without it.
-        units = {"units": pane.units}
         attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
-        lines = {key: ("time", line, units) for key, line in values.items()}
+        lines = {key: ("time", line, {"units": pane.units}) for key, line in values.items()}
         result = xr.Dataset(lines, attrs=attrs)
         result["pixels"].attrs.clear()
         if pane.kind == "map":
