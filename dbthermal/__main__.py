@@ -6,13 +6,12 @@ standard error.
 """
 
 import argparse
-import difflib
 import json
 import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import cache
 from importlib import import_module
@@ -21,7 +20,15 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
-from dbthermal._cli import is_source, leaves, progress
+from dbthermal._cli import (
+    kelvin,
+    kelvin_or_path,
+    lines_of,
+    plain,
+    sources_and_targets,
+    stage_shown,
+    suggestion,
+)
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -37,36 +44,13 @@ _EXTRAS: Final = {
 }
 """Library -> the extra that has it."""
 
-_UNIT_DOUBTED: Final = 200.0  # from which degrees Celsius, and below which kelvin, are doubted
-
-
-def _kelvin(text: str) -> float:
-    """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
-    try:
-        value, unit = float(text[:-1]), text[-1:]
-        kelvin = value + {"C": 273.15, "K": 0.0}[unit]
-    except (KeyError, ValueError) as error:
-        rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"
-        raise argparse.ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
-    if unit == "C" and value > _UNIT_DOUBTED:
-        warnings.warn(f"{text} is {kelvin:g} K; kelvin are written {value:g}K.", stacklevel=1)
-    elif unit == "K" and value < _UNIT_DOUBTED:
-        degrees = f"{kelvin - 273.15:g} degrees Celsius"
-        warnings.warn(f"{text} is {degrees}; these are written {value:g}C.", stacklevel=1)
-    return kelvin
-
-
-def _kelvin_or_path(text: str) -> float | Path:
-    return _kelvin(text) if re.fullmatch(r"[-+\d.,]+ ?\W?[A-Za-z]?", text) else Path(text)
-
-
 _KINDS: Final[dict[str, Any]] = {
     "path": Path,
-    "text": str,
+    "name": str,
     "number": float,
-    "whole": int,
-    "kelvin": _kelvin,
-    "point": _kelvin_or_path,
+    "n": int,
+    "temperature": kelvin,
+    "point": kelvin_or_path,
 }
 _ARGUMENTS: Final = """
 files path+             files of one camera, then a '+' and the other's; or a store
@@ -78,34 +62,34 @@ correction path?        store of gain and offset
 response path           store of the cameras' response
 result path             store of a result
 shown path*             its capture, and the cameras' response, to be shown beside it
-materials text*         as listed by 'data'; all by default
+materials name*         as listed by 'data'; all by default
 --output path!          new {output}
 --overwrite flag        replace the output
 --dry-run flag          only say what would be read, with sizes, and written
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
---bands text+           names of the bands: 8-14 9.5
---unit text             of the numbers in TIFF, raw files and arrays: 'count' if not stated
+--bands name+           names of the bands: 8-14 9.5
+--unit name             of the numbers in TIFF, raw files and arrays: 'count' if not stated
 --clock number+         frame rate [Hz], of each camera if they differ; FLIR's files have times
---shape whole2          rows and columns of raw files [pixel]
+--shape n2          rows and columns of raw files [pixel]
 --byte-order little|big of the numbers in raw files
---header whole=0        before the first frame of raw files [byte]
---frame-header whole=0  before each frame of raw files [byte]
+--header n=0        before the first frame of raw files [byte]
+--frame-header n=0  before each frame of raw files [byte]
 --simulated flag        no camera has recorded it: all that is made of it says so
---variable text         name of an array in a file of several, or in a result
+--variable name         name of an array in a file of several, or in a result
 --offset number+        start of each other camera after the first's [s]; else found
 --simulate flag         use emulated devices
 --side-by-side flag     cameras side by side, in place of one window for both
 --at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
 --blackbody path        in place of --at: a store of all temperatures
---sweep text2           in place of --at: folder and session of a sweep by 'record'
+--sweep name2           in place of --at: folder and session of a sweep by 'record'
 --maker path            in place of --at: a capture of FLIR's files, for the maker's constants
---frames whole+         the first N, or from A up to B: A B; of each temperature 64
---every whole=1         take one frame of so many
---rows whole2           take rows Y0 up to Y1 of the image
+--frames n+         the first N, or from A up to B: A B; of each temperature 64
+--every n=1         take one frame of so many
+--rows n2           take rows Y0 up to Y1 of the image
 --blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
 --blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
---room-temperature kelvin  of that room, as 22C
+--room-temperature temperature  of that room, as 22C
 --offset-std number+    drift of the level of each camera since [K] (0.5)
 --gain-std number+      error of the gain of each camera (0.01)
 --pattern-std number+   drift of the pixels of each camera since [K] (0.1)
@@ -114,26 +98,26 @@ materials text*         as listed by 'data'; all by default
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
 --register none|translation|affine|homography   between the views (homography); none: on one grid
---search whole=5        largest delay that is sought, either way [frame]
---reference text        band whose frames are left as they are in time
+--search n=5        largest delay that is sought, either way [frame]
+--reference name        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
---method text           one step alone, by rows: {methods}
+--method name           one step alone, by rows: {methods}
 --emissivity number+    of each band, for the method 'calibrated'
---surroundings kelvin   temperature of what is reflected, as 22C
+--surroundings temperature   temperature of what is reflected, as 22C
 --outdoors flag         the sky is mirrored, which is not gray: wider bars
 --background-ratio number2  changes of what is mirrored, second band over first; its deviation
---prior text            material of pixels that cannot be measured, as listed by 'data'
---workers whole=2       number of threads
---title text            heading of the report
---author text           name below it
+--prior name            material of pixels that cannot be measured, as listed by 'data'
+--workers n=2       number of threads
+--title name            heading of the report
+--author name           name below it
 --logo path             picture beside it, *.png
 --noise number!         of the camera without a filter [K]
 --seconds number=35     length of the capture
 --rate number=10        frame rate [Hz]
 --span number=25        rise of the object's temperature [K]
 --amplitude number=3    height of the reflected changes [K]
---pixel whole2&         row and column of a curve; repeated
---region whole4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
+--pixel n2&         row and column of a curve; repeated
+--region n4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
@@ -144,13 +128,8 @@ _VALUES: Final = {
     "--pixel": "Y X",
     "--region": "Y0 Y1 X0 X1",
     "--rows": "Y0 Y1",
-    "path": "PATH",
-    "text": "NAME",
-    "number": "NUMBER",
-    "whole": "N",
-    "kelvin": "TEMPERATURE",
 }
-"""Option, or its kind -> names of its values in the help."""
+"""Option -> names of its values in the help, where it is not that of its kind."""
 
 _METHODS: Final = (
     "subspace (what the default call begins with), calibrated (emissivities as stated), "
@@ -253,11 +232,10 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit."""
-        options = re.findall(r"(?m)^--[\w-]+", _ARGUMENTS)
+        listed = ", ".join(re.findall(r"(?m)^--[\w-]+", _ARGUMENTS))
         for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
-            listed = ", ".join(f"'{option}'" for option in options)
-            message += _suggestion(f"'{wrong}': choose from {listed}")
-        super().error(message + _suggestion(message))
+            message += suggestion(f"'{wrong}': choose from {listed}")
+        super().error(message + suggestion(message))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -303,7 +281,7 @@ def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
     if argument.startswith("-"):
-        values = _VALUES.get(argument, _VALUES.get(name, "VALUE")).split()
+        values = _VALUES.get(argument, name.upper()).split()
         options["metavar"] = tuple(values) if len(values) > 1 else values[0]
     if "!" in kind:
         options["required"] = True
@@ -336,17 +314,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
         reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
-        reason += _suggestion(reason)
+        reason += suggestion(reason)
     print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
     return status
 
 
 def _reason(error: Exception, options: argparse.Namespace) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
-    command = options.command
-    extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
-    if isinstance(error, ImportError) and extra:
-        extra = command if command == "report" else extra  # which has all that it needs
+    library = str(error.name).split(".")[0] if isinstance(error, ImportError) else ""
+    if isinstance(error, ImportError) and (extra := _EXTRAS.get(library)):
+        extra = "report" if options.command == "report" else extra  # which has all that it needs
         return str(import_module("dbthermal._text").missing_library(error.name, extra))
     if isinstance(error, FileNotFoundError) and error.filename:  # of the system, not of dbthermal
         return f"No file or folder '{error.filename}'. Must exist."
@@ -360,18 +337,6 @@ def _reason(error: Exception, options: argparse.Namespace) -> str:
     return f"{type(error).__name__}: {message} (--traceback shows where)"
 
 
-def _suggestion(reason: str) -> str:
-    """Question after the name that is most like an unknown one, of those that a message lists."""
-    unknown = re.search(r"'([^']+)'.*(?:Must be one of|choose from)\s(.*)", reason)
-    if unknown is None or "Did you mean" in reason:
-        return ""
-    wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))
-    names = names or unknown.group(2).strip(" .)").split(", ")
-    words = [name for name in names if wrong.lower() in name.lower()]
-    like = [*difflib.get_close_matches(wrong, names, 1), *words]
-    return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
-
-
 def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Check the options, and what is read and written; run the command; print its summary."""
     if options.command == "completion":
@@ -380,19 +345,19 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
-    with progress.shown(options.command):
-        _command("unused", "refuse")(options, arguments)
-        sources, targets = _sources_and_targets(options)
+    with stage_shown(options.command):
+        _command("files", "refuse_unused")(options, arguments)
+        sources, targets = sources_and_targets(options)
         if options.dry_run:
             summary = _command("steps", "foreseen")(options, sources, targets)
         else:
             with ExitStack() as places:
                 for path in targets:  # which no other process writes to from here on
                     places.enter_context(import_module("dbthermal.store").reserved(path))
-                _sources_and_targets(options)  # and to which none has written meanwhile
+                sources_and_targets(options)  # and to which none has written meanwhile
                 summary = _command(module, function)(options)
     # The summary, for programs or for people.
-    lines = [json.dumps(summary, default=_plain)] if options.json else _lines(summary)
+    lines = [json.dumps(summary, default=plain)] if options.json else lines_of(summary)
     print("\n".join(map(_shown, lines)), flush=True)
     return 0
 
@@ -407,27 +372,6 @@ def _shown(text: str) -> str:
 def _command(module: str, function: str) -> Any:
     """Function of a command, imported when it is needed."""
     return getattr(import_module(f"dbthermal._cli.{module}"), function)
-
-
-def _sources_and_targets(options: argparse.Namespace) -> tuple[list[Path], list[Path]]:
-    """Paths that a command reads, which must exist, and writes, which must be free."""
-    arguments = vars(options).items()
-    sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
-    written = ("output", "folder")
-    targets = [value for name, value in arguments if name.endswith(written) and value]
-    for path in sources:
-        if not path.exists():
-            raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
-    taken = [source.resolve() for source in sources]
-    for path in targets:
-        place = path.resolve()
-        if any(place in (used, *used.parents) or used in place.parents for used in taken):
-            label = f"Invalid output '{path}': it is another one, or it is read"
-            raise ValueError(f"{label}. Must be another place.")
-        taken.append(place)
-        if path.exists() and not getattr(options, "overwrite", path.is_dir()):
-            raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
-    return sources, targets
 
 
 def _completion() -> str:
@@ -446,31 +390,6 @@ def _completion() -> str:
 }}
 [ -z "${{ZSH_VERSION-}}" ] || {{ autoload -U compinit bashcompinit; compinit; bashcompinit; }}
 complete -o default -F _dbthermal dbthermal"""
-
-
-def _plain(value: Any) -> Any:
-    """Value as JSON takes it: an array or number of NumPy as a list or number, else as text."""
-    return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
-def _lines(summary: Any, indent: str = "") -> Iterator[str]:
-    """Summary as text: a line for each entry that is not empty, numbers in one line.
-
-    Sentences (`answer`) and commands (`next`) have a line each; `numbers` repeat those of the
-    sentences, for programs.
-    """
-    for key, value in summary.items():
-        if key in {"answer", "next", "numbers"}:
-            yield from (f"{indent}{line}" for line in value if key != "numbers")
-            continue
-        entries = value if isinstance(value, dict) else dict[str, Any]()
-        if any(isinstance(entry, dict | list | str) for entry in entries.values()):
-            yield f"{indent}{key}:"
-            yield from _lines(value, indent + "  ")
-            continue
-        words = [f"{name} {number:g}" for name, number in entries.items()]
-        if line := ", ".join(words if isinstance(value, dict) else map(str, leaves(value))):
-            yield f"{indent}{key}: {line}"
 
 
 if __name__ == "__main__":

@@ -69,9 +69,7 @@ def _stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) -> di
         top, left = (camera * shift for shift in view)
         seen = truth.assign(background_temperature=mirrored)
         seen = seen.isel(y=slice(top, top + _SHAPE[0]), x=slice(left, left + _SHAPE[1]))
-        seen = seen.drop_vars(["y", "x"]).assign_coords(
-            y=np.arange(_SHAPE[0]), x=np.arange(_SHAPE[1])
-        )
+        seen = seen.assign_coords(y=np.arange(_SHAPE[0]), x=np.arange(_SHAPE[1]))
         films.append(simulation.observe(seen, rig.response(), rng).sel(band=[band]))
     # Raw counts of two detectors, as they show the scene and the blackbody.
     detector = simulation.pattern(rig, _SHAPE, rng)

@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import Parameter, signature
 from itertools import groupby
 from pathlib import Path
@@ -12,12 +12,13 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import _rows, readers, schema, store
+from dbthermal import _rows, readers, store
 from dbthermal._arrays import on_disk, release
 from dbthermal._cli import PLUS, accepted, is_source, leaves
+from dbthermal._cli.summary import stage_of, summary
 from dbthermal._warnings import warned
-from dbthermal.explorer._answer import answer
 from dbthermal.readers import _formats as formats
+from dbthermal.response import ACCURACY
 
 _MADE_BY = {
     "capture": "import",
@@ -39,6 +40,8 @@ ANIMATED: Final = (".gif", ".webp")
 NO_TABLES: Final = (".tif", ".nc", *PICTURES, *ANIMATED)
 _UNEQUAL: Final = 0.05  # of the duration, by which two cameras' recordings may differ
 _BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
+# Options of files, of which each kind takes those that its reader has, and the last two.
+_FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
 
@@ -56,7 +59,7 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
     """Stores that arguments name, each of a stage of `schema`, or of one of several: ``a|b``."""
     datasets = {name: opened(getattr(options, name)) for name in stages}
     for name, wanted in stages.items():
-        actual = _stage(datasets[name])
+        actual = stage_of(datasets[name])
         if actual not in wanted.split("|"):
             fitting = [argument for argument in stages if actual in stages[argument].split("|")]
             hint = f" Exchanged with the {fitting[0]}?" if fitting else ""
@@ -89,7 +92,8 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     if kind != "raw files":
         formats.refuse_text(paths[0])  # of a suffix that promises more
     stated = _arguments(reader, options, paths[0].name, camera)
-    selected = {"time": frames_of(options), "y": _rows_of(options)} if "rows" in options else {}
+    dims = {"time": "frames", "y": "rows"} if "rows" in options else {}
+    selected = {dim: between(options, name) for dim, name in dims.items()}
     if stated.pop("frames", None) and selected and "frames" in signature(reader).parameters:
         stated["frames"] = selected.pop("time")
     # Files of the kinds that make one recording together.
@@ -124,23 +128,17 @@ def _arguments(
     return stated
 
 
-def frames_of(options: argparse.Namespace, most: int | None = None) -> slice:
-    """Frames that are selected: the first N, or from A up to B, and every so many of them."""
-    ends: list[int] = options.frames or []
+def between(options: argparse.Namespace, name: str, most: int | None = None) -> slice:
+    """Frames or rows that are selected: the first N, or from A up to B; every so many frames."""
+    ends: list[int] = vars(options).get(name) or []
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
+    every = vars(options).get("every", 1) if name == "frames" else 1
     if len(ends) > 2 or first < 0 or (end is not None and end <= first):
-        raise ValueError(f"Invalid --frames {ends}. Must be a number, or first and end: 100 400.")
-    if (every := vars(options).get("every", 1)) < 1:
+        label = f"Invalid --{name} {' '.join(map(str, ends))}"
+        raise ValueError(f"{label}. Must be a number, or first and end: 100 400.")
+    if every < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
     return slice(first, end, every)
-
-
-def _rows_of(options: argparse.Namespace) -> slice:
-    """Rows of the image that are selected."""
-    first, end = options.rows or (0, None)
-    if first < 0 or (end is not None and end <= first):
-        raise ValueError(f"Invalid --rows {first} {end}. Must be from 0 on, and rise.")
-    return slice(first, end)
 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
@@ -180,7 +178,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
 
     scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
-        scene = scene.isel(time=frames_of(options), y=_rows_of(options))
+        scene = scene.isel(time=between(options, "frames"), y=between(options, "rows"))
     # What speaks against separating it later.
     stamps = scene.get("exposure_time", scene["time"])
     lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
@@ -259,95 +257,56 @@ def _is_store(path: Path) -> bool:
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 
 
-def outline(dataset: xr.Dataset) -> dict[str, Any]:
-    """Stage, sizes, bands and clock of a dataset."""
-    lines: dict[str, Any] = {"stage": _stage(dataset), "sizes": dict(dataset.sizes)}
-    if "band" in dataset.coords:
-        lines["bands"] = [str(band) for band in np.atleast_1d(dataset["band"].values)]
-    if dataset.sizes.get("time", 0) > 1 and "time" in dataset.coords:
-        time = dataset["time"].values
-        lines["seconds"] = round(float(time[-1] - time[0]), 6)
-        lines["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
-    return lines
+def refuse_unused(options: argparse.Namespace, arguments: Sequence[str]) -> None:
+    """Refuse an option that is stated and has no effect."""
+    stated = {argument.partition("=")[0] for argument in arguments}
+    for reason, names in _unused(options).items():
+        for flag in (f"--{name.replace('_', '-')}" for name in names.split()):
+            if flag in stated:
+                raise ValueError(f"Unused option {flag}. Must be left out {reason}.")
 
 
-def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
-    """Outline, flags, clocks, views and medians of a dataset; with everything its attributes."""
-    lines, attrs = outline(dataset), dataset.attrs
-    if lines["stage"] == "separated" and "x" in dataset.sizes:
-        sentences, numbers = answer(dataset)
-        lines = {"answer": sentences, "numbers": numbers, **lines}
-    # Shares of the flags, frames that were lost or bridged, and the offset of the clocks.
-    for name in ("status", "frame_flags"):
-        if name in dataset and "flag_masks" in dataset[name].attrs:
-            lines[f"{name}_shares"] = _shares(dataset[name])
-    places = {"frames_missing": 1, "frames_bridged": 1, "frames_lost": 1}
-    places |= {"time_offset": 6, "time_offset_std": 6}  # decimals
-    for name, decimals in places.items():
-        if attrs.get(name) is not None:
-            unit = "_s" if name.startswith("time") else ""
-            lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
-    lines |= _shifts(dataset)
-    # Medians over the pixels without a flag, where every band has one.
-    for name, unit in (("netd", "_K"), ("emissivity", "")):
-        if name in dataset and dataset[name].dims[:1] == ("band",):
-            good = dataset[name].astype(float).where(np.isfinite)
-            good = good.where(dataset["status"] == 0 if "status" in dataset else True)
-            medians = good.median([dim for dim in good.dims if dim != "band"])
-            if medians.notnull().all():
-                lines[f"median_{name}{unit}"] = medians.round(4).to_series().to_dict()
-    if not everything:
-        return lines
-    lines["variables"] = {
-        str(name): f"{array.dtype} {array.dims} [{array.attrs.get('units', '-')}]"
-        for name, array in dataset.data_vars.items()
-    }
-    long = ("provenance", "files", "transform")
-    lines["attributes"] = {name: value for name, value in attrs.items() if name not in long}
-    return lines | {name: attrs.get(name, {}) for name in long[:2]}
+def _unused(options: argparse.Namespace) -> dict[str, str]:
+    """Options of a command that have no effect, by the reason."""
+    if options.command in {"import", "info", "calibrate"}:
+        return _of_files(options)
+    if options.command == "align" and options.offset is not None:
+        return {"with --offset": "search"}
+    if options.command == "export" and options.output.suffix in NO_TABLES:
+        suffix = options.output.suffix
+        return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
+    if options.command != "separate":
+        return {}
+    if options.correction:
+        return {"with --correction": "method emissivity"}
+    aligned = {"without --correction, for the capture is aligned": "register offset"}
+    names = "surroundings outdoors background_ratio prior workers"
+    completing = {"with --method: 'dbthermal complete'": names}
+    return aligned | (
+        completing if options.method else {"without --method calibrated": "emissivity"}
+    )
 
 
-def _stage(dataset: xr.Dataset) -> str:
-    """Stage of `schema` that a dataset fits, "other" if none."""
-    if "counts" in dataset and dataset["counts"].dims == ("time", "y", "x"):
-        return "recording of one band"
-    fitting = ["other"]
-    for stage, variables in sorted(schema.STAGES.items(), key=lambda stage: len(stage[1])):
-        try:
-            schema.check(dataset, stage)
-        except (TypeError, ValueError):
-            continue
-        raw = "counts" in variables and dataset["counts"].dtype.kind != "f"
-        if stage not in {"capture", "corrected"} or raw == (stage == "capture"):
-            fitting.append(stage)
-    return fitting[-1]
-
-
-def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
-    """Shifts of the views, of which there is a matrix for each band, and of the reflections."""
-    lines, views = dict[str, Any](), len(dataset.attrs.get("transform", ())) / 9
-    if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
-        lines["view_shift_pixel"] = _view_shifts(dataset)
-    if "reflection_shift" in dataset:
-        shifts = dataset["reflection_shift"].median(("y", "x")).values.round(2).tolist()
-        lines["reflection_shift_pixel"] = dict(zip(("rows", "columns"), shifts, strict=True))
-    return lines
-
-
-def _view_shifts(dataset: xr.Dataset) -> dict[str, list[float]]:
-    """Rows down and columns to the right, by which each view shows the image's centre elsewhere."""
-    column, row = (0.5 * (dataset.sizes[dim] - 1) for dim in ("x", "y"))
-    matrices = np.reshape(dataset.attrs["transform"], (-1, 3, 3))
-    right, down, scale = (matrices @ [column, row, 1.0]).T
-    shifts = np.stack([down / scale - row, right / scale - column], axis=1).round(2)
-    return dict(zip(map(str, dataset["band"].values), shifts.tolist(), strict=True))
-
-
-def _shares(flags: xr.DataArray) -> dict[str, float]:
-    """Share of the values without a flag, and of each flag found."""
-    values = flags.values
-    shares = {"no_flag": float((values == 0).mean())}
-    for name in str(flags.attrs["flag_meanings"]).split():
-        share = float(schema.has_flag(flags, name).mean())
-        shares |= {name: share} if share else {}
-    return {name: round(share, 6) for name, share in shares.items()}
+def _of_files(options: argparse.Namespace) -> dict[str, str]:
+    """Options that neither the files of a command nor its other source take."""
+    # Kinds of the files; a folder alone is a store, unless it is read as another program's.
+    kinds, foreign = set[str](), options.command == "info" and options.unit is not None
+    for group in options.at if options.command == "calibrate" else [options.files]:
+        paths = [leaf for leaf in leaves(group) if isinstance(leaf, Path) and leaf != PLUS]
+        if foreign or len(paths) != 1 or not paths[0].is_dir():
+            kinds |= {kind_of(path, options) for path in paths}
+    # Sources of a calibration in place of files, and what each leaves without effect.
+    sources = {"blackbody": "frames", "sweep": ""}
+    sources["maker"] = " ".join(["frames", "correction_output", *ACCURACY])
+    stated = [source for source in sources if vars(options).get(source)]
+    if options.command == "calibrate" and not (options.at or stated):
+        return {}
+    taken = {"bands", "offset"} if kinds else set[str]()
+    for kind in kinds:
+        parameters = {*signature(READERS[kind][0]).parameters}
+        taken |= parameters | ({"variable"} if "name" in parameters else set())
+        taken |= {"simulated"} if kind != "FLIR" else set()
+    names = [name for name in _FORM.split() if name not in taken]
+    names += sources[stated[0]].split() if stated and not kinds else []
+    reason = " and ".join([*(f"--{source}" for source in stated), *sorted(kinds)]) or "a store"
+    return {f"with {reason}": " ".join(names)}

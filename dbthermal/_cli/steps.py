@@ -23,6 +23,7 @@ from dbthermal import (
     separation,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
+from dbthermal._cli.summary import outline
 from dbthermal._warnings import warned
 from dbthermal.limits._planner import SKY_LEVEL
 from dbthermal.response import ACCURACY
@@ -71,13 +72,13 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     # A store, or the recordings of a sweep.
-    frames_of = files.frames_of(options, most=_SWEEP)
+    frames = files.between(options, "frames", most=_SWEEP)
     if options.blackbody:
         return files.opened(options.blackbody).load()
     if options.sweep:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
-        return recording.open_sweep(*options.sweep, frames=frames_of.stop)
+        return recording.open_sweep(*options.sweep, frames=frames.stop)
     # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
@@ -88,8 +89,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
-        frames = still["counts"].isel(time=good[frames_of]).load()
-        movie = frames.drop_vars("time").rename(time="frame")
+        movie = still["counts"].isel(time=good[frames]).load()
+        movie = movie.drop_vars("time").rename(time="frame")
         movies.append(movie.expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)
@@ -199,10 +200,10 @@ def foreseen(
         contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
         inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
-            inputs[str(path)] |= files.outline(files.opened(path))
+            inputs[str(path)] |= outline(files.opened(path))
     summary: dict[str, Any] = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
+        summary["would_be"] = outline(files.capture(options.files, options, options.offset))
     # Bytes of an output before its compression, and those that the disk has for it.
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]

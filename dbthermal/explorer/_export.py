@@ -1,5 +1,6 @@
 """Figure and files of explored frames and curves."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,20 +75,38 @@ def figure(view: View, shown: Shown) -> Figure:
     return result
 
 
-def save_film(view: View, path: Path, shown: Shown) -> None:
-    """Save the films among the panes side by side, as an animated picture at their own speed."""
-    every, panels = slice(None, None, -(-view.time.size // _FILMED)), list[figures.FilmPanel]()
+def sampled(
+    view: View, name: str, frames: int, samples: float = np.inf, *, celsius: bool
+) -> tuple[xr.DataArray, int]:
+    """Film of a pane in its shown unit, of some frames and pixels, and the step of the pixels."""
+    moments = slice(None, None, -(-view.time.size // frames))
+    time, pane = view.time[moments], view.pane(name)
+    step = max(1, math.ceil(math.sqrt(math.prod(view.shape) * time.size / samples)))
+    values = pane.read(moments, slice(None, None, step), slice(None, None, step))
+    zero = np.float32(pane.unit(celsius=celsius)[1])
+    return xr.DataArray(values - zero, {"time": time}, ("time", "y", "x")), step
+
+
+def panels(
+    view: View, shown: Shown, frames: int, samples: float = np.inf
+) -> list[figures.FilmPanel]:
+    """Pictures of a film of the panes that change, of at most so many frames and samples each."""
+    made = []
     for pane in (view.pane(name) for name in shown.names if view.pane(name).kind == "film"):
         unit, zero = pane.unit(celsius=shown.celsius)
         low, high = shown.limits.get(pane.name) or view.limits(pane.name)
-        values = pane.read(every) - np.float32(zero)
-        film = xr.DataArray(values, {"time": view.time[every]}, ("time", "y", "x"))
+        film, _ = sampled(view, pane.name, frames, samples, celsius=shown.celsius)
         style: dict[str, Any] = {"limits": (low - zero, high - zero), "palette": shown.palette}
-        panels.append(figures.FilmPanel(film, pane.label, f"[{unit}]", **style))
-    if not panels:
+        made.append(figures.FilmPanel(film, pane.label, f"[{unit}]", **style))
+    return made
+
+
+def save_film(view: View, path: Path, shown: Shown) -> None:
+    """Save the films among the panes side by side, as an animated picture at their own speed."""
+    if not (pictures := panels(view, shown, _FILMED)):
         raise ValueError(f"Invalid film of {list(shown.names)}. Must have a picture that changes.")
     origin = drawing.provenance_note(view.data).strip(" (),") or "film"
-    first, *further = map(Image.fromarray, figures.film(panels, title=origin))
+    first, *further = map(Image.fromarray, figures.film(pictures, title=origin))
     period = max(20, round(1000.0 * float(np.ptp(view.time)) / max(len(further), 1)))  # [ms]
     first.save(path, save_all=True, append_images=further, duration=period, loop=0)
 

@@ -1,12 +1,11 @@
 """Films and maps of a view, read frame by frame from memory, a store, or a computation."""
 
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Any, Literal
+from tempfile import gettempdir
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +13,18 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import _rows, schema, store
-from dbthermal._arrays import Array, Mask
-from dbthermal.response import Curve
+from dbthermal import response as responses
+from dbthermal._arrays import Array, Mask, empty, on_disk, release
+from dbthermal._coordinates import laid_on
 
 Values = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
+
+FILMS: Final = {
+    "object_temperature": "object temperature",
+    "background_temperature": "reflected temperature",
+}
+_ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +37,7 @@ class Pane:
     array: xr.DataArray  # values (time, y, x) or (y, x), in memory or lazy
     absolute: bool = False  # temperature, also shown in degrees Celsius; not a difference
     std: str = ""  # pane of its standard deviation; empty without one
-    curve: Curve | None = None  # response, for counts shown as apparent temperatures
+    curve: responses.Curve | None = None  # response, for counts shown as apparent temperatures
 
     @property
     def kind(self) -> Literal["film", "map", "status"]:
@@ -56,23 +62,14 @@ class Pane:
         array = self.array
         if "_source" in vars(self) or array.ndim < 3 or array.variable._in_memory:
             return
-        size = array.size * array.dtype.itemsize
-        with TemporaryFile() as file:
-            try:
-                if hasattr(os, "posix_fallocate"):  # or a full disk would end the process later
-                    os.posix_fallocate(file.fileno(), 0, size)
-            except OSError as error:
-                raise OSError(
-                    error.errno,
-                    f"No room for {size / 1e6:.0f} MB of '{self.name}' in the folder of temporary "
-                    "files. Must be free, or TMPDIR name another folder",
-                ) from error
-            copy = np.memmap(file, array.dtype, "r+", shape=array.shape)
+        with on_disk(Path(gettempdir())):
+            copy = empty(array.shape, array.dtype)
         height = array.encoding.get("preferred_chunks", {}).get("y", 1)
         for block in _rows.blocks(array.shape, max(1, height * array.size // array.shape[1])):
             copy[:, block] = array.isel(y=block).values
             if progress is not None:
                 progress(f"reading {self.label}", block.stop / array.shape[1])
+            release()
         vars(self)["_source"] = copy
 
     def read(
@@ -96,6 +93,55 @@ def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
             "store, as from separation.separate."
         )
     return data
+
+
+def result_panes(data: xr.Dataset) -> Iterator[Pane]:
+    """Yield the panes of a result, in the order in which they are shown."""
+    if "object_temperature" not in data:
+        raise ValueError(
+            f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}. Must be a "
+            "result of separation, or a capture with 'counts'."
+        )
+    variables = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+    for name in (name for name in variables if name in data):
+        schema.check_variable(data[name], variables[name], f"'{name}' of the result")
+        laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
+    # What is estimated, then its deviations: a film each, or a map a band.
+    missing = str(data.attrs.get("not_estimated", "")).split()
+    stds = [f"{name}_std" for name in (*FILMS, "emissivity") if name not in missing]
+    for name in (name for name in [*FILMS, "emissivity", *stds] if name in data):
+        base = name.removesuffix("_std")
+        if name in missing or base not in data:
+            continue
+        words = FILMS.get(base, base) + (", deviation" if name != base else "")
+        has_std = name == base and f"{name}_std" in data and f"{name}_std" not in missing
+        std = f"{name}_std" if has_std else ""
+        if base in FILMS:
+            yield Pane(name, words, "K", data[name], absolute=name == base, std=std)
+            continue
+        for place, band in enumerate(map(str, data[name]["band"].values)):
+            title, image = f"{band} \N{MICRO SIGN}m {words}", data[name].isel(band=place)
+            yield Pane(f"{name} {band}", title, "1", image, std=std and f"{std} {band}")
+    if "status" in data:
+        yield Pane("status", "status", "1", data["status"])
+
+
+def input_panes(
+    capture: xr.Dataset, response: xr.Dataset | None, reference: xr.Dataset | xr.DataArray | None
+) -> Iterator[Pane]:
+    """Yield the bands of a capture, as apparent temperatures if there is a response."""
+    if "counts" in capture and "band" not in capture["counts"].dims:  # of one camera
+        schema.check_variable(capture["counts"], _ONE_BAND, "'counts' of the capture")
+        yield Pane("input", "input", "count", capture["counts"])
+        return
+    counts = schema.check(capture, "capture")["counts"]
+    if reference is not None and reference is not capture:
+        counts = laid_on(counts, reference, "the capture", "the result")
+    for place, band in enumerate(map(str, counts["band"].values)):
+        film, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
+        curve = None if response is None else responses.curve(response, band)
+        form: Any = {"absolute": curve is not None, "curve": curve}
+        yield Pane(f"input {band}", label, "count" if curve is None else "K", film, **form)
 
 
 def marks(capture: xr.Dataset, time: Array) -> dict[str, float]:

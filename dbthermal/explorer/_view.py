@@ -1,8 +1,9 @@
 """View of a result or a capture: panes, frames, ranges of colour, curves, and code for them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from pprint import pformat
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
@@ -12,19 +13,22 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal._coordinates import laid_on
-from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
+from dbthermal.explorer._films import (
+    FILMS,
+    Pane,
+    Progress,
+    Values,
+    input_panes,
+    marks,
+    opened,
+    result_panes,
+)
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
 
 COMPLETED: Final = int(schema.COMPLETED)
-FILMS: Final = {
-    "object_temperature": "object temperature",
-    "background_temperature": "reflected temperature",
-}
-_ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 _SAMPLES: Final = 2**22  # of a region's film that are read in one pass
 _RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the range of colour
 
@@ -91,88 +95,28 @@ class View:
         self.capture = None if capture is None else opened(capture, "capture")
         self.response = None if response is None else opened(response, "response")
         sources = {"result": data, "capture": capture, "response": response}
+        if is_capture and capture is not None:
+            raise ValueError("Invalid second capture. The data are a capture: must be a result.")
         if is_capture:
-            if capture is not None:
-                raise ValueError(
-                    "Invalid second capture. The data are a capture: must be a result."
-                )
             self.capture, sources = self.data, {"capture": data, "response": response}
         self.sources = {
             name: repr(str(source)) if isinstance(source, str | Path) else name
             for name, source in sources.items()
             if source is not None
         }
-        self.panes = {pane.name: pane for pane in self._panes(is_capture=is_capture)}
+        reference = self.data if is_capture else self.data.get("object_temperature")
+        inputs = [] if self.capture is None else input_panes(self.capture, self.response, reference)
+        results = [] if is_capture else result_panes(self.data)
+        self.panes = {pane.name: pane for pane in (*inputs, *results)}
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
-        self.events = {
-            **marks(shown, self.time),
-            **{name: float(moment) for name, moment in events.items()},
-        }
+        stated = {name: float(moment) for name, moment in events.items()}
+        self.events = marks(shown, self.time) | stated
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
-
-    def _panes(self, *, is_capture: bool) -> Iterator[Pane]:
-        """Yield the panes, in the order in which they are shown."""
-        if self.capture is not None:
-            reference = self.data if is_capture else self.data.get("object_temperature")
-            yield from self._inputs(self.capture, reference)
-        if is_capture:
-            return
-        data = self.data
-        if "object_temperature" not in data:
-            raise ValueError(
-                f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}. Must be a "
-                "result of separation, or a capture with 'counts'."
-            )
-        variables = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
-        for name in (name for name in variables if name in data):
-            schema.check_variable(data[name], variables[name], f"'{name}' of the result")
-            laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
-        missing = str(data.attrs.get("not_estimated", "")).split()
-        shown = [name for name in (*FILMS, "emissivity") if name in data and name not in missing]
-        for name in [*shown, *(f"{name}_std" for name in shown if f"{name}_std" in data)]:
-            yield from self._of(name, missing)
-        if "status" in data:
-            yield Pane("status", "status", "1", data["status"])
-
-    def _of(self, name: str, missing: Sequence[str]) -> Iterator[Pane]:
-        """Yield the panes of a variable of a result: one, or one a band."""
-        if name in missing:
-            return
-        array, base = self.data[name], name.removesuffix("_std")
-        words = FILMS.get(base, base) + (", deviation" if name != base else "")
-        std = f"{name}_std" if name == base and f"{name}_std" in self.data else ""
-        std = "" if std in missing else std
-        if base in FILMS:
-            yield Pane(name, words, "K", array, absolute=name == base, std=std)
-            return
-        for place, band in enumerate(map(str, array["band"].values)):
-            std_name = f"{std} {band}" if std else ""
-            title = f"{band} \N{MICRO SIGN}m {words}"
-            yield Pane(f"{name} {band}", title, "1", array.isel(band=place), std=std_name)
-
-    def _inputs(
-        self, capture: xr.Dataset, reference: xr.Dataset | xr.DataArray | None
-    ) -> Iterator[Pane]:
-        """Yield the bands of a capture, as apparent temperatures if there is a response."""
-        if "counts" in capture and "band" not in capture["counts"].dims:  # of one camera
-            schema.check_variable(capture["counts"], _ONE_BAND, "'counts' of the capture")
-            yield Pane("input", "input", "count", capture["counts"])
-            return
-        counts = schema.check(capture, "capture")["counts"]
-        if reference is not None and reference is not capture:
-            counts = laid_on(counts, reference, "the capture", "the result")
-        for place, band in enumerate(map(str, counts["band"].values)):
-            film, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
-            if self.response is None:
-                yield Pane(f"input {band}", label, "count", film)
-            else:
-                curve = responses.curve(self.response, band)
-                yield Pane(f"input {band}", label, "K", film, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
         """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
@@ -273,22 +217,41 @@ class View:
         # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         where = (mask & self.counted(pixels))[box]
-        gain = self._common(pane, box, where)
+        gain, base = self._common(pane, box, where), name.removesuffix("_std")
+        contrast = [] if gain is None else [self.pane(film) for film in FILMS]
+
+        def statistics_of(frames: slice) -> dict[str, Array]:
+            """Statistics of some frames of the region, at the pixels of its box that count."""
+            values, *films = (film.read(frames, *box)[:, where] for film in (pane, *contrast))
+            if pixels == "measured" and "bridged" in self.data and base in FILMS:
+                bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
+                values = np.where(bridged[:, where], np.float32(np.nan), values)
+            result = statistics(values)
+            std = common = np.full(values.shape, np.nan)
+            if pane.name.startswith("input "):
+                std, common = self._noise(pane, values), np.zeros(values.shape)
+            elif pane.std:
+                std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
+            if gain is not None:
+                common = gain * np.abs(films[0] - films[1])
+            # What the calibration is taken for is an error of all pixels, besides the noise.
+            finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
+            if pane.std:
+                std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
+            std = mean_std(np.where(finite, std, np.nan), common)
+            shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
+            shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
+            return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
+
         count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
-        at_once = [slice(at, at + count) for at in starts]
-        measured = pixels == "measured"
-        chunks = [self._part(pane, at, box, where, gain, measured=measured) for at in at_once]
+        chunks = [statistics_of(slice(at, at + count)) for at in starts]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
         # Dataset over time, of a map without it.
-        units = {"units": pane.units}
-        result = xr.Dataset(
-            {
-                key: ("time", array, {} if key == "pixels" else units)
-                for key, array in values.items()
-            },
-            attrs={"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels},
-        )
+        attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
+        lines = {key: ("time", line, {"units": pane.units}) for key, line in values.items()}
+        result = xr.Dataset(lines, attrs=attrs)
+        result["pixels"].attrs.clear()
         if pane.kind == "map":
             return result.isel(time=0)
         return result.assign_coords(time=("time", self.time, schema.COORDINATES["time"].attrs))
@@ -311,39 +274,6 @@ class View:
         measured = where & ((self.status[box] & COMPLETED) == 0)
         gains = common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
-
-    def _part(
-        self,
-        pane: Pane,
-        frames: slice,
-        box: tuple[slice, ...],
-        where: Mask,
-        gain: Array | None,
-        *,
-        measured: bool,
-    ) -> dict[str, Array]:
-        """Statistics of some frames of a region, at the pixels of its box that count."""
-        values = pane.read(frames, *box)[:, where]
-        if measured and "bridged" in self.data and pane.name.removesuffix("_std") in FILMS:
-            bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
-            values = np.where(bridged[:, where], np.float32(np.nan), values)
-        result = statistics(values)
-        std = common = np.full(values.shape, np.nan)
-        if pane.name.startswith("input "):
-            std, common = self._noise(pane, values), np.zeros(values.shape)
-        elif pane.std:
-            std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
-        if gain is not None:
-            warm, cold = (self.pane(name).read(frames, *box)[:, where] for name in FILMS)
-            common = gain * np.abs(warm - cold)
-        # What the calibration is taken for is an error of all pixels, beside those of the noise.
-        finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
-        if pane.std:
-            std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
-        std = mean_std(np.where(finite, std, np.nan), common)
-        shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
-        shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
-        return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
 
     def _shared(self, pane: Pane, values: Values, box: tuple[slice, ...], where: Mask) -> Array:
         """Deviation of the samples of a pane by the calibration, which the whole image shares."""
@@ -410,16 +340,10 @@ class View:
             f"frame = view.frame({name!r}, {index})  # (y, x) at {self.time[index]:.3f} s",
         ]
         if name != "status" and regions:
-            lines.append("regions = {")
+            listed = pformat(dict(regions), width=88, sort_dicts=False)
+            curve = f"view.curve({name!r}, region, pixels={pixels!r})"
             lines += [
-                f"    {key!r}: Region({region.kind!r}, {region.points}),"
-                for key, region in regions.items()
-            ]
-            lines += [
-                "}",
-                "curves = {",
-                f"    key: view.curve({name!r}, region, pixels={pixels!r})",
-                "    for key, region in regions.items()",
-                "}",
+                f"regions = {listed}",
+                f"curves = {{key: {curve} for key, region in regions.items()}}",
             ]
         return "\n".join(lines) + "\n"

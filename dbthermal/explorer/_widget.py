@@ -16,9 +16,9 @@ from matplotlib import colormaps
 from dbthermal import schema
 from dbthermal._arrays import Mask
 from dbthermal.explorer import _export
-from dbthermal.explorer._films import Values
+from dbthermal.explorer._films import FILMS, Values
 from dbthermal.explorer._regions import Region
-from dbthermal.explorer._view import COMPLETED, FILMS, View
+from dbthermal.explorer._view import COMPLETED, View
 from dbthermal.figures import drawing
 from dbthermal.figures._status import legend
 

@@ -7,9 +7,9 @@ opens was written by others: it must be a regular file of a limited size.
 from dbthermal._text import read_yaml
 from dbthermal.readers._arrays import array
 from dbthermal.readers._flir import flir
-from dbthermal.readers._sequences import sequence
+from dbthermal.readers._sequences import raw, sequence
 from dbthermal.readers._spectra import ecostress
-from dbthermal.readers._stacks import raw, tiff
+from dbthermal.readers._stacks import tiff
 from dbthermal.readers._two_bands import two_bands
 
 __all__ = [

@@ -13,7 +13,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib import import_module
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,8 +22,8 @@ import zarr
 
 from dbthermal import _text as texts
 from dbthermal.readers import _formats as formats
-from dbthermal.readers import _matlab, _netcdf
 from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _variables as variables
 
 # Names of times: of a dim, and of an array beside another.
 _BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
@@ -103,39 +102,36 @@ def _times_of(arrays: dict[str, Any], name: str, frames: int) -> list[Any]:
     ]
 
 
-def read(
-    path: Path,
-    kind: str,
-    name: str | None,
-    check: Callable[[Any, list[Any]], None],
-    compare: Callable[[Any], None],
-    stack: ExitStack,
-) -> Any:
-    """Numbers of an array of three dimensions, by its name if there are several, once checked."""
+def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[Any]]:
+    """Array of three dimensions of a file, by its name if there are several, and its times.
+
+    What the libraries raise until the file is closed names it as damaged.
+    """
+    kind = formats.format_of(path)
+    form = f"a whole {kind}" if kind in _OPENED else ".npy, .npz, HDF5, NetCDF or zarr"
+    state = "Damaged" if kind in {*_OPENED, "zip"} else "Invalid"
+    stack.enter_context(recordings.damage_named(f"{state} '{path.name}'", form))
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
+    if kind not in _OPENED:
+        return variables.numpy_array(path, name, stack), []
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
-    with recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"):
-        opened = {"zarr": _foreign_store, "HDF5": _hdf5}.get(kind, _variables)
-        arrays = opened(path, stack)
-        films = [key for key, array in arrays.items() if array.ndim == 3]
-        name = recordings.array_name(films, name, path)
-        # Shapes first, then what is stored, then times and numbers.
-        values = arrays[name]
-        check(values, dims_of(values))
-        listed = _times_of(arrays, name, frames := values.shape[0])
-        for times in listed:
-            if times.size != frames:
-                rule = f"Must be {frames}, one for each frame"
-                raise ValueError(f"Invalid number {times.size} of times of '{name}'. {rule}.")
-            _check_whole(times, path)
-            compare(times)
-        if not listed:
-            compare(None)
-        _check_whole(values, path)
-        with path.open("rb") if kind in {"HDF5", "MATLAB 5"} else BytesIO() as stream:
-            by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
-        counts = recordings.film(values)
-        return np.swapaxes(counts, 1, 2) if by_columns else counts
+    arrays = _OPENED[kind](path, stack)
+    arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
+    name = recordings.array_name([key for key in arrays if arrays[key].ndim == 3], name, path)
+    return arrays[name], _times_of(arrays, name, arrays[name].shape[0])
+
+
+def read(values: Any, path: Path) -> npt.NDArray[Any]:
+    """Numbers of an array of a file, once it is checked to be whole."""
+    if isinstance(values, variables.Stream):
+        return values.counts()
+    check_whole(values, path)
+    counts = recordings.film(values)
+    if path.is_dir():
+        return counts
+    with path.open("rb") as stream:
+        by_columns = stream.read(6) == b"MATLAB"  # whose arrays are (y, x, time)
+    return np.swapaxes(counts, 1, 2) if by_columns else counts
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
@@ -149,7 +145,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
             label = f"{len(headers)} objects, {name.count('/')} deep, in '{path.name}'"
             raise ValueError(f"Invalid tree of {label}. Must be {_OBJECTS}, {_DEPTH} at most.")
         if isinstance(array, h5py.Dataset) and _NO_VARIABLE not in str(attribute(array, "NAME")):
-            arrays.update({name: array} if array.ndim == 3 or are_times(name, array) else {})
+            arrays[name] = array
 
     # All arrays of the file itself: no other file, no overlap.
     file.visititems(visit)  # follows no link to another file
@@ -182,7 +178,7 @@ def _filters(array: Any, path: Path) -> list[int]:
     return codes
 
 
-def _check_whole(array: Any, path: Path) -> None:
+def check_whole(array: Any, path: Path) -> None:
     """Refuse an array that is not all there, or whose chunks unpack to more than itself."""
     if isinstance(array, zarr.Array):
         _check_chunks(array, path)
@@ -224,12 +220,6 @@ def _check_pieces(array: Any, path: Path) -> None:
             raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
 
 
-def _variables(path: Path, _: ExitStack) -> dict[str, Any]:
-    is_matlab = formats.format_of(path) == "MATLAB 5"
-    variables: dict[str, Any] = _matlab.arrays(path) if is_matlab else _netcdf.arrays(path)
-    return {n: v for n, v in variables.items() if v.ndim == 3 or are_times(n, v)}
-
-
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
@@ -239,8 +229,9 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
         if isinstance(root, zarr.Group):
             members = dict(root.members(max_depth=None))
     arrays = {n: array for n, array in members.items() if isinstance(array, zarr.Array)}
-    arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
     for name, array in arrays.items():
+        if not (array.ndim == 3 or are_times(name, array)):
+            continue
         for code in array.filters:
             kind = getattr(code, "codec_id", type(code).__name__)
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
@@ -350,3 +341,10 @@ _UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
     "bz2": _unpacks(bz2.BZ2Decompressor),
     "lzma": _unpacks(lzma.LZMADecompressor),
 }
+_OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {
+    "zarr": _foreign_store,
+    "HDF5": _hdf5,
+    "NetCDF": lambda path, _: variables.netcdf_arrays(path),
+    "MATLAB 5": lambda path, _: variables.matlab_arrays(path),
+}
+"""Format -> function that opens its arrays by name."""

@@ -133,6 +133,7 @@ def flir(
     name = recordings.label(paths)
     recordings.check_number(memory, "memory")
     wanted = slice(None) if frames is None else frames
+    stated = "" if byte_order is None else recordings.byte_order(name, byte_order)
     # Records of the selected frames.
     with ExitStack() as stack:
         try:
@@ -143,18 +144,25 @@ def flir(
         if not listed:
             raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
         # Images, all of the form of the first.
-        form = _image(*listed[0])._replace(body=b"")
+        form = _image(*listed[0], stated)._replace(body=b"")
         stored = sum(file.stat().st_size for file in paths)
         recordings.check_memory((len(listed), *form.shape), memory, name, stored)
         counts = empty((len(listed), *form.shape), np.uint16)
         for number, listing in enumerate(listed):
-            image = _image(*listing)
+            image, place = _image(*listing, stated), listing[-1]
             if image._replace(body=b"") != form:
-                unlike = f"{image.shape}, {image.codec} of {listing[-1]}"
+                unlike = f"{image.shape}, {image.codec} of {place}"
                 raise ValueError(f"Invalid image {unlike}. Must be {form.shape}, {form.codec}.")
-            if byte_order is not None and image.order:
-                image = image._replace(order=recordings.byte_order(name, byte_order))
-            counts[number] = _decoded(image, listing[-1])
+            if image.codec == "none":
+                values = np.frombuffer(image.body, f"{image.order}u2")
+                counts[number] = values.reshape(image.shape)
+            elif image.codec == "png":
+                counts[number] = recordings.png(image.body, place)
+            else:
+                codecs = recordings.optional("imagecodecs", "recordings")
+                with recordings.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
+                    values = codecs.jpegls_decode(image.body)
+                counts[number] = recordings.decoded(values, image.shape, place)
             release()
         seconds, same_number, attrs = _cameras(listed, timed=clock is None)
     # Byte order, flags and times.
@@ -192,8 +200,8 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
             raise ValueError(f"{error}{before}") from error
 
 
-def _image(content: Content, records: Frame, place: str) -> _Image:
-    """Form and bytes of an image, whose sizes agree in all places that state them."""
+def _image(content: Content, records: Frame, place: str, stated: str) -> _Image:
+    """Form and bytes of an image, of a stated byte order, whose sizes agree wherever they are."""
     body, fault = container.body(content, records[container.IMAGE])
     if fault:
         raise ValueError(f"Damaged image in {place}: {fault}.")
@@ -203,19 +211,19 @@ def _image(content: Content, records: Frame, place: str) -> _Image:
         raise ValueError(f"Damaged image in {place}: it begins with {head[:2]!r}. Must be 2.")
     # Sizes by the header, and by the compressed image.
     width, height = struct.unpack_from(f"{order}HH", head, 2)
-    image = _Image((height, width), order, "none", body)
-    stated = (height, width, 16)
+    image = _Image((height, width), stated or order, "none", body)
+    size = (height, width, 16)
     if body[:8] == formats.PNG:
         image = image._replace(order="", codec="png")
-        stated = recordings.png_size(body, place)
+        size = recordings.png_size(body, place)
     elif body[:2] == b"\xff\xd8":
         image = image._replace(order="", codec="jpegls")
-        stated = _jpegls_size(body, place)
+        size = _jpegls_size(body, place)
     elif len(body) != 2 * width * height:
         label = f"{len(body)} bytes of counts in {place}"
         raise ValueError(f"Truncated or damaged {label}. Must be 2 x {width} x {height}.")
-    if stated != (height, width, 16) or not width * height:
-        label = f"{stated[0]} x {stated[1]} pixels of {stated[2]} bits in {place}"
+    if size != (height, width, 16) or not width * height:
+        label = f"{size[0]} x {size[1]} pixels of {size[2]} bits in {place}"
         raise ValueError(f"Invalid {label}. Must be {height} x {width} of 16, as its header says.")
     return image
 
@@ -231,42 +239,27 @@ def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
     raise ValueError(f"Invalid JPEG in {place}, of 8 bits. Must be JPEG-LS: record 16-bit counts.")
 
 
-def _decoded(image: _Image, place: str) -> Counts:
-    """Counts (y, x) of an image; ValueError where its codec finds damage."""
-    if image.codec == "none":
-        return np.frombuffer(image.body, f"{image.order}u2").reshape(image.shape)
-    codecs = recordings.optional("imagecodecs", "recordings")
-    if image.codec == "png":
-        return recordings.png(image.body, place)
-    with recordings.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
-        counts = codecs.jpegls_decode(image.body)
-    return recordings.decoded(counts, image.shape, place)
-
-
 def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple[str, str]:
     """Byte order of the counts, which are swapped in place if need be, and what decided it."""
     if form.codec == "jpegls":
         return "none: numbers are coded", "codec"
+    order = recordings.ORDERS[form.order or ">"]  # a PNG has its highest byte first
+    decided = "caller" if stated else "header" if form.order else "smoothness"
     sign = recordings.smoother(counts)
-    if stated is None and (sign < 0 if form.order else sign == 0):
-        raise ValueError(
-            f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
-            "as smooth. Must be stated: byte_order='little' or 'big'."
-        )
-    # Decoded as stated, or as PNG has it: its highest byte first.
-    as_stated = bool(form.order) or stated is None or recordings.byte_order(name, stated) == ">"
-    if stated is not None and (sign < 0 if as_stated else sign > 0):
+    if order != (stated or order) or (decided == "smoothness" and sign < 0):
+        counts.byteswap(inplace=True)
+        order, sign = "little" if order == "big" else "big", -sign
+    if stated and sign < 0:
         raise ValueError(
             f"Invalid byte_order '{stated}' for '{name}': its images are smoother with their bytes "
             "swapped. Must be the other one."
         )
-    if form.order:
-        order = {"<": "little", ">": "big"}[form.order] if stated is None else stated
-        return order, "caller" if stated else "header"
-    swap = sign < 0 if stated is None else recordings.byte_order(name, stated) == "<"
-    if swap:  # a PNG has its highest byte first
-        counts.byteswap(inplace=True)
-    return "little" if swap else "big", "caller" if stated else "smoothness"
+    if not stated and ((sign == 0 and not form.order) or sign < 0):
+        raise ValueError(
+            f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
+            "as smooth. Must be stated: byte_order='little' or 'big'."
+        )
+    return order, decided
 
 
 def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dict[str, Any]]:

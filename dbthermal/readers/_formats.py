@@ -93,10 +93,9 @@ def files(path: Paths, reader: str) -> list[Path]:
     numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
     for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):
         if len(before) == len(after) and after <= before:
-            rule = (
-                "Must rise, not in the order of text, frame1, frame10, frame2: $(ls -v frame*.png)"
-            )
-            raise ValueError(f"Unordered files: the numbers of '{file.name}' do not rise. {rule}.")
+            label = f"Unordered files: the numbers of '{file.name}' do not rise"
+            rule = "Must rise, not in the order of text, frame1, frame10, frame2"
+            raise ValueError(f"{label}. {rule}: $(ls -v frame*.png).")
     for file in paths:
         actual = "" if reader == "raw" else reader_of(file)
         if actual not in {"", reader}:

@@ -45,6 +45,7 @@ _APART: Final = 1.3  # axes whose roughness differs by this factor are of anothe
 _PACKED: Final = 64
 SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
 _PIECES: Final = 2**14  # of less than 1 kB in a file
+ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 # Names of a digital number, and of units of time.
 _COUNTS: Final = re.compile(
     r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
@@ -223,7 +224,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
 
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
-    if str(value) not in {"little", "big"}:
+    if str(value) not in ORDERS.values():
         raise ValueError(f"Invalid byte_order '{value}' for '{name}'. Must be 'little' or 'big'.")
     return "<" if value == "little" else ">"
 

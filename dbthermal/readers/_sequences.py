@@ -1,10 +1,11 @@
-"""Recordings of frames behind headers: FLIR .sfmov, whose rate is in an .inc, and Telops .hcc."""
+"""Frames of numbers behind headers: bare ones, FLIR .sfmov with its rate in .inc, Telops .hcc."""
 
 import re
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from dbthermal._arrays import Array
@@ -12,6 +13,8 @@ from dbthermal.readers import _formats as formats
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
+_FIRST: Final = 8  # frames that tell rows from columns
+_LONGER: Final = 64  # factor of roughness between the parts of a longer number
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
 # Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
 _HEADER: Final[np.dtype[Any]] = np.dtype(
@@ -22,6 +25,92 @@ _HEADER: Final[np.dtype[Any]] = np.dtype(
     }
 )
 _COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
+
+
+def raw(
+    path: str | Path,
+    shape: tuple[int, int],
+    *,
+    byte_order: str,
+    unit: str,
+    clock: Clock,
+    header: int = 0,
+    frame_header: int = 0,
+    memory: float = MEMORY,
+) -> xr.Dataset:
+    """Counts of a file of bare 16-bit numbers, frame after frame.
+
+    Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
+    fit the size of the file without remainder. An image is refused that is smoother, or as rough,
+    with its bytes swapped, smoother with rows and columns exchanged, or of longer numbers.
+
+    Parameters
+    ----------
+    path : str or Path
+        Regular file.
+    shape : (int, int)
+        Rows and columns of a frame [pixel].
+    byte_order : {"little", "big"}
+        Order of the bytes of a number.
+    unit, clock, memory
+        As for `tiff`.
+    header, frame_header : int
+        Size of what precedes the first frame, and each frame [byte].
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> frames = np.arange(18000, 18024, dtype=">u2").reshape(2, 3, 4)
+    >>> with TemporaryDirectory() as folder:
+    ...     frames.tofile(f"{folder}/a.raw")
+    ...     capture = raw(f"{folder}/a.raw", (3, 4), byte_order="big", unit="count", clock=30.0)
+    >>> bool((capture.counts == frames).all())
+    True
+    """
+    (file,) = formats.files([path], "raw")
+    name = file.name
+    recordings.check_unit(unit, name)
+    # Form, as stated.
+    order = recordings.byte_order(name, byte_order)
+    for label, value in {"header": header, "frame_header": frame_header}.items():
+        recordings.check_number(value, f"{label} of '{name}'", whole=True)
+        if value < 0:
+            raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
+    sizes = np.asarray(shape)
+    if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
+        rule = "Must be rows and columns, two whole numbers"
+        raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
+    # Counts, whose images must be smooth in that form.
+    form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
+    counts = recordings.film(_frames(file, form, header, memory)["counts"])
+    if (sign := recordings.smoother(counts)) < 0:
+        rule = "Must be the other byte order, or another shape or header"
+        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+    if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
+        rule = (
+            "Must be 16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
+        )
+        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
+    if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
+        rule = "Must be rows, then columns"
+        raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
+    decided = {"byte_order": byte_order, "byte_order_by": "caller"}
+    return recordings.clocked(counts, clock, name, format="raw", **decided)
+
+
+def _are_longer(counts: Counts) -> bool:
+    """Tell whether numbers of 16 bits are parts of longer ones, whole or floating-point.
+
+    Then neighbours, or every fourth number of some of the four, are much rougher than those of the
+    smoothest of the four. Columns of a camera differ by far less.
+    """
+    values = counts[0].ravel().astype(np.int32)
+    if values.size < _FIRST * 4:
+        return False
+    fourths = [float(np.median(np.abs(np.diff(values[n::4])))) for n in range(4)]
+    near = float(np.median(np.abs(np.diff(values))))
+    return max(near, *fourths) > _LONGER * (min(fourths) + 1)
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
@@ -55,6 +144,18 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
         clock = recordings.check_times(times, "s", clock, path.name)
     kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
     return recordings.clocked(counts, name=path.name, **kind)
+
+
+def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:
+    """Frames, each with its header and counts, behind a start; the file must hold whole ones."""
+    size = path.stat().st_size
+    number, remainder = divmod(size - start, form.itemsize)
+    if number < 1 or remainder:
+        label = f"{size} bytes of '{path.name}': {number} frames and {remainder} bytes"
+        rule = f"Must be whole frames of {form.itemsize} bytes behind {start}, as stated"
+        raise ValueError(f"Truncated or damaged: {label}. {rule}.")
+    recordings.check_memory((number, *form["counts"].shape), memory, path.name, size)
+    return np.memmap(path, form, "r", start)
 
 
 def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
@@ -94,19 +195,14 @@ def _lines(header: bytes) -> dict[str, str]:
 
 def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts of frames that have a header each, and their times, which may be those of a rate."""
-    size, first = path.stat().st_size, np.fromfile(path, _HEADER, 1)
+    first = np.fromfile(path, _HEADER, 1)
     if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
         raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")
-    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
-    whole = length + 2 * rows * columns
-    recordings.check_memory((size // whole, rows, columns), memory, path.name, size)
-    if size % whole:
-        label = f"{size} bytes of '{path.name}' in frames of {whole}"
-        raise ValueError(f"Truncated or damaged: {label}. Must be whole frames.")
     # All frames by their headers, which must be alike.
+    length, rows, columns = (int(first[name][0]) for name in ("length", "rows", "columns"))
     between = ("more", f"V{length - _HEADER.itemsize}")
     form: Any = [("header", _HEADER), between, ("counts", "<u2", (rows, columns))]
-    frames = np.memmap(path, form, "r")
+    frames = _frames(path, np.dtype(form), 0, memory)
     headers = frames["header"]
     for name in ("signature", "length", "rows", "columns", "mode"):
         for number in np.flatnonzero(headers[name] != headers[name][0]):

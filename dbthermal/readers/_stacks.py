@@ -1,4 +1,4 @@
-"""Counts that other programs wrote: TIFF stacks and bare numbers, which tell little else."""
+"""Counts that other programs wrote as TIFF or PNG, which tell little else."""
 
 import json
 import logging
@@ -36,11 +36,8 @@ _CODECS: Final = {1: "", 32946: "zlib"} | dict(
 )
 _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
-_LONGER: Final = 64  # factor of roughness between the parts of a longer number
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
 _AT_ONCE: Final = 2**25  # of a span [byte]
-_FIRST: Final = 8  # frames that tell rows from columns
-_ORDERS: Final = {"<": "little", ">": "big"}
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
@@ -150,104 +147,10 @@ def tiff(
             at += values.size
             release()
     recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
-    order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
+    order = " and ".join(sorted({recordings.ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
     form = "PNG" if pages[0].codec == "png" else "TIFF"
     return recordings.clocked(counts, seconds, name, *sentences, format=form, **decided)
-
-
-def raw(
-    path: str | Path,
-    shape: tuple[int, int],
-    *,
-    byte_order: str,
-    unit: str,
-    clock: Clock,
-    header: int = 0,
-    frame_header: int = 0,
-    memory: float = MEMORY,
-) -> xr.Dataset:
-    """Counts of a file of bare 16-bit numbers, frame after frame.
-
-    Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
-    fit the size of the file without remainder. An image is refused that is smoother, or as rough,
-    with its bytes swapped, smoother with rows and columns exchanged, or of longer numbers.
-
-    Parameters
-    ----------
-    path : str or Path
-        Regular file.
-    shape : (int, int)
-        Rows and columns of a frame [pixel].
-    byte_order : {"little", "big"}
-        Order of the bytes of a number.
-    unit, clock, memory
-        As for `tiff`.
-    header, frame_header : int
-        Size of what precedes the first frame, and each frame [byte].
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> frames = np.arange(18000, 18024, dtype=">u2").reshape(2, 3, 4)
-    >>> with TemporaryDirectory() as folder:
-    ...     frames.tofile(f"{folder}/a.raw")
-    ...     capture = raw(f"{folder}/a.raw", (3, 4), byte_order="big", unit="count", clock=30.0)
-    >>> bool((capture.counts == frames).all())
-    True
-    """
-    (file,) = formats.files([path], "raw")
-    name = file.name
-    recordings.check_unit(unit, name)
-    # Form, as stated.
-    order = recordings.byte_order(name, byte_order)
-    for label, value in {"header": header, "frame_header": frame_header}.items():
-        recordings.check_number(value, f"{label} of '{name}'", whole=True)
-        if value < 0:
-            raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
-    sizes = np.asarray(shape)
-    if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
-        rule = "Must be rows and columns, two whole numbers"
-        raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
-    # Size of the file, which the form must fill.
-    frame = frame_header + 2 * shape[0] * shape[1]
-    frames, remainder = divmod(file.stat().st_size - header, frame)
-    if frames < 1 or remainder:
-        label = f"{file.stat().st_size} bytes of '{name}': {frames} frames and {remainder} bytes"
-        rule = f"Must be {header} + a whole number of {frame}, as shape and headers state"
-        raise ValueError(f"Invalid size {label}. {rule}.")
-    recordings.check_memory((frames, *shape), memory, name)
-    # Counts, whose images must be smooth in that form.
-    form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = recordings.film(np.memmap(file, form, "r", offset=header)["counts"])
-    if (sign := recordings.smoother(counts)) < 0:
-        rule = "Must be the other byte order, or another shape or header"
-        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
-    if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
-        rule = (
-            "Must be 16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
-        )
-        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
-    if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
-        rule = "Must be rows, then columns"
-        raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
-    decided = {"byte_order": byte_order, "byte_order_by": "caller"}
-    return recordings.clocked(counts, clock, name, format="raw", **decided)
-
-
-def _are_longer(counts: Counts) -> bool:
-    """Tell whether numbers of 16 bits are parts of longer ones, whole or floating-point.
-
-    Then neighbours, or every fourth number of some of the four, are much rougher than those of the
-    smoothest of the four. Columns of a camera differ by far less.
-    """
-    values = counts[0].ravel().astype(np.int32)
-    if values.size < _FIRST * 4:
-        return False
-    fourths = [float(np.median(np.abs(np.diff(values[n::4])))) for n in range(4)]
-    near = float(np.median(np.abs(np.diff(values))))
-    return max(near, *fourths) > _LONGER * (min(fourths) + 1)
 
 
 def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Array, list[str]]:
@@ -257,15 +160,13 @@ def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Arra
     times = np.array(_TIMES.findall(text), dtype=np.float64)
     times = times if times.size == frames else np.multiply(interval, np.arange(frames))
     if times.any():
-        seconds = recordings.check_times(times, unit, clock, name)
-        return (seconds if clock is None else recordings.stamps(clock, frames, name)), []
+        stated = recordings.check_times(times, unit, clock, name)
+        return recordings.stamps(stated if clock is None else clock, frames, name), []
     seconds = recordings.stamps(clock, frames, name)
-    if rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate:
-        rule = "Must be the rate of recording; that in the file may be of playing it"
-        return seconds, [
-            f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
-        ]
-    return seconds, []
+    differs = rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate
+    rule = "Must be the rate of recording; that in the file may be of playing it"
+    sentence = f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
+    return seconds, [sentence] if differs else []
 
 
 class _Page(NamedTuple):
@@ -346,9 +247,7 @@ def _pages(path: Path) -> list[_Page]:
     finally:
         log.removeHandler(handler)
     # Number of the pages, as the description states it.
-    if (
-        len(pages) == 1 and stated > 1 and not pages[0].codec
-    ):  # one page for a stack without gaps: ImageJ beyond 4 GB
+    if len(pages) == 1 and stated > 1 and not pages[0].codec:  # as ImageJ beyond 4 GB, without gaps
         (start, length), *further = pages[0].spans
         if further or start + stated * length > size:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"

@@ -182,8 +182,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 
 def _check(recording: xr.Dataset, name: str) -> None:
-    """Refuse what is no recording of counts in one band."""
-    # Variables and dims.
+    """Refuse what is no recording of counts in one band: variables, dims, types, rising times."""
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:
@@ -192,17 +191,13 @@ def _check(recording: xr.Dataset, name: str) -> None:
                 f"Invalid recording of band '{name}': '{variable}' is {actual}. Must be {dims}, as "
                 "from a reader of recordings."
             )
-    # Times that rise.
-    for variable in ("time", "exposure_time"):
-        values = schema.check_numbers(
-            recording[variable], f"'{variable}' of band '{name}'", "s"
-        ).values
+        array, label = recording[variable], f"'{variable}' of band '{name}'"
+        if variable in {"counts", "frame_flags"}:
+            if (array.dtype.kind, array.dtype.itemsize) != ("u", 2):
+                raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be uint16.")
+            continue
+        values = schema.check_numbers(array, label, "s").values
         valid = values[~np.isnan(values)] if variable == "exposure_time" else values
         if not valid.size or not np.isfinite(valid).all() or np.any(np.diff(valid) <= 0):
             rule = "Must be known, finite and rise; an exposure time may be NaN, not all"
-            raise ValueError(f"Invalid '{variable}' of band '{name}' {shown(values)}. {rule}.")
-    # Types.
-    for variable in ("counts", "frame_flags"):
-        if ((dtype := recording[variable].dtype).kind, dtype.itemsize) != ("u", 2):
-            actual = f"dtype {dtype} of the {variable} of band '{name}'"
-            raise TypeError(f"Invalid {actual}. Must be uint16.")
+            raise ValueError(f"Invalid {label} {shown(values)}. {rule}.")

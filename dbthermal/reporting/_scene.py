@@ -1,46 +1,42 @@
 """Report of a separated scene: films, curves of regions, validity, emissivities, assumptions."""
 
-from collections.abc import Iterator, Mapping
+import io
+import json
+from collections.abc import Mapping
+from importlib import resources
 from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from dbthermal import emissivity, figures, schema
-from dbthermal._arrays import Array
+from dbthermal import _text as texts
+from dbthermal import emissivity, figures, schema, store
 from dbthermal.explorer import Region, View
 from dbthermal.explorer._answer import SPREAD, answer, nearest
+from dbthermal.explorer._export import sampled
+from dbthermal.explorer._films import FILMS
 from dbthermal.figures import drawing
-from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
-from dbthermal.reporting._page import Section, image_tag, save_page, table
+from dbthermal.readers._formats import PNG
+from dbthermal.reporting._films import VIEWED, base64_text, video, viewer
 from dbthermal.schema import Status
 from dbthermal.separation._doubts import against_response, hardly_measured
 
+try:
+    from jinja2 import Environment
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+except ImportError as error:
+    raise ImportError(texts.missing_library(error.name, "report")) from error
+
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
-_WORDS: Final = {
-    "method": "method",
-    "settings": "its options",
-    "response_kind": "response of the cameras",
-    "calibration": "calibration",
-    "blackbody": "blackbody of the calibration",
-    "gain_offset_by_camera": "gain and offset corrected by the cameras, as was stated",
-    "noise_source": "noise taken from",
-    "emissivity_source": "emissivities taken from",
-    "not_estimated": "not estimated",
-    "reference_band": "band on whose grid the result is",
-    "reflection_shift": "shift between the cameras' reflections",
-    "time_offset": "clock of the second camera behind the first [s]",
-    "frames_lost": "frames lost",
-    "frames_missing": "frames without data of all bands at any pixel",
-    "frames_bridged": "frames bridged in a pixel that lacks some, mean",
-}
+_LOGO: Final = 2**20  # largest picture beside the title [byte]
 
 
 def report(  # noqa: PLR0913 - what is shown beside the result, by name
@@ -122,9 +118,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
                 'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
             )
     chosen = dict(regions) or {
-        "measured pixels of the whole image": Region(
-            "rectangle", ((0, 0), (view.shape[0], view.shape[1]))
-        )
+        "measured pixels of the whole image": Region("rectangle", ((0, 0), view.shape))
     }
     # Curves of every region in every pane.
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
@@ -134,114 +128,111 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     }
     table_ = emissivity.embedded_table() if materials is None else materials
     # Numbers of the scene, which the page holds as JSON.
-    sentence, extent = _extent(view)
+    (rows, columns), frames, seconds = view.shape, view.time.size, float(np.ptp(view.time))
+    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
+    if "method" in result.attrs:
+        sentence += f"; separated by the method '{result.attrs['method']}'"
     numbers: dict[str, Any] = {
-        "scene": extent,
+        "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
         "validity": _validity(view),
         "uncertainty": _budget(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
     made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
-    # Film, viewer, and the sections of the page.
     sentences, numbers["answer"] = answer(result, table_)
     about = [author, *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
-    film = video(view, title, codec, celsius=celsius)
-    sections = [
-        Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),
-        Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
-        Section("What can be trusted", list(_trust(view, numbers["validity"]))),
-        Section("Deviation by cause", list(_causes(numbers["uncertainty"]))),
-        Section("Emissivities", list(_emissivities(numbers, named=bool(regions)))),
-        Section("What was assumed", [_assumed(view)]),
-    ]
-    save_page(
-        path,
-        title,
-        [section for section in sections if section.body],
+    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
+    if view.capture is not None and view.response is not None:
+        doubts += against_response(view.capture, view.response)
+    unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
+    emissivities = _emissivities(numbers, named=bool(regions))
+    picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
+    if logo is not None and not picture.startswith(PNG):
+        raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
+    # The page, which asks for nothing else.
+    page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
+    environment = Environment(autoescape=True, trim_blocks=True)
+    text = environment.from_string(page.read_text("utf-8")).render(
+        title=title,
         origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
-        numbers=numbers,
-        provenance=made_by,
         about=", ".join(filter(None, about)),
-        logo=logo,
         answer=[
             sentence.replace("+-", "\N{PLUS-MINUS SIGN}").replace("degC", "\N{DEGREE SIGN}C")
             for sentence in sentences
         ],
+        logo=base64_text(picture),
+        numbers=numbers,
+        scene=sentence,
+        film=video(view, title, codec, celsius=celsius),
+        viewer=viewer(view, celsius=celsius),
+        outlines=_svg(_outlines(view, chosen, celsius=celsius)),
+        curves=_svg(_curves(view, curves, celsius=celsius)),
+        unit=unit,
+        zero=zero,
+        doubts=dict.fromkeys(doubts),
+        status=_svg(figures.status(result)) if "status" in view.panes else "",
+        meanings={bit.label: bit.meaning for bit in Status},
+        percent=drawing.percent,
+        causes=schema.CAUSES,
+        emissivities=emissivities,
+        bands=[drawing.band_label(band) for band in result["band"].values] if emissivities else [],
+        spread=SPREAD,
+        attrs=result.attrs,
+        events=", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items()),
+        text=_text,
+        provenance=json.dumps(made_by, indent=2, sort_keys=True),
+        script=Markup(script.read_text("utf-8")),
+        json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
     )
+    if Path(path).suffix != ".html":
+        raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
+    store.save_text(text, path, made_by)
 
 
-def _extent(view: View) -> tuple[str, dict[str, Any]]:
-    """Size and duration of a scene, as a sentence with its method, and as numbers."""
-    (rows, columns), frames = view.shape, int(view.time.size)
-    seconds = float(view.time[-1] - view.time[0])
-    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
-    if "method" in view.data.attrs:
-        sentence += f"; separated by the method '{view.data.attrs['method']}'"
-    return sentence, {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds}
+def _svg(figure: Figure) -> str:
+    """Figure as a picture of vectors, in base64."""
+    buffer = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "dbthermal", "svg.fonttype": "path"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
+    return base64_text(buffer.getvalue())
 
 
-def _regions(
-    view: View, chosen: Mapping[str, Region], curves: Curves, *, celsius: bool
-) -> Iterator[Markup | str]:
-    """Yield where the regions are, and their curves with two standard deviations."""
-    yield image_tag(
-        _outlines(view, chosen, celsius=celsius), "Object temperature, mean over time; regions."
-    )
+def _curves(view: View, curves: Curves, *, celsius: bool) -> Figure:
+    """Curves of the regions, with two standard deviations."""
     names = [name for name in FILMS if name in view.panes]
     figure, axes = drawing.canvas(len(names), 1, (9.0, 2.9 * len(names)))
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     for axis, name in zip(axes[:, 0], names, strict=True):
-        for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
-            curve = curves[region][name]
-            mean, interval = curve["mean"].values - zero, 2 * curve["std"].values
-            axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
-            axis.fill_between(
-                view.time, mean - interval, mean + interval, color=color, alpha=0.25, linewidth=0
-            )
+        for region, color in zip(curves, cycle(drawing.COLORS), strict=False):
+            mean, std = (curves[region][name][key].values for key in ("mean", "std"))
+            low, high = mean - zero - 2 * std, mean - zero + 2 * std
+            axis.plot(view.time, mean - zero, color=color, label=region, linewidth=1.2)
+            axis.fill_between(view.time, low, high, color=color, alpha=0.25, linewidth=0)
         axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
-    yield image_tag(
-        figure, "Means of the regions' measured pixels, and two standard deviations of these means."
-    )
-    head = ["region", "measured pixels", f"object temperature [{unit}]", "its std [K]"]
-    rows = []
-    for region in chosen:
-        curve = curves[region]["object_temperature"]
-        stds = [_text(_plain(curve[key].mean()), 3) for key in ("std", "calibration_std")]
-        rows.append(
-            [region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), *stds]
-        )
-    yield table([*head, "of it by calibration [K]"], rows)
-    yield (
-        "Of a region only measured pixels and frames count: no pixel with a flag or completed, "
-        "and no frame of a pixel that was bridged in time. "
-        "Errors that the pixels of a region share are not lessened by their number."
-    )
+    return figure
 
 
 def _budget(view: View) -> dict[str, float]:
     """Median deviation [K] of the object temperature of the measured pixels, by cause."""
     if "uncertainty" not in view.data:
         return {}
-    budget, good = view.data["uncertainty"], view.counted("measured")
-    rows = zip(map(str, budget["cause"].values), budget.values[:, good], strict=True)
-    known = {cause: row[np.isfinite(row)] for cause, row in rows}
-    return {cause: float(np.median(row)) for cause, row in known.items() if row.size}
+    medians = view.data["uncertainty"].where(view.counted("measured")).median(("y", "x"))
+    return {str(cause): float(std) for cause, std in medians.to_series().dropna().items()}
 
 
 def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Figure:
     """Mean picture of the object with the regions on it."""
     pane = view.panes["object_temperature"]
-    unit, zero = pane.unit(celsius=celsius)
-    film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000)
-    image = film.mean("time") - zero
+    film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000, celsius=celsius)
+    image, (unit, _) = film.mean("time"), pane.unit(celsius=celsius)
     aspect = view.shape[0] / view.shape[1]
     figure, axes = drawing.canvas(1, 1, (5.6, 4.6 * aspect + 0.5))
     limits = drawing.limits_of(image)
     drawing.draw_image(figure, axes[0, 0], image, pane.label, f"[{unit}]", limits=limits)
     for (name, region), color in zip(chosen.items(), cycle(drawing.COLORS), strict=False):
-        mask = region.mask((view.shape[0], view.shape[1]))[::step, ::step]
+        mask = region.mask(view.shape)[::step, ::step]
         if mask.all():
             continue
         axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
@@ -256,59 +247,19 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
 def _validity(view: View) -> dict[str, float]:
     """Share of the pixels that are measured, completed, without a value, and with each flag."""
     completed = (view.status & int(schema.COMPLETED)) != 0
-    film, _ = sampled(view, "object_temperature", VIEWED, VIEWED * 200_000)
+    film, _ = sampled(view, "object_temperature", VIEWED, VIEWED * 200_000, celsius=False)
     shares = {
         "no_flag": float(np.mean(view.status == 0)),
         "completed": float(completed.mean()),
         "without_value": float(film.isnull().all("time").mean()),
     }
-    return shares | {
-        bit.label: float(np.mean((view.status & bit) != 0))
-        for bit in Status
-        if (view.status & bit).any()
-    }
-
-
-def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
-    """Yield the warnings, the map of the status, and the table of the flags."""
-    doubts = [*view.data.attrs.get("warnings", []), *hardly_measured(view.data)]
-    if view.capture is not None and view.response is not None:
-        doubts += against_response(view.capture, view.response)
-    yield from (
-        Markup("<p><strong>{}</strong></p>").format(doubt) for doubt in dict.fromkeys(doubts)
-    )
-    if "status" not in view.panes:
-        yield "The result has no status: nothing is said of what can be trusted."
-        return
-    yield image_tag(figures.status(view.data), "Pixels to trust, and the reason of the others.")
-    meaning = {bit.label: bit.meaning for bit in Status}
-    words = {
-        "no_flag": "measured, and nothing speaks against it",
-        "completed": "not measured here, but completed from what else is known",
-        "without_value": "no object temperature at any time",
-    }
-    rows = [
-        [name.replace("_", " "), words.get(name) or meaning[name], drawing.percent(share)]
-        for name, share in shares.items()
-    ]
-    yield table(["flag", "meaning", "share of the pixels"], rows, names=2)
-
-
-def _causes(budget: Mapping[str, float]) -> Iterator[Markup | str]:
-    """Yield the table of the deviation by cause."""
-    if not budget:
-        return
-    rows = [[cause, schema.CAUSES[cause], _text(std, 3)] for cause, std in budget.items()]
-    yield table(["cause", "an error is shared by", "standard deviation [K]"], rows, names=2)
-    yield (
-        "Of the object temperature, median over the measured pixels. The bands show noise and "
-        "ratio; all else is what the response of the cameras states."
-    )
+    flags = {bit.label: float(np.mean((view.status & bit) != 0)) for bit in Status}
+    return shares | {name: share for name, share in flags.items() if share}
 
 
 def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[str, Any]:
     """Numbers of a region: temperatures, emissivities, and the nearest materials."""
-    summary: dict[str, Any] = {}
+    summary: dict[str, Any] = {"pixels": int(curves["object_temperature"]["pixels"].max())}
     for name in (name for name in FILMS if name in curves):
         curve = curves[name]
         keys = ("mean", "std", "calibration_std")
@@ -327,39 +278,20 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
     return summary
 
 
-def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> Iterator[Markup | str]:
-    """Yield the emissivities of materials, and of named regions, beside the nearest known."""
+def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> list[list[str]]:
+    """Emissivities of materials, and of named regions, beside the nearest known: rows of text."""
     places = {f"{entry['pixels']} pixels alike": entry for entry in numbers["answer"]["materials"]}
     if named:
         places |= {name: of for name, of in numbers["regions"].items() if of.get("emissivity")}
-    if not places:
-        return
     rows = []
     for name, of in places.items():
         pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
-        cells = [f"{_text(value, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for value, std in pairs]
+        cells = [f"{_text(value)} \N{PLUS-MINUS SIGN} {_text(std)}" for value, std in pairs]
         steady = of.get("emissivity_steady_std", {}).values()
         cells = [f"{cell} ({std:.4f})" for cell, std in zip(cells, steady, strict=False)] or cells
         near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
         rows.append([name, ", ".join(near) or "many", *cells])
-    head = ["measured pixels", "nearest materials of the table (distance)"]
-    bands = next(iter(places.values()))["emissivity"]
-    yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
-    yield (
-        "Medians of pixels that are alike, and means of regions; in brackets the deviation if the "
-        "surroundings do not drift. The distance is the root mean "
-        "square over the bands, in standard deviations, to which "
-        f"{SPREAD} is added for what samples of a material differ. "
-        "A near material is no identification: many share two emissivities."
-    )
-
-
-def _assumed(view: View) -> Markup:
-    """Assumptions of the separation, by the attributes of the result."""
-    attrs = view.data.attrs
-    rows = [[words, str(attrs[name])] for name, words in _WORDS.items() if str(attrs.get(name, ""))]
-    events = ", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items())
-    return table(["what", "as"], [*rows, ["events", events or "none known"]], names=2)
+    return rows
 
 
 def _plain(value: Any) -> float | None:
@@ -367,11 +299,5 @@ def _plain(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _text(value: float | None, digits: int) -> str:
-    return "no value" if value is None else f"{value:.{digits}f}"
-
-
-def _range(values: Array) -> str:
-    """Least and greatest of some values."""
-    finite = values[np.isfinite(values)]
-    return f"{finite.min():.2f} to {finite.max():.2f}" if finite.size else "no value"
+def _text(value: float | None) -> str:
+    return "no value" if value is None else f"{value:.3f}"

@@ -8,7 +8,6 @@ import math
 import os
 import re
 import shutil
-import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain
@@ -169,14 +168,12 @@ def _save(
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
                 options = {"mode": "a", "append_dim": "y"}
-                constant = [
-                    name for name, array in plain.variables.items() if "y" not in array.dims
-                ]
-                plain = plain.drop_vars(constant)
+                lasting = [name for name in plain.variables if "y" not in plain[name].dims]
+                plain = plain.drop_vars(lasting)
             # Arrays of dask are written in the chunks of the store.
-            lazy = {name: array for name, array in plain.variables.items() if array.chunks}
-            for name, array in lazy.items():
-                plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
+            for name, array in plain.variables.items():
+                if array.chunks:
+                    plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
             plain.to_zarr(
                 integrity.SummedStore(folder),
                 zarr_format=3,
@@ -217,22 +214,18 @@ def _check(dataset: xr.Dataset) -> None:
     repeated = texts.repeated(str(name).lower() for name in dataset.variables)
     for name, variable in dataset.variables.items():
         listed = isinstance(name, str) and _NAME.fullmatch(name) and name not in _RESERVED
-        alike = str(name).lower() in repeated
-        if not listed or alike or (" " in str(name) and name in dataset.coords):
+        listed = listed and str(name).lower() not in repeated
+        if not listed or (" " in str(name) and name in dataset.coords):
             rule = "Must be at most 60 letters, digits, _ - + . ( ), or blanks unless of a "
             rule += "coordinate, of no device, and differ in more than capitals"
             raise ValueError(f"Invalid name {texts.shown(name)}. {rule}: a folder has it.")
         if not all(length >= 0 for length in variable.shape):  # NaN in arrays of dask
             rule = "Must have known sizes, as from compute_chunk_sizes() of dask"
             raise ValueError(f"Invalid shape {variable.shape} of '{name}'. {rule}.")
-        text = variable.dtype.kind == "O" and all(
-            isinstance(element, str) for element in variable.values.flat
-        )
-        if not (
-            text
-            or variable.dtype.kind in "UTMm"
-            or (variable.dtype.kind in "biuf" and variable.dtype.itemsize <= 8)
-        ):
+        real = variable.dtype.kind in "biuf" and variable.dtype.itemsize <= 8
+        kinds = {*map(type, variable.values.flat)} if variable.dtype.kind == "O" else {object}
+        text = all(issubclass(kind, str) for kind in kinds)
+        if not (real or text or variable.dtype.kind in "UTMm"):
             rule = "Must be real numbers of at most 64 bits, truth values, or text"
             raise TypeError(f"Invalid dtype {variable.dtype} of '{name}'. {rule}.")
 
@@ -249,10 +242,8 @@ def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
         if equal and name in rows.coords:
             equal = bool(variable.equals(reference))  # type: ignore[no-untyped-call]
         if not equal:
-            raise ValueError(
-                f"Invalid '{name}' of rows {number}. Must have the dims, type, unit and, of a "
-                "coordinate, the values of the first."
-            )
+            rule = "Must have the dims, type, unit and, of a coordinate, the values of the first"
+            raise ValueError(f"Invalid '{name}' of rows {number}. {rule}.")
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
@@ -360,22 +351,33 @@ def join_parts(
     if not (sources := [texts.as_path(folder) for folder in folders]):
         raise ValueError(f"No parts to join as '{path}'. Must be at least one.")
     with whole(path, ".zarr") as folder:
-        # The first folder, then the chunks of all others in their places.
+        # The first folder, and a list of its files that is not linked.
         shutil.copytree(sources[0], folder, copy_function=_link)
-        metadata = {file: json.loads(file.read_text()) for file in folder.glob("*/zarr.json")}
         sums = integrity.last_sums(folder)
-        for file, array in metadata.items():
-            if dim not in array["dimension_names"]:
-                continue
-            axis = array["dimension_names"].index(dim)
-            for source in sources[1:]:
-                sums |= _linked_chunks(source, folder, file.parent.name, array, axis)
-            # The metadata, of all rows, in a file of its own: that of the first is linked.
-            content = json.dumps(array, indent=2).encode()
-            file.unlink()
-            file.write_bytes(content)
-            sums[file.relative_to(folder).as_posix()] = f"{zlib.crc32(content):08x}"
         (folder / integrity.SUMS).unlink()
+        (folder / integrity.SUMS).write_bytes(integrity.sums_file(sums))
+        # The chunks of all others in their places; zarr replaces what it writes, and no link.
+        for name, array in zarr.open_group(integrity.SummedStore(folder), mode="r+").arrays():
+            metadata: Any = array.metadata
+            dims, shape = [*(metadata.dimension_names or ())], [*array.shape]
+            for source in sources[1:] if dim in dims else ():
+                axis = dims.index(dim)
+                number, remainder = divmod(shape[axis], array.chunks[axis])
+                if remainder:
+                    label = f"{shape[axis]} rows or columns in chunks of {array.chunks[axis]}"
+                    rule = "Must follow whole chunks"
+                    raise ValueError(f"Invalid part '{source}' after {label}. {rule}.")
+                for key, crc in integrity.last_sums(source).items():
+                    if key.startswith(f"{name}/c/"):
+                        place = key.split("/")
+                        place[axis + 2] = str(int(place[axis + 2]) + number)
+                        target = folder.joinpath(*place)
+                        target.parent.mkdir(parents=True, exist_ok=True)
+                        _link(source / key, target)
+                        sums["/".join(place)] = crc
+                shape[axis] += zarr.open_array(source / name, mode="r").shape[axis]
+            array.resize(tuple(shape))
+        sums |= integrity.last_sums(folder)
         (folder / integrity.SUMS).write_bytes(integrity.sums_file(sums))
 
 
@@ -385,29 +387,6 @@ def _link(source: str | Path, target: str | Path) -> None:
         os.link(source, target)
     except OSError:  # a disk that knows no links
         shutil.copyfile(source, target)
-
-
-def _linked_chunks(
-    source: Path, folder: Path, name: str, metadata: dict[str, Any], axis: int
-) -> dict[str, str]:
-    """Link the chunks of an array of a part behind those of the whole; checksums by file."""
-    sums = dict[str, str]()
-    end = metadata["shape"][axis]
-    rows = metadata["chunk_grid"]["configuration"]["chunk_shape"][axis]
-    if end % rows:
-        label = f"Invalid part '{source}' after {end} rows or columns in chunks of {rows}"
-        raise ValueError(f"{label}. Must follow whole chunks.")
-    for key, crc in integrity.last_sums(source).items():
-        if key.startswith(f"{name}/c/"):
-            numbers = key.split("/")
-            numbers[axis + 2] = str(int(numbers[axis + 2]) + end // rows)
-            target = folder.joinpath(*numbers)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            _link(source / key, target)
-            sums["/".join(numbers)] = crc
-    added = json.loads((source / name / integrity.GROUP).read_text())
-    metadata["shape"][axis] += added["shape"][axis]
-    return sums
 
 
 def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:

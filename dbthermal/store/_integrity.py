@@ -97,7 +97,8 @@ class CheckedStore(SummedStore):
         if self._sums:
             self._check_files(_sum(GROUP, content or b""))
         else:
-            warn_unchecked(self.root, stacklevel=3)
+            rule = "as of dbthermal 0.1.0: damage is not seen. Saved again, it has them."
+            warnings.warn(f"No checksums in '{self.root}', {rule}", stacklevel=3)
 
     def get_sync(
         self,
@@ -156,15 +157,6 @@ class CheckedStore(SummedStore):
 
 
 AS_WRITTEN: Final = "Must be as it was written: copy it again, or make it anew."
-
-
-def warn_unchecked(path: str | Path, stacklevel: int) -> None:
-    """Warn that damage of a file or store cannot be seen."""
-    warnings.warn(
-        f"No checksums in '{path}', as of dbthermal 0.1.0: damage is not seen. Saved again, it has "
-        "them.",
-        stacklevel=stacklevel + 1,
-    )
 
 
 def add_sum(root: Path, key: str, content: Content) -> Path:

@@ -1,25 +1,28 @@
 """Files and folders that appear whole under their names, and belong to one process meanwhile.
 
 What is written lies in a hidden folder beside its place until it is whole and on the disk; then it
-is renamed. A file system may write names and contents in any order: after a power loss a renamed
-file may have its new name and no content. So the new content is synced first, then it is renamed,
-then the folder that holds the name is synced.
+is renamed. Signals that end the program are raised as errors, so that it is ended first. A file
+system may write names and contents in any order: after a power loss a renamed file may have its new
+name and no content. So the new content is synced first, then it is renamed, then the folder that
+holds the name is synced.
 """
 
 import errno
 import os
 import platform
 import shutil
+import signal
+import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from types import FrameType
+from typing import Any, Final
 
 from dbthermal import _text as texts
 from dbthermal.store._integrity import SUMS
-from dbthermal.store._signals import raised_signals
 
 try:
     import fcntl
@@ -27,6 +30,8 @@ except ImportError:  # Windows: there two processes may write to one place
     fcntl = None  # type: ignore[assignment]
 
 _THREADS: Final = 8
+_STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
+_ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _REPLACED: Final = "replaced"  # an earlier result, until the new one has its name
 _LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they die with us
 
@@ -149,27 +154,21 @@ def _lock(folder: Path, path: Path) -> int | None:
         with suppress(FileNotFoundError):
             lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                if (holder := _lock_file(lock)) == name:
-                    return None
-                if holder:
+                if not take(lock):
+                    holder = os.read(lock, 200).decode(errors="replace") or "another process"
+                    if holder == name:
+                        return None
                     rule = "Must end first, or another output be named"
                     raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
                 if os.path.samestat(os.fstat(lock), file.stat()):
+                    with suppress(OSError):
+                        os.ftruncate(lock, 0)
                     _sign(lock, name, folder)
                     _LOCKED.add(lock)
                     return lock
             finally:
                 if lock not in _LOCKED:
                     os.close(lock)
-
-
-def _lock_file(lock: int) -> str:
-    """Lock an open file and empty it, or return the name that is written in it."""
-    if not take(lock):
-        return os.read(lock, 200).decode(errors="replace") or "another process"
-    with suppress(OSError):
-        os.ftruncate(lock, 0)
-    return ""
 
 
 def take(descriptor: int, *, shared: bool = False) -> bool:
@@ -260,3 +259,53 @@ def _to_disk(path: Path) -> None:
             raise
     finally:
         os.close(file)
+
+
+class SignalExit(SystemExit):
+    """End of the program by a signal, with the exit status of a shell: 128 and its number.
+
+    Parameters
+    ----------
+    number : int
+        Of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(_STATUS + number)
+        self.status, self.name = _STATUS + number, signal.Signals(number).name
+
+
+@contextmanager
+def raised_signals() -> Iterator[None]:
+    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
+
+    A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
+    first signal is raised, those after it are ignored: what is being closed must be left to end. A
+    signal that the program handles by itself or ignores, as under ``nohup``, stays so.
+    """
+    previous: dict[int, Any] = {}
+    raised: list[int] = []
+    late: list[int] = []  # came while the handlers were put back
+    closing = False
+
+    def end(number: int, _: FrameType | None) -> None:
+        if closing:
+            late.append(number)
+        elif not raised:
+            raised.append(number)
+            raise SignalExit(number)
+
+    try:
+        # Only signals that would end the program, and only in the main thread, which gets them.
+        if threading.current_thread() is threading.main_thread():
+            for number in _ENDING:
+                if signal.getsignal(number) is signal.SIG_DFL:
+                    previous[number] = signal.signal(number, end)
+        yield
+    finally:
+        closing = True
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        if not raised:
+            for number in late:
+                signal.raise_signal(number)

@@ -1,11 +1,14 @@
-"""Recordings with headers of FLIR (.sfmov) and Telops (.hcc), written here by their layouts."""
+"""Bare numbers, and recordings with headers of FLIR (.sfmov) and Telops (.hcc)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from flir_files import scene
 from hostile_files import hcc, sfmov
+from numpy.testing import assert_array_equal
 
 from dbthermal import readers
 from dbthermal.__main__ import main
@@ -21,7 +24,7 @@ def written(path: Path, content: bytes) -> Path:
 def test_sfmov(tmp_path: Path, ending: str) -> None:
     """Frames lie behind DATA, however its line ends; the rate is that of the .inc, or stated."""
     path = written(tmp_path / "a.sfmov", sfmov(scene(), ending))
-    np.testing.assert_array_equal(readers.sequence(path, clock=10.0).counts, scene())
+    assert_array_equal(readers.sequence(path, clock=10.0).counts, scene())
     with pytest.raises(ValueError, match=r"Missing clock= for 'a\.sfmov'"):
         readers.sequence(path)
     path.with_suffix(".inc").write_text("FRate_0 20.0\r\nITime_0 0.5\r\n")
@@ -36,7 +39,7 @@ def test_hcc(tmp_path: Path) -> None:
     """Each frame has its time; without times that of the rate, of which one is lost."""
     path = written(tmp_path / "a.hcc", hcc(scene()))
     movie = readers.sequence(path)
-    np.testing.assert_array_equal(movie.counts, scene())
+    assert_array_equal(movie.counts, scene())
     np.testing.assert_allclose(movie.time, np.arange(len(scene())) / 10.0, atol=1e-6)
     path.write_bytes(hcc(scene(), times=False, rate=20_000))
     np.testing.assert_allclose(readers.sequence(path).time[1], 0.05, atol=1e-9)
@@ -79,3 +82,62 @@ def test_by_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert words in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"Must be read by readers\.sequence"):
         readers.flir(a)
+
+
+def bare(path: Path, **options: Any) -> xr.Dataset:
+    """Raw counts of 24 x 32 pixels, little-endian, at 10 Hz."""
+    stated = {"byte_order": "little", "unit": "count", "clock": 10.0, **options}
+    return readers.raw(path, stated.pop("shape", (24, 32)), **stated)
+
+
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", "<i4", ">u4"])
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_longer_numbers_are_no_counts(tmp_path: Path, kind: str, order: str) -> None:
+    """Numbers of 32 or 64 bits, whole or floating-point, are not taken for twice as many counts."""
+    values = scene() if kind[1] in "iu" else 20 + (scene() - 17900.0) / 100
+    values.astype(kind).tofile(path := tmp_path / "a.raw")
+    shape = (24, 32 * np.dtype(kind).itemsize // 2)
+    with pytest.raises(ValueError, match=r"no images of 16-bit numbers|rougher"):
+        bare(path, shape=shape, byte_order=order)
+
+
+def test_bytes_of_a_picture_are_no_counts(tmp_path: Path) -> None:
+    """Numbers of 8 bits, of which two would make a count, and noise are refused."""
+    path, rng = tmp_path / "a.raw", np.random.default_rng(1)
+    picture = (np.hypot(*np.mgrid[:24, :64]) * 3 + rng.integers(0, 3, (3, 24, 64))).astype("u1")
+    for content in (picture.tobytes(), rng.bytes(picture.size)):
+        path.write_bytes(content)
+        for order in ("little", "big"):
+            with pytest.raises(ValueError, match="no images of 16-bit numbers"):
+                bare(path, byte_order=order)
+
+
+def test_raw(tmp_path: Path) -> None:
+    """Bare numbers with and without headers, in both orders; what does not fit is refused."""
+    path, counts = tmp_path / "a.raw", scene()
+    path.write_bytes(counts.tobytes())
+    assert_array_equal(bare(path).counts, counts)
+    path.write_bytes(b"h" * 100 + b"".join(b"frame" + image.tobytes() for image in counts))
+    assert_array_equal(bare(path, header=100, frame_header=5).counts, counts)
+    with pytest.raises(ValueError, match=r"4723 bytes of 'a\.raw': 3 frames and 115 bytes"):
+        bare(path)
+    path.write_bytes(counts.astype(">u2").tobytes())
+    assert_array_equal(bare(path, byte_order="big").counts, counts)
+    with pytest.raises(ValueError, match=r"rougher than with bytes swapped"):
+        bare(path)
+    path.write_bytes(counts.tobytes())
+    with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
+        bare(path, shape=(32, 24))
+    path.write_bytes(counts.astype(">u2").tobytes())
+    with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
+        bare(path, shape=(0, 32))
+    with pytest.raises(ValueError, match="Invalid frame_header -1"):
+        bare(path, frame_header=-1)
+    for argument, value in {"header": "0", "frame_header": 1.5, "memory": "1e9"}.items():
+        with pytest.raises(TypeError, match=rf"Invalid {argument} .*{value}.*Must be a .* number"):
+            bare(path, byte_order="big", **{argument: value})
+    for argument, wrong in {"shape": ("24", 32), "unit": ["count"], "byte_order": ["big"]}.items():
+        with pytest.raises(ValueError, match=rf"Invalid {argument} .*a\.raw'\. Must be"):
+            bare(path, **{"byte_order": "big", argument: wrong})
+    with pytest.raises(ValueError, match=r"Must be at most memory=100"):
+        bare(path, byte_order="big", memory=100)

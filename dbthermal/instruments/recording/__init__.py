@@ -20,7 +20,7 @@ from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
 from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.session import BLACKBODY
-from dbthermal.store._signals import SignalExit, raised_signals
+from dbthermal.store._whole import SignalExit, raised_signals
 
 __all__ = [
     "Limits",

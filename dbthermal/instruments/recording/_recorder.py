@@ -25,7 +25,7 @@ from dbthermal.instruments import camera
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Clock, Task
-from dbthermal.store._signals import SignalExit, raised_signals
+from dbthermal.store._whole import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
 Totals = Mapping[str, Mapping[str, int]]
