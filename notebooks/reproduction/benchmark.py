@@ -27,10 +27,11 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment, separation, simulation, store
-from reproduction import experiments, paths, verify
 from reproduction import methods as outside
+from reproduction import paths, verify
+from reproduction.experiments import cases
+from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.pictures import Picture, smooth_shift
-from reproduction.experiments.scores import held, rmse
 
 T = TypeVar("T")
 
@@ -217,7 +218,7 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     """Simulated plate glass of so many pixels; beyond 128 those are repeated in another order."""
     few, rig = min(pixels, 128), simulation.Rig(bands=BANDS[:bands], noise=NOISE[:bands])
     glass: dict[str, Any] = {"emissivity": list(EMISSIVITY[:bands]), "start": 20, "stop": 60}
-    row = experiments.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
+    row = cases.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
     rng, counts = np.random.default_rng(1), row["counts"].values.reshape(bands, frames, few)
     # Frames as a store gives them: an index of NumPy would leave pixels the slowest axis.
     some = [counts.take(rng.permutation(few), axis=2) for _ in range(pixels // few)]

@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
+from dbthermal._arrays import Array
 from dbthermal.readers._spectra import File, spectrum
-
-Array = npt.NDArray[np.float64]
 
 
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:

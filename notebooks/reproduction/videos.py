@@ -16,9 +16,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from reproduction import metrics, palettes, parallax, scales
-
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
+from reproduction import metrics, palettes, uncalibrated
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
@@ -181,10 +180,10 @@ class Comparison:
     """A scene separated in several ways, each beside the authors' maps."""
 
     undone: xr.DataArray  # inputs (band, time, y, x) without the frames' scale, where it allows
-    separated: xr.Dataset  # from `scales.uncalibrated_reflection` of that
+    separated: xr.Dataset  # from `uncalibrated.uncalibrated_reflection` of that
     scores: xr.DataArray  # its agreement (time) [1] with the authors' first map
-    edges: xr.DataArray  # from `parallax.edges_shift`
-    reflections: xr.DataArray  # from `parallax.reflections_shift`
+    edges: xr.DataArray  # from `uncalibrated.edges_shift`
+    reflections: xr.DataArray  # from `uncalibrated.reflections_shift`
     table: xr.DataArray  # median agreement (way, map, pixels) [1], NaN where left out
     left_out: Mapping[str, str]  # way -> why
 
@@ -198,16 +197,16 @@ def compare(scene: Scene, number: int) -> Comparison:
     the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
     """
     # Undo the frames' scale; find the displacement, and the pixels that both bands show.
-    undone = scales.unscaled(scene.movie, still(scene.outline))
-    reflections = parallax.reflections_shift(undone, scene.outline)
-    shared = parallax.shared_outline(scene.outline, reflections)
+    undone = uncalibrated.unscaled(scene.movie, still(scene.outline))
+    reflections = uncalibrated.reflections_shift(undone, scene.outline)
+    shared = uncalibrated.shared_outline(scene.outline, reflections)
     # Separate in each way.
     found: dict[str, xr.Dataset] = {}
     left_out = {}
     for way, of_reflections in WAYS.items():
         try:
-            movie = parallax.moved(undone, reflections) if of_reflections else undone
-            parts = scales.uncalibrated_reflection(movie)
+            movie = uncalibrated.moved(undone, reflections) if of_reflections else undone
+            parts = uncalibrated.uncalibrated_reflection(movie)
         except ValueError as error:
             left_out[way] = str(error)
         else:
@@ -216,7 +215,7 @@ def compare(scene: Scene, number: int) -> Comparison:
         raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
     # Choose pixels and frames by the first separation.
     first = found[next(iter(found))]
-    pixels = {"object": shared, "moving": shared & (first["correlation"] > scales.CORRELATED)}
+    pixels = {"object": shared, "moving": shared & (first["correlation"] > uncalibrated.CORRELATED)}
     frames = strongest(first["reflection"], shared, number)
     # Correlate each reflection with each of the authors' maps.
     coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
@@ -226,7 +225,7 @@ def compare(scene: Scene, number: int) -> Comparison:
         score = agreement(reflection, scene.theirs[kind], frames, pixels[where]).median()
         table.loc[{"way": way, "map": kind, "pixels": where}] = score
     scores = agreement(first["reflection"], scene.theirs[KINDS[0]], frames, shared)
-    edges = parallax.edges_shift(undone)
+    edges = uncalibrated.edges_shift(undone)
     return Comparison(undone, first, scores, edges, reflections, table, left_out)
 
 

@@ -15,9 +15,9 @@ def test_medians_count_what_the_default_solves() -> None:
         "status": (("variant", "pixel"), [[0, 0, 1, 0], [0, 4, 0, 0]]),
     }
     comparison = xr.Dataset(parts, {"variant": ["subspace", "other"]})
-    medians = experiments.medians(comparison)
+    medians = experiments.comparison.medians(comparison)
     expected = {"object_temperature_rmse": [0.2, 2.0], "solved": [0.75] * 2}
     for name, values in (expected | {"wrong": [0.0, 0.0]}).items():
         np.testing.assert_allclose(medians[name], values, rtol=0, atol=1e-12)
-    lost = experiments.medians(comparison.isel(pixel=[1, 2]))
+    lost = experiments.comparison.medians(comparison.isel(pixel=[1, 2]))
     assert np.isnan(lost["object_temperature_rmse"].sel(variant="other"))

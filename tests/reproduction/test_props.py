@@ -4,8 +4,7 @@ import numpy as np
 
 from reproduction.twins import surfaces
 from reproduction.twins.panes import pointing
-from reproduction.twins.people import FINGERS, Route, imprint, pacing
-from reproduction.twins.props import Writing, board
+from reproduction.twins.people import FINGERS, Route, Writing, board, imprint, pacing
 from reproduction.twins.stage import AMBIENT, clock
 from reproduction.twins.surroundings import Pose
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from reproduction.twins import solids, surfaces
+from reproduction.twins import bodies, surfaces
 
 SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "plate": lambda: surfaces.plate(0.3, 0.2, 0.01),
@@ -106,7 +106,7 @@ def test_wrong_sizes() -> None:
 
 def test_rabbit_sits_on_the_table() -> None:
     """The built-in rabbit is of six closed parts, as high as the bunny."""
-    rabbit = solids.rabbit()
+    rabbit = bodies.rabbit()
     assert rabbit.is_watertight
     assert rabbit.body_count == 6
-    np.testing.assert_allclose(rabbit.bounds[:, 2], [0.0, solids.BUNNY_HEIGHT], rtol=0, atol=1e-3)
+    np.testing.assert_allclose(rabbit.bounds[:, 2], [0.0, bodies.BUNNY_HEIGHT], rtol=0, atol=1e-3)

@@ -16,7 +16,7 @@ from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 from reproduction import experiments, methods
 from reproduction.methods.dbvt import DbvtSettings
-from reproduction.reflection import reflected_change
+from reproduction.metrics import reflected_change
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0

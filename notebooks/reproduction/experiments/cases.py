@@ -8,14 +8,15 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
+from scipy.special import ndtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
+from dbthermal._arrays import Array
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.simulation import Background, Rig
-from reproduction import closed_form, disturbances
-from reproduction.experiments.scores import held, rmse
+from reproduction import disturbances
 
-Array = npt.NDArray[np.float64]
 Case = Mapping[str, Any]
 
 STEPS: Final = 20
@@ -90,15 +91,15 @@ def efficiency(
 
     Robust standard deviation over the pixels of a scene of one material. The noise is that of the
     two bands' signals [K], the order the size of the smooth subspace of
-    `closed_form.ratio_variance_bound`.
+    `ratio_variance_bound`.
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
     functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
-    bound = np.sqrt(closed_form.ratio_variance_bound(pair, noise, background, functions))
-    ratio = closed_form.reflection_ratio(result["emissivity"].values.reshape(2, -1))
-    scaled = (ratio - closed_form.reflection_ratio(emissivity)) / bound
+    bound = np.sqrt(ratio_variance_bound(pair, noise, background, functions))
+    ratio = reflection_ratio(result["emissivity"].values.reshape(2, -1))
+    scaled = (ratio - reflection_ratio(emissivity)) / bound
     scaled = scaled[np.isfinite(scaled)]
     return float(np.diff(np.quantile(scaled, [0.1587, 0.8413]))[0] / 2)
 
@@ -230,3 +231,72 @@ def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: 
         names.append(str(case["case"]))
     together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
     return together.assign_attrs(origin="simulated", pixels=pixels, seed=seed)
+
+
+INTERVAL: Final = float(ndtri(0.975))
+"""Half-width of a 95 % interval, in standard deviations [1]."""
+
+
+def rmse(error: xr.DataArray) -> xr.DataArray:
+    """Root mean square of an error (time, y, x) over time, median over the pixels with a value."""
+    return ((error**2).mean("time") ** 0.5).median()
+
+
+def held(error: xr.DataArray, std: xr.DataArray, width: float = INTERVAL) -> xr.DataArray:
+    """Share of the known errors that lie within so many standard deviations [1]."""
+    return (abs(error) < width * std).where(error.notnull()).mean()
+
+
+def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
+    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
+
+    Parameters
+    ----------
+    emissivity : array_like, shape (2, ...)
+        Emissivities [1].
+
+    Examples
+    --------
+    >>> reflection_ratio([0.86, 0.72]).round(3).item()  # plate glass in 8-14 um and 9.5 um
+    2.0
+    """
+    first, second = np.asarray(emissivity, dtype=np.float64)
+    return np.asarray((1.0 - second) / (1.0 - first))
+
+
+def ratio_variance_bound(
+    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
+) -> Array:
+    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
+
+    .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
+              {\sum_t [(1 - e_1) P y(t)]^2}
+
+    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
+
+    Parameters
+    ----------
+    emissivity, noise : tuple of float
+        Emissivities [1] of the two bands, and standard deviations of their noise [K]; TypeError or
+        ValueError for other than two numbers, in [0, 1] and positive.
+    background : ndarray, shape (time, ...)
+        Background temperature [K].
+    functions : ndarray, shape (time, order)
+        Orthonormal functions that span the smooth subspace.
+
+    Examples
+    --------
+    Plate glass before a background that changes by 3 K every five seconds:
+
+    >>> background = 295.0 + 3.0 * (np.arange(200) // 50 % 2)  # K, 10 frames/s
+    >>> functions, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 200), 5))
+    >>> variance = ratio_variance_bound((0.86, 0.72), (0.03, 0.35), background, functions)
+    >>> np.sqrt(variance).round(2).item()
+    0.15
+    """
+    ratio = float(reflection_ratio(real_numbers("emissivity", emissivity, (0.0, 1.0), (2,))))
+    real_numbers("noise [K]", noise, POSITIVE, (2,))
+    background, functions = real_numbers("background", background), real_numbers("basis", functions)
+    rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
+    energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
+    return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)

@@ -10,13 +10,12 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 
 from dbthermal import correction, separation, simulation
+from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status
 from reproduction import disturbances
-from reproduction.experiments import cases, stress
+from reproduction.experiments import cases, limits
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Change = Callable[[npt.NDArray[Any], Mask, np.random.Generator], None]
 
 FAR: Final = 5.0
@@ -250,7 +249,7 @@ def _count_misses(
     counts["alarms"].values[place] += np.count_nonzero(apart)
     counts["clean_pixels"].values[place] += np.count_nonzero(~holds)
     none = holds & (status == 0)
-    wrong = stress.wrong(truth, result, FAR).values
+    wrong = limits.wrong(truth, result, FAR).values
     parts = {
         "pixels": holds,
         "without_it": holds & ((status & Status.bits()[flag]) == 0),

@@ -11,9 +11,8 @@ from dbthermal import alignment, separation, simulation
 from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
 from reproduction import disturbances
-from reproduction.experiments.cases import STEPS
+from reproduction.experiments.cases import STEPS, held, rmse
 from reproduction.experiments.limits import on_clock
-from reproduction.experiments.scores import held, rmse
 
 TREATMENTS: Final = ("as recorded", "undone", "without")
 """A capture with the nuisance as it is; with the nuisance undone; and one that never had it."""

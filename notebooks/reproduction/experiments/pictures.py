@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import simulation
-
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
 
 ROOM: Final = 295.15
 """Temperature of the room [K]."""

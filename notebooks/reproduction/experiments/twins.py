@@ -12,10 +12,10 @@ from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
+from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
-from reproduction.experiments.scores import held, rmse
 from reproduction.metrics import relative_error_celsius
-from reproduction.twins.views import Registration
+from reproduction.twins.stage import Registration
 
 BEAD: Final = 3
 """Pixels along a side of the square that a thermocouple's bead covers."""

@@ -13,9 +13,9 @@ from dbthermal.calibration import fit_response
 from dbthermal.response import EXACT
 from dbthermal.simulation import Rig
 from reproduction import disturbances
+from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
-from reproduction.experiments.scores import held, rmse
 
 # Heating that differs from place to place, by so much [1], over so many pixels: the detail.
 _UNEVEN, _DETAIL = 0.05, 3.0

@@ -12,11 +12,16 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
+from reproduction.twins.bodies import bunny, coffee_pot, wineglass
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
-from reproduction.twins.solids import bunny
-from reproduction.twins.stage import Capture, Stage, take, thermocouple_readings
-from reproduction.twins.vessels import coffee_pot, wineglass
-from reproduction.twins.views import observe, registered
+from reproduction.twins.stage import (
+    Capture,
+    Stage,
+    observe,
+    registered,
+    take,
+    thermocouple_readings,
+)
 
 __all__ = [
     "TWINS",

@@ -7,11 +7,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from reproduction import heat
 from reproduction.twins import surfaces
-from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
-from reproduction.twins.props import Writing, board
-from reproduction.twins.rays import Array, Camera
+from reproduction.twins.people import FINGERS, Writing, board, hand, imprint, pacing, person
+from reproduction.twins.rays import Camera
 from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, since
 from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 

@@ -15,10 +15,9 @@ import numpy.typing as npt
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from dbthermal._arrays import Array, Mask
 from dbthermal._compiled import kept
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Point = tuple[float, float, float]
 
 MISSED: Final = -1

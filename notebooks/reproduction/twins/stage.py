@@ -1,8 +1,8 @@
-"""Stage of a twin (object, camera, surroundings), the scene of it, and its thermocouples."""
+"""Stage of a twin, its scene and thermocouples, and what two cameras record of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -10,10 +10,11 @@ import trimesh
 import xarray as xr
 from scipy.special import ndtr
 
-from dbthermal import schema, simulation
+from dbthermal import alignment, schema, simulation
+from dbthermal._arrays import Array
 from reproduction import heat
 from reproduction.twins.people import pacing, person
-from reproduction.twins.rays import Array, Camera, Caster, unit
+from reproduction.twins.rays import Camera, Caster, unit
 from reproduction.twins.surroundings import Actor, incident, painted
 
 AMBIENT: Final = 295.15
@@ -321,3 +322,45 @@ def since(
     before = np.array([start]) if start < time[0] else np.empty(0)
     times = np.concatenate([before, time])
     return heat.simulate(shell, times, AMBIENT, exchanges, step=STEP)[before.size :]
+
+
+Registration = Literal["perfect", "found"]
+
+
+def observe(scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
+    """Capture of a twin, as `simulation.observe`: each band at the pixels of its own camera."""
+    if not scene.attrs["baseline"]:
+        return simulation.observe(scene, response, rng)
+    second = scene.assign(
+        {
+            f"{name}_temperature": scene[f"second_{name}_temperature"]
+            for name in ("object", "background")
+        }
+    )
+    views = [
+        simulation.observe(view, response.isel(band=[band]), rng)
+        for band, view in enumerate((scene, second))
+    ]
+    return xr.concat(views, "band", combine_attrs="override")
+
+
+def registered(
+    scene: xr.Dataset, corrected: xr.Dataset, registration: Registration = "perfect"
+) -> xr.Dataset:
+    """Capture with all views on the first camera's grid, by `alignment.align`.
+
+    A registration is "perfect", by the surface's geometry: each pixel shows the same point of the
+    surface in both bands, NaN where the second camera does not see it, and beside the object; or
+    "found" from the pictures, by `alignment.register`. The views of one place stay as they are.
+    """
+    if not scene.attrs["baseline"]:
+        return corrected
+    by_geometry = registration == "perfect"
+    transform = _by_geometry(scene) if by_geometry else alignment.register(corrected)
+    return alignment.align(corrected, offset=0.0, transform=transform)
+
+
+def _by_geometry(scene: xr.Dataset) -> xr.DataArray:
+    """Rows and columns (band, axis, y, x) [pixel] of the surface's points in each view."""
+    own = xr.zeros_like(scene["place_in_second"]).copy(data=np.indices(scene["on_object"].shape))
+    return xr.concat([own, scene["place_in_second"]], scene["band"])

@@ -14,8 +14,9 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
-from reproduction.twins.rays import Array, unit
+from reproduction.twins.rays import unit
 
 Profile = tuple[tuple[float, float], ...]
 

@@ -14,8 +14,9 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal._compiled import kept
-from reproduction.twins.rays import Array, Caster, Hits
+from reproduction.twins.rays import Caster, Hits
 
 Rays = tuple[Array, Array]
 

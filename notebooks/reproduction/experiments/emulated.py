@@ -1,15 +1,15 @@
-"""Frames of the emulated rig's cameras, from the simulation and with its truth.
+"""Emulated rig and bench: frames of the cameras, from the simulation and with its truth.
 
 The frames of `Views` are mixed, with noise, fixed pattern and 16 bits, one by one when a
-camera takes them, from the temperatures that the emulated world has at that moment. Everything
-here is simulated.
+camera takes them, from the temperatures that the emulated world has at that moment. The
+thermometers of `Bench` err, its samples are heated. Everything here is simulated.
 """
 
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +17,13 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.instruments.emulated import World
+from dbthermal.instruments.session import Session
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
 from reproduction.twins.rays import Camera
 
-Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]
 Picture = Callable[[float], Counts]
 Look = Callable[[float], Array]
@@ -204,3 +205,67 @@ def clear(folder: Path) -> None:
 def _simulated(path: Path) -> bool:
     attrs = store.open_dataset(path).attrs
     return bool(attrs.get("is_simulated", path.name.startswith(_TRUTH)))
+
+
+class Bench(World):
+    """An emulated bench whose thermometers have errors, and whose samples are heated.
+
+    By name: standard deviations of one reading [K], 0 for others; lowest and highest temperature to
+    which a sample is heated [K]; temperature (time) [K], over the scene's time [s], of other
+    objects that a thermocouple touches. The rest as for `World`.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        reading_std: Mapping[str, float],
+        samples: Mapping[str, tuple[float, float]] | None = None,
+        touched: Mapping[str, xr.DataArray] | None = None,
+        **world: Any,
+    ) -> None:
+        super().__init__(scene=self._warmth, **world)
+        self._rng, self._std, self._samples = rng, dict(reading_std), dict(samples or {})
+        self._touched = dict(touched or {})
+        self._temperatures = {name: low for name, (low, _) in self._samples.items()}
+
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        rng: np.random.Generator,
+        errors: Mapping[str, float],
+        *,
+        samples: Mapping[str, tuple[float, float]] | None = None,
+        touched: Mapping[str, xr.DataArray] | None = None,
+    ) -> Self:
+        """
+        Bench of an emulated session with its cameras, filters and thermocouples; waits for `begin`.
+
+        The errors are standard deviations of one reading of the ``blackbody`` and of any other
+        ``thermocouple`` [K]; samples and touched as for `Bench`.
+        """
+        std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
+        std["blackbody"] = errors["blackbody"]
+        bench = cls(rng, std, samples, touched, filters=session.filters, waits=True)
+        bench.furnish(session)
+        return bench
+
+    def step(self, temperature: float) -> None:
+        """Set the blackbody [K], and heat every sample to a temperature of its own."""
+        self.blackbody_temperature = temperature
+        self._temperatures = {
+            name: float(self._rng.uniform(*ends)) for name, ends in self._samples.items()
+        }
+
+    def thermocouple_temperature(self, channel: int) -> float:
+        """Temperature of one thermocouple's tip with the error of one reading [K]; NaN if open."""
+        std = self._std.get(self.thermocouples.get(channel, "open"), 0.0)
+        with self.lock:
+            return super().thermocouple_temperature(channel) + std * float(self._rng.normal())
+
+    def _warmth(self, time: float) -> Mapping[str, float]:
+        touched = {
+            name: float(np.interp(time, course["time"], course))
+            for name, course in self._touched.items()
+        }
+        return {**self._temperatures, **touched}
