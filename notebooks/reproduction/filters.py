@@ -13,19 +13,11 @@ _NUMBERS = schema.Variable(("material", "first", "second"), "float64", "1", "con
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
-    """Condition number of the mixing matrix for each material and pair of bands.
+    """Condition number (material, first, second) [1] of the mixing matrix of each pair of bands.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table` of `schema`, of at least two bands, its emissivities NaN or within
-        `schema.EMISSIVITY_LIMITS`, or a ValueError.
-
-    Returns
-    -------
-    DataArray
-        Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
-        where the two emissivities are equal. See `mixing.condition_number`.
+    Of a table, stage `emissivity_table`, of at least two bands, its emissivities NaN or within
+    `schema.EMISSIVITY_LIMITS`, or a ValueError. Symmetric; infinite on the diagonal and where the
+    two emissivities are equal. See `mixing.condition_number`.
 
     Examples
     --------
@@ -49,20 +41,12 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
 
 
 def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
-    """Condition number of each pair of bands, over the materials.
+    """Condition number of each pair of bands, over the materials, of `condition_numbers`.
 
-    Parameters
-    ----------
-    numbers : DataArray
-        Condition numbers (material, first, second) [1], from `condition_numbers`.
-
-    Returns
-    -------
-    Dataset
-        `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
-        materials in the mean. A gray material counts in the median as infinite and not in the mean,
-        which a few nearly gray ones govern: choose by the median. Both are infinite where every
-        material is gray, as on the diagonal.
+    `median` and `mean` (first, second) [1], and `finite` (first, second), the number of materials
+    in the mean. A gray material counts in the median as infinite and not in the mean, which a few
+    nearly gray ones govern: choose by the median. Both are infinite where every material is gray,
+    as on the diagonal.
 
     Examples
     --------
@@ -94,26 +78,17 @@ def rank_filters(
 
     The first criterion is the paper's, the lowest condition number (its section 5 says highest, a
     slip). The second is the standard deviation of the object temperature from one frame, which
-    includes the noise of a narrow filter. Both are medians over the materials.
+    includes the noise of a narrow filter, (band) [K] as from `filter_noise`. Both are medians over
+    the materials of a table, stage `emissivity_table`.
 
-    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`
-    and another, or the noise lacks a band, is in another unit, or is not finite and positive.
+    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`,
+    the camera's own, and another, or the noise lacks a band, is in another unit, or is not finite
+    and positive.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `filter_noise`.
-    beside : str
-        Name of the camera's own band.
-
-    Returns
-    -------
-    Dataset
-        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
-        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
-        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
+    The result has, each (band) in the order of the first criterion: `condition_number` [1];
+    `condition_number_mean` [1], over the materials where it is finite; `object_temperature_std`
+    [K]; `noise` [K]. Attributes `lowest_condition_number` and `lowest_std` name the filter of each
+    criterion.
 
     Examples
     --------

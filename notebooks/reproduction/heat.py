@@ -223,9 +223,7 @@ class Shell:
         return self.capacity_per_area * self.area
 
 
-TOLERANCE: Final = 1e-6
-"""Largest error of the iteration in a stage of a step [K]."""
-
+TOLERANCE: Final = 1e-6  # largest error of the iteration in a stage of a step [K]
 # Diagonal of the two-stage scheme, the smaller root of 2 g^2 - 4 g + 1 = 0 [1]; contraction of the
 # error above which an iteration gets a new factorisation [1].
 _GAMMA, _CONTRACTION = 1.0 - np.sqrt(0.5), 0.5

@@ -17,15 +17,9 @@ def correlation(
 ) -> xr.DataArray:
     """Pearson's correlation of two maps, in [-1, 1], over the dims other than y and x.
 
-    ValueError if dims or places differ, fewer than two pixels count, one is not finite, or a map is
-    constant.
-
-    Parameters
-    ----------
-    first, second : DataArray
-        Maps (..., y, x), each in a unit of its own.
-    mask : DataArray of bool, optional
-        Pixels (y, x) that count; all by default.
+    Of maps (..., y, x), each in a unit of its own, over the pixels (y, x) of a mask, all by
+    default. ValueError if dims or places differ, fewer than two pixels count, one is not finite, or
+    a map is constant.
 
     Examples
     --------
@@ -58,13 +52,9 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     .. math:: 100 \, |\hat T - T| / (T - 273.15)
 
     The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
-    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled.
-
-    Parameters
-    ----------
-    estimate, truth : DataArray
-        Temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError.
-        The result is NaN where the estimate is.
+    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled. Both
+    are temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError. NaN
+    where the estimate is.
 
     Examples
     --------
@@ -125,27 +115,12 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
 
     .. math:: (1 - e_1) (y - \bar y)
 
-    with the mean over time, in the linear response of small changes. Of a constant object without
-    a completed background it is the change of the apparent temperature.
-
-    Parameters
-    ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K], from
-        `response.apparent_temperature`.
-    result : Dataset
-        From `solve`, `separate` or `complete`, of the same capture.
-
-    Returns
-    -------
-    DataArray
-        (time, y, x) [K], float32; NaN where the reflection is unknown.
-
-    Raises
-    ------
-    ValueError
-        If a variable is missing, emissivities are in per cent, or the first bands, dims, sizes or
-        coordinates differ.
+    with the mean over time, in the linear response of small changes, (time, y, x) [K], float32; NaN
+    where the reflection is unknown. Of a constant object without a completed background it is the
+    change of the apparent temperature. That is of the inputs (band, time, y, x) [K], from
+    `response.apparent_temperature`; the result from `solve`, `separate` or `complete`, of the same
+    capture. ValueError if a variable is missing, emissivities are in per cent, or the first bands,
+    dims, sizes or coordinates differ.
 
     Examples
     --------

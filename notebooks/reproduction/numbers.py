@@ -21,15 +21,10 @@ Number = float | int | str | bool
 def save(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """Save headline numbers as strict JSON, with sorted names.
+    """Save headline numbers as strict JSON, with sorted names, and a provenance, see `store.save`.
 
-    Parameters
-    ----------
-    numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
-        TypeError or ValueError for any other value.
-    path, provenance : str or Path, mapping
-        File ``*.json``; see `store.save`.
+    Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; TypeError
+    or ValueError for any other value.
 
     Examples
     --------
@@ -51,16 +46,8 @@ def save(
 def read(path: str | Path) -> dict[str, Number]:
     """Read a file of `save`: name to value.
 
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.json``.
-
-    Raises
-    ------
-    ValueError
-        With file and line, if it is not such a file, a name is listed twice, a number is not
-        finite, or it differs from what was written.
+    ValueError with the file if it is not such a file, a name is listed twice, a number is not
+    finite, or it differs from what was written.
     """
     content = _parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):

@@ -14,10 +14,12 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NoReturn
 
+import av
 import numpy as np
 import xarray as xr
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from dbthermal import _text as texts
@@ -37,17 +39,12 @@ _CONTAINERS: Final = {
 """FFmpeg's name of a container -> where its mark stands in the file [byte], and the marks."""
 
 
-class Film(NamedTuple):
-    """Frames of a video as packed colours (time, y, x), red highest, and their times [s]."""
-
-    codes: NDArray[np.uint32]
-    times: NDArray[np.float64]
+Film = tuple[NDArray[np.uint32], Array]
+"""Frames of a video as packed colours (time, y, x), red highest, and their times (time,) [s]."""
 
 
-def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
+def _decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
     """Decode a video left of `width` [pixel]; see `palette_video`."""
-    import av  # noqa: PLC0415  (a spectrum needs no video codec)
-
     require_positive("memory", memory)
     content = texts.regular_file(path, int(memory)).read_bytes()
     kinds = _CONTAINERS.items()
@@ -118,7 +115,7 @@ def _frames(
         raise ValueError(f"Unordered timestamps in '{path.name}'. Must increase strictly.")
     _check_duration(container, seconds, path)
     _check_segment(path)
-    return Film(codes, seconds - seconds[0])
+    return codes, seconds - seconds[0]
 
 
 def _undamaged(packets: Sequence[Any], path: Path) -> Iterator[Any]:
@@ -246,7 +243,7 @@ def palette_video(
     """
     path = texts.as_path(path)
     colours = _palette(palette)
-    video = _distinct(decode(path, None, memory, sha256))
+    video = _distinct(*_decode(path, None, memory, sha256))
     position, _, distance = _nearest(video.colours, colours)
     residual = float(np.sqrt(np.average(distance**2, weights=video.share)))
     attrs = _attrs(path, palette, residual, video.colours, video.share)
@@ -261,60 +258,27 @@ def masked_palette_video(
     memory: float = MEMORY,
     sha256: str | None = None,
 ) -> xr.Dataset:
-    """Video whose object is drawn in a palette while the rest is gray.
+    """Video whose object is drawn in a palette while the rest is gray; see `palette_video`.
 
-    A pixel is valid where its colour is nearer to the palette than to gray, in the measure of
-    `palette_video`. Compression pulls single pixels between strong colours over that line, so the
-    object's outline is best taken from the share of frames in which a pixel is valid.
+    A pixel is valid where its colour is nearer to the palette than to gray, in the same measure.
+    Compression pulls single pixels between strong colours over that line, so the object's outline
+    is best taken from the share of frames in which a pixel is valid. Columns to keep are those left
+    of a printed colour bar [pixel].
 
-    Parameters
-    ----------
-    path : str or Path
-        File as for `palette_video`.
-    palette : str
-        Name of a continuous colour map of matplotlib.
-    width : int, optional
-        Columns to keep [pixel], left of a printed colour bar.
-    memory, sha256 : optional
-        As for `palette_video`.
-
-    Returns
-    -------
-    Dataset
-        `value` (time, y, x), float32 in [0, 1], a position also where it is not valid; `valid`
-        (time, y, x), bool. Attributes of `value` as in `palette_video`, but ``palette_residual`` is
-        the median over the coloured pixels.
-
-    Raises
-    ------
-    FileNotFoundError, TypeError, ValueError
-        As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
-
-    Examples
-    --------
-    The left half of the video is drawn in turbo, the right half is gray.
-
-    >>> import numpy as np
-    >>> from tempfile import TemporaryDirectory
-    >>> from matplotlib import colormaps
-    >>> from dbthermal import store
-    >>> frames = np.full((3, 48, 64, 3), 90, dtype=np.uint8)
-    >>> frames[:, :, :32] = colormaps["turbo"](np.linspace(0.2, 0.8, 32), bytes=True)[:, :3]
-    >>> with TemporaryDirectory() as folder:
-    ...     store.save_video(frames, f"{folder}/half.mp4", {}, rate=10.0)
-    ...     masked_palette_video(f"{folder}/half.mp4").valid[0, 24, [10, 50]].values.tolist()
-    [True, False]
+    The dataset has `value` (time, y, x), float32 in [0, 1], a position also where it is not valid,
+    whose ``palette_residual`` is the median over the coloured pixels, and `valid` (time, y, x),
+    bool. ValueError, too, if the video is narrower than `width`, or has no coloured pixel.
     """
     path = texts.as_path(path)
     colours = _palette(palette)
-    video = _distinct(decode(path, width, memory, sha256))
+    video = _distinct(*_decode(path, width, memory, sha256))
     position, from_palette, distance = _nearest(video.colours, colours)
     coloured = np.ptp(video.colours, axis=1) > _COLOURED
     if not coloured.any():
         raise ValueError(f"No coloured pixel in '{path.name}'. Must show an object in a palette.")
     share = video.share[coloured]
     residual = np.quantile(distance[coloured], 0.5, weights=share, method="inverted_cdf")
-    valid = from_palette < np.linalg.norm(_ycc(video.colours)[:, 1:], axis=1)
+    valid = from_palette < np.linalg.norm((video.colours @ _YCC.T)[:, 1:], axis=1)
     attrs = _attrs(path, palette, float(residual), video.colours[coloured], share)
     dims = tuple(video.coords)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
@@ -337,9 +301,8 @@ class _Video:
     coords: dict[str, Any]
 
 
-def _distinct(film: Film) -> _Video:
+def _distinct(codes: NDArray[np.uint32], times: Array) -> _Video:
     """Replace each code, in place, by its place among the distinct ones."""
-    codes = film.codes
     present = np.zeros(2**24, dtype=bool)
     for frame in codes:
         present[frame] = True
@@ -351,7 +314,7 @@ def _distinct(film: Film) -> _Video:
         frame[...] = place[frame]
         count += np.bincount(frame.ravel(), minlength=distinct.size)
     colours = (distinct[:, np.newaxis] >> np.array([16, 8, 0]) & 255).astype(np.float64)
-    coords = {"time": ("time", film.times, schema.COORDINATES["time"].attrs)} | {
+    coords = {"time": ("time", times, schema.COORDINATES["time"].attrs)} | {
         dim: (dim, np.arange(size), {"units": "1", "long_name": "pixel"})
         for dim, size in zip("yx", codes.shape[1:], strict=True)
     }
@@ -360,22 +323,15 @@ def _distinct(film: Film) -> _Video:
 
 def _palette(name: str) -> Array:
     """Colours (256, 3) [0-255] of a palette."""
-    from matplotlib import colormaps  # noqa: PLC0415  (drawing is not needed to read a spectrum)
-
     if name not in colormaps or colormaps[name].N != 256:
         raise ValueError(f"Unknown palette '{name}'. Must be a colour map of matplotlib with 256.")
     return np.asarray(colormaps[name](np.arange(256))[:, :3] * 255.0)
 
 
-def _ycc(colours: Array) -> Array:
-    ycc: Array = colours @ _YCC.T
-    return ycc
-
-
 def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
     place, distance = np.empty((2, len(colours)))
-    _project(_ycc(colours), _ycc(palette), place, distance)
+    _project(colours @ _YCC.T, palette @ _YCC.T, place, distance)
     first = np.minimum(place.astype(np.intp), len(palette) - 2)
     nearest = palette[first] + (place - first)[:, np.newaxis] * np.diff(palette, axis=0)[first]
     position = (place / (len(palette) - 1)).astype(np.float32)

@@ -41,24 +41,12 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     each pixel's residual over time. A band where they explain less than 90 % of the weighted
     variance over time stays as it is.
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own.
-    still : DataArray of bool
-        Pixels (y, x) off the object; a third of them may change after all.
-
-    Returns
-    -------
-    DataArray
-        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
-        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
-        that are, and `scale_explained`, each band's explained share.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+    The signal (band, time, y, x) has two bands in units of their own; the still pixels (y, x) are
+    off the object, and a third of them may change after all. The result is in units of its mean
+    over time, with the coordinate `gain` (band, time) [1], by which the noise was divided, 1 in a
+    band that is not undone. Attributes `scale_undone`, the bands that are, and `scale_explained`,
+    each band's explained share. ValueError if dims or bands are wrong, a value is not finite, or
+    fewer than 200 pixels are still.
 
     References
     ----------
@@ -111,24 +99,14 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own, `time` [s]; the coordinate `gain`
-        (band, time) [1], if it has one, is what the noise of each frame was divided by.
+    The signal (band, time, y, x) has two bands in units of their own and `time` [s]; its coordinate
+    `gain` (band, time) [1], if it has one, is what the noise of each frame was divided by.
 
-    Returns
-    -------
-    Dataset
-        `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission` (time, y, x),
-        the first band less the reflection, in the first band's unit; attributes `pooled_ratio`,
-        `noise_ratio`, `correlated_pixels`, `order`, and those of the signal.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 100 pixels are uncorrelated
-        (correlation below 0.1) or correlated (above 0.5).
+    The result has `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission`
+    (time, y, x), the first band less the reflection, in the first band's unit; attributes
+    `pooled_ratio`, `noise_ratio`, `correlated_pixels`, `order`, and those of the signal. ValueError
+    if dims or bands are wrong, a value is not finite, or fewer than 100 pixels are uncorrelated
+    (correlation below 0.1) or correlated (above 0.5).
 
     References
     ----------
@@ -153,9 +131,7 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
-    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
-    rapid = weight * values
-    rapid -= [functions @ (functions.T @ part) for part in rapid]
+    rapid = _rapid(signal, weight, values)
     # Subtract each frame's offset and gain error, as the uncorrelated pixels show it.
     quiet = np.abs(_correlation(rapid)) < _UNCORRELATED
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
@@ -291,8 +267,10 @@ def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArra
     the end of the search, `REACH`.
     """
     # Correlate the rapid changes at every whole displacement.
-    first, second = _rapid(movie, outline.values)
-    scores = _correlations(first, second, outline.values)
+    values = movie.values[..., outline.values].astype(np.float64)
+    rapid = np.zeros(movie.shape, dtype=np.float32)
+    rapid[..., outline.values] = _rapid(movie, _frame_weight(movie), values)
+    scores = _correlations(rapid[0], rapid[1], outline.values)
     place = np.array(np.unravel_index(np.argmax(scores), scores.shape))
     largest = {"correlation": scores.max(), "correlation_at_0": scores[REACH]}
     attrs = {name: float(value) for name, value in largest.items()}
@@ -307,19 +285,11 @@ def _displacement(value: Array) -> xr.DataArray:
     return xr.DataArray(value, {"axis": ["y", "x"]}, "axis", attrs={"units": "pixel"})
 
 
-def _rapid(movie: xr.DataArray, inside: Mask) -> list[Movie]:
-    """Weighted changes (time, y, x) of the bands that smooth functions leave; 0 off the object."""
-    gain = movie.coords.get("gain", xr.ones_like(movie.isel(y=0, x=0, drop=True)))
-    weight = np.sqrt(gain.prod("band").values)[:, np.newaxis]
-    place = np.linspace(-1, 1, movie.sizes["time"])
-    functions, _ = np.linalg.qr(weight * np.polynomial.legendre.legvander(place, _ORDER - 1))
-    result = []
-    for band in movie.values:
-        values = weight * band[:, inside]
-        part = np.zeros(band.shape, dtype=np.float32)
-        part[:, inside] = values - functions @ (functions.T @ values)
-        result.append(part)
-    return result
+def _rapid(signal: xr.DataArray, weight: Array, values: Array) -> Array:
+    """Weighted changes (band, time, pixel) of a signal's values that smooth functions leave."""
+    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
+    rapid = weight * values
+    return np.asarray(rapid - [functions @ (functions.T @ part) for part in rapid])
 
 
 def _correlations(first: Movie, second: Movie, inside: Mask) -> Array:

@@ -20,7 +20,6 @@ from dbthermal import calibration, mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal.emissivity import embedded_table
-from dbthermal.response import Curve, require_range
 
 _CAMERA_BAND: Final = "8-14"
 
@@ -44,6 +43,10 @@ OBJECTS: Final = (
 )
 """The five objects of the paper (its table of emissivities, doi:10.48550/arXiv.2509.11334), with
 its reference values for 8-14 um; the rest is this project's choice."""
+
+
+def _names(response: xr.Dataset) -> tuple[str, ...]:
+    return tuple(str(name) for name in response["band"].values)
 
 
 @cache
@@ -110,15 +113,8 @@ def bench_series(
 ) -> xr.Dataset:
     """One series of measurements on the paper's bench, with all its errors: the stage `contact`.
 
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`, that of one pixel and frame: it stands for the drift of the camera between
-        shutter events, which no mean over pixels removes.
-    sample, bench : Sample, Bench
-        The object; steps and errors, of which the common ones are drawn once.
-    rng : Generator
-        Source of the errors.
+    The noise of the response is that of one pixel and frame: it stands for the drift of the camera
+    between shutter events, which no mean over pixels removes. Common errors are drawn once.
 
     Examples
     --------
@@ -137,12 +133,11 @@ def bench_series(
         part.ravel()
         for part in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
     )
-    curves = _curves(response)
     stray = rng.uniform(0.0, sample.stray)
-    room = _blackbody(curves, np.full_like(cold, bench.air_temperature))
-    reflected = (1.0 - stray) * _blackbody(curves, cold) + stray * room
-    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
+    room = _blackbody(response, np.full_like(cold, bench.air_temperature))
+    reflected = (1.0 - stray) * _blackbody(response, cold) + stray * room
+    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
+    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
     shown = cold + rng.uniform(-1, 1) * bench.blackbody_tolerance
     read = {
         "object_temperature": _thermocouple(warm, bench, rng),
@@ -183,14 +178,13 @@ def reflector_series(
             f"{bench.least_excess} K above the air's {bench.air_temperature} K."
         )
     air = np.full_like(warm, bench.air_temperature)
-    curves = _curves(response)
     stray = rng.uniform(0.0, sample.stray)
-    mirrored = _blackbody(curves, air + rng.uniform(*bench.mirrored_excess))
-    reflected = (1.0 - stray) * mirrored + stray * _blackbody(curves, air)
-    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
-    uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
-    emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
+    mirrored = _blackbody(response, air + rng.uniform(*bench.mirrored_excess))
+    reflected = (1.0 - stray) * mirrored + stray * _blackbody(response, air)
+    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
+    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
+    uneven = _blackbody(response, air + rng.normal(0, bench.foil_std, air.size))
+    emitted = _blackbody(response, air + bench.foil_warming * (warm - air))
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
     read = {
         "counts": _noisy(response, counts, rng),
@@ -200,21 +194,14 @@ def reflector_series(
     return _series(response, "reflector", read)
 
 
-def _curves(response: xr.Dataset) -> list[Curve]:
-    """Response curve of each band."""
-    return responses.curves(response, [str(name) for name in response["band"].values])
-
-
-def _blackbody(curves: list[Curve], temperature: Array) -> Array:
+def _blackbody(response: xr.Dataset, temperature: Array) -> Array:
     """Counts of a blackbody (band, measurement), the temperatures checked against the response."""
-    values = require_range(temperature, curves[0], "temperature")
-    return np.stack([curve.counts(values) for curve in curves])
+    return responses.counts(response, xr.DataArray(temperature, dims="measurement")).values
 
 
 def _noisy(response: xr.Dataset, counts: Array, rng: np.random.Generator) -> Array:
     """Counts (band, measurement) with the response's noise."""
-    names = [str(name) for name in response["band"].values]
-    noise = responses.noise(response, names)[:, np.newaxis]
+    noise = responses.noise(response, [*_names(response)])[:, np.newaxis]
     return np.asarray(counts + noise * rng.standard_normal(counts.shape))
 
 
@@ -242,44 +229,20 @@ def contact_measurements(
     stds: tuple[float, float],
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
+    """Readings for the calibration of an emissivity (band) [1]: the stage `contact`.
 
-    ValueError if a temperature lies outside the response, or the emissivity lacks a band.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
+    Of true temperatures (measurement,) [K] and standard deviations of a reading of thermocouple and
+    blackbody [K]. ValueError if a temperature lies outside the response, or the emissivity lacks a
+    band.
     """
-    names = [str(name) for name in response["band"].values]
-    places = schema.band_positions(emissivity, names, "the emissivity")
+    places = schema.band_positions(emissivity, [*_names(response)], "the emissivity")
     true = {
         "object_temperature": object_temperature,
         "background_temperature": background_temperature,
     }
-    emitted, reflected = (
-        responses.counts(response, xr.DataArray(level, dims="measurement")).values
-        for level in true.values()
-    )
-    clean = mixing.leaving(emissivity.values[places][:, np.newaxis], emitted, reflected)
-    noise = responses.noise(response, names)[:, np.newaxis] * rng.standard_normal(clean.shape)
-    read = {
-        name: ("measurement", level + rng.normal(0, std, len(level)), {"units": "K"})
-        for (name, level), std in zip(true.items(), stds, strict=True)
-    }
-    counts = (("band", "measurement"), clean + noise, {"units": "count"})
-    return xr.Dataset({"counts": counts, **read}, {"band": names}, {"origin": "simulated"})
+    signals = (_blackbody(response, level) for level in true.values())
+    clean = mixing.leaving(emissivity.values[places][:, np.newaxis], *signals)
+    read = {"counts": _noisy(response, clean, rng)}
+    for (name, level), std in zip(true.items(), stds, strict=True):
+        read[name] = level + rng.normal(0, std, len(level))
+    return _series(response, "contact", read)

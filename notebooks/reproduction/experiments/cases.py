@@ -122,78 +122,43 @@ def run_case(
 def simulate(
     case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    r"""Scene, capture and response of one case.
+    r"""Scene at the first band's exposures, capture without stamps, and response of one case.
 
-    Parameters
-    ----------
-    case : mapping
-        `emissivity` (one a band [1]), `start` and `stop` of the object [degree Celsius]; and
-        optionally: a name `case`; `background`, arguments of `simulation.Background`; `jump` of the
-        object, arguments of `Jump`; `following` [1], the c of a background that drifts along with
-        the object's own curve, :math:`y(t) + c (x(t) - x(t_0))`; `swapped` (default false): the
-        object then moves as the background would, and the other way round; `offset` of the other
-        bands [frame], a multiple of 1 / `STEPS`: they are exposed so much later; `frames`: only
-        the first of the times; `noise` of the bands [K], in place of the rig's.
-    rig, time, pixels, seed
-        See `run_case`. With an `offset` the times must be even.
-
-    Returns
-    -------
-    tuple of Dataset
-        The scene at the first band's exposures; the capture, without stamps; the response.
-
-    Raises
-    ------
-    ValueError
-        If the case has an unknown key, lacks one, or has a value other than described.
+    A case has `emissivity` (one a band [1]), `start` and `stop` of the object [degree Celsius]; and
+    optionally: a name `case`; `background`, arguments of `simulation.Background`; `jump` of the
+    object, arguments of `Jump`; `following` [1], the c of a background that drifts along with the
+    object's own curve, :math:`y(t) + c (x(t) - x(t_0))`; `swapped` (default false): the object then
+    moves as the background would, and the other way round; `offset` of the other bands [frame], a
+    multiple of 1 / `STEPS`: they are exposed so much later, and the times must be even; `frames`:
+    only the first of the times; `noise` of the bands [K], in place of the rig's. ValueError if the
+    case has an unknown key, lacks one, or has a value other than described.
     """
-    _check_keys(case)
+    if not case.keys() >= _NEEDED or not case.keys() <= _NEEDED | _OPTIONAL:
+        rule = f"Must have {sorted(_NEEDED)}, may have {sorted(_OPTIONAL)}"
+        raise ValueError(f"Invalid case with keys {sorted(case)}. {rule}.")
+    count, offset = int(case.get("frames", time.size)), case.get("offset", 0.0)
+    if not 2 <= count <= time.size:
+        raise ValueError(f"Invalid number of frames {count}. Must lie in [2, {time.size}].")
+    later = round(offset * STEPS)
+    if offset < 0 or abs(later - offset * STEPS) > 1e-9:
+        rule = f"Must be zero or positive, a multiple of 1/{STEPS}"
+        raise ValueError(f"Invalid offset {offset} frames. {rule}.")
     rng = np.random.default_rng(seed)
     noise = tuple(case.get("noise", rig.noise))
     response = replace(rig, noise=noise).response()
-    time = _first(time, int(case.get("frames", time.size)))
-    later = _steps(case.get("offset", 0.0))
-    clock = _finer(time, later) if later else time
+    clock = time = time[:count]
+    if later:  # on the finer clock until the last frame of the band that is exposed later
+        step = (time[-1] - time[0]) / (time.size - 1) / STEPS
+        if not np.allclose(np.diff(time), step * STEPS, rtol=0, atol=1e-6 * step):
+            raise ValueError("Invalid times of bands that are exposed apart. Must be even.")
+        clock = time[0] + step * np.arange((time.size - 1) * STEPS + later + 1)
     scene = _draw(case, rig.bands, clock, pixels, rng)
     if not later:
         return scene, simulation.observe(scene, response, rng), response
-    frames, starts = time.size, [0, *[later] * (len(rig.bands) - 1)]
-    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
-    first = scene.isel(time=slice(0, (frames - 1) * STEPS + 1, STEPS))
+    starts = [0, *[later] * (len(rig.bands) - 1)]
+    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=count)
+    first = scene.isel(time=slice(0, (count - 1) * STEPS + 1, STEPS))
     return first, seen.drop_vars("exposure_time"), response
-
-
-def _check_keys(case: Case) -> None:
-    if not case.keys() >= _NEEDED or not case.keys() <= _NEEDED | _OPTIONAL:
-        raise ValueError(
-            f"Invalid case with keys {sorted(case)}. Must have {sorted(_NEEDED)}, "
-            f"may have {sorted(_OPTIONAL)}."
-        )
-
-
-def _first(time: np.ndarray, frames: int) -> np.ndarray:
-    """The first of the times."""
-    if not 2 <= frames <= time.size:
-        raise ValueError(f"Invalid number of frames {frames}. Must lie in [2, {time.size}].")
-    return time[:frames]
-
-
-def _steps(offset: float) -> int:
-    """An offset [frame] in steps of the finer clock."""
-    steps = round(offset * STEPS)
-    if offset < 0 or abs(steps - offset * STEPS) > 1e-9:
-        raise ValueError(
-            f"Invalid offset {offset} frames. Must be zero or positive, a multiple of 1/{STEPS}."
-        )
-    return steps
-
-
-def _finer(time: np.ndarray, later: int) -> Array:
-    """Times [s] of the finer clock, on until the last frame of the band that is exposed later."""
-    step = (time[-1] - time[0]) / (time.size - 1) / STEPS
-    if not np.allclose(np.diff(time), step * STEPS, rtol=0, atol=1e-6 * step):
-        raise ValueError("Invalid times of bands that are exposed apart. Must be even.")
-    return np.asarray(time[0] + step * np.arange((time.size - 1) * STEPS + later + 1))
 
 
 def _draw(
@@ -210,14 +175,9 @@ def _draw(
     if "jump" in case:
         warm = warm + Jump(**case["jump"]).draw(time, pixels, rng)[:, np.newaxis]
     roles = (cold, warm) if case.get("swapped", False) else (warm, cold)
-    return scene.assign(
-        {
-            name: values.assign_attrs(scene[name].attrs)
-            for name, values in zip(
-                ("object_temperature", "background_temperature"), roles, strict=True
-            )
-        }
-    )
+    names = ("object_temperature", "background_temperature")
+    films = zip(names, roles, strict=True)
+    return scene.assign({name: film.assign_attrs(scene[name].attrs) for name, film in films})
 
 
 def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int) -> xr.Dataset:
@@ -248,12 +208,7 @@ def held(error: xr.DataArray, std: xr.DataArray, width: float = INTERVAL) -> xr.
 
 
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
-    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
-
-    Parameters
-    ----------
-    emissivity : array_like, shape (2, ...)
-        Emissivities [1].
+    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections, emissivities (2, ...) [1].
 
     Examples
     --------
@@ -272,17 +227,10 @@ def ratio_variance_bound(
     .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
               {\sum_t [(1 - e_1) P y(t)]^2}
 
-    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
-
-    Parameters
-    ----------
-    emissivity, noise : tuple of float
-        Emissivities [1] of the two bands, and standard deviations of their noise [K]; TypeError or
-        ValueError for other than two numbers, in [0, 1] and positive.
-    background : ndarray, shape (time, ...)
-        Background temperature [K].
-    functions : ndarray, shape (time, order)
-        Orthonormal functions that span the smooth subspace.
+    with P the projection orthogonal to the smooth subspace, spanned by orthonormal functions (time,
+    order), in which the object may do anything; emissivities [1] and noise [K] of the two bands,
+    background temperature (time, ...) [K]. TypeError or ValueError for other than two numbers, in
+    [0, 1] and positive.
 
     Examples
     --------

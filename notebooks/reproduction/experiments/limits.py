@@ -62,13 +62,10 @@ def near_bound(
     and must be the quietest; `ends` are the first and last temperature of the object [degree
     Celsius], `clock` the number of frames and their rate [Hz].
 
-    Returns
-    -------
-    Dataset
-        `reflection_ratio_error` (pixel) [1], signed, of the second band, and
-        `reflection_ratio_bound` (knowing, pixel); `object_temperature_error` (pixel) [K], root mean
-        square over time, and `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN
-        in pixels without an object temperature. `status` (pixel).
+    `reflection_ratio_error` (pixel) [1], signed, of the second band, and `reflection_ratio_bound`
+    (knowing, pixel); `object_temperature_error` (pixel) [K], root mean square over time, and
+    `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN in pixels without an object
+    temperature. `status` (pixel).
     """
     rig = Rig(bands=tuple(bands), noise=tuple(noise))
     case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
@@ -134,13 +131,10 @@ def pooled(
     pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
     share. Other parameters as for `near_bound`, of the default `Rig`.
 
-    Returns
-    -------
-    Dataset
-        `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
-        groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
-        `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
-        separation's own standard deviation of the ratio, root mean square.
+    `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
+    groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
+    `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
+    separation's own standard deviation of the ratio, root mean square.
     """
     uneven = [size for size in sizes if size < 1 or pixels % size]
     if uneven:

@@ -16,10 +16,7 @@ from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, li
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
     """Maps of gain and offset, one row per band, with the bad pixels marked.
 
-    Parameters
-    ----------
-    correction : Dataset
-        From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
+    From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
@@ -42,14 +39,9 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
 
     From above: counts over temperature, the line's residuals, and those of the Sakuma-Hattori curve
     on a scale of their own, with the noise of one pixel and frame where the response has it.
-    Residuals and noise are counts over the slope of the line.
-
-    Parameters
-    ----------
-    response : Dataset
-        From `calibration.fit_response`.
-    fine : DataArray
-        Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
+    Residuals and noise are counts over the slope of the line. The response is from
+    `calibration.fit_response`; `fine` are its fitted counts (band, temperature) on a fine grid of
+    temperatures, from `response.counts`.
     """
     bands = response["band"].values
     schema.check_numbers(response["temperature"], "'temperature' of the response", "K")
@@ -82,13 +74,7 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
-    """Band emissivities (material, band) [1] as bars, one group per material.
-
-    Parameters
-    ----------
-    table : Dataset
-        From `emissivity.band_table`: `emissivity` (material, band) [1].
-    """
+    """Band emissivities (material, band) [1] of `emissivity.band_table` as bars, by material."""
     materials, bands = table["material"].values, table["band"].values
     figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
     width = 0.8 / len(bands)
@@ -105,14 +91,9 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
 
 
 def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
-    """Emissivities from thermocouple and blackbody with their standard deviations.
+    """Emissivities (material, band) [1] by thermocouple and blackbody, with standard deviations.
 
-    Parameters
-    ----------
-    measured : Dataset
-        `emissivity`, `emissivity_std` (material, band) [1].
-    table : DataArray, optional
-        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
+    `emissivity` and `emissivity_std`; tabulated values, of a simulation the truth, are crosses.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     if table is not None:
@@ -138,14 +119,9 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
 
 
 def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
-    """Condition number of the emissivity matrix for every pair of bands.
+    """Condition number of the emissivity matrix for every pair of bands, over some materials.
 
-    Parameters
-    ----------
-    summary : DataArray
-        (first, second) [1], averaged over materials; NaN or infinite on the diagonal.
-    materials : int
-        Their number.
+    (first, second) [1], averaged over the materials; NaN or infinite on the diagonal.
     """
     figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)

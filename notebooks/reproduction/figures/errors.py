@@ -21,17 +21,9 @@ from dbthermal.figures.drawing import (
     provenance_note,
 )
 
-_RIGHT: Final = "#a8d5b0"
-
-_WRONG: Final = "#e3000f"
-
-# What a 95 % interval should hold, and where the axis of the coverage begins [%].
-_SPAN: Final = (92.0, 98.0)
-
-_LOWEST: Final = 50.0
-
-_ARROW: Final = 48.5
-
+_RIGHT, _WRONG = "#a8d5b0", "#e3000f"
+# What a 95 % interval should hold, where the axis of the coverage begins, and its arrow lies [%].
+_SPAN, _LOWEST, _ARROW = (92.0, 98.0), 50.0, 48.5
 _DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
 
 

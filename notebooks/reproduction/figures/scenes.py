@@ -91,18 +91,10 @@ def compared_pictures(
 
 
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
-    """Truth against estimate over time at one pixel, with two standard deviations.
+    """Truth against estimate over time at a pixel (row, column), with two standard deviations.
 
-    Object above, background below.
-
-    Parameters
-    ----------
-    truth : Dataset
-        Scene with `object_temperature`, `background_temperature` (time, y, x) [K].
-    result : Dataset
-        From `separation.solve`.
-    pixel : tuple of int
-        Row and column.
+    Object above, background below, of a scene with `object_temperature` and
+    `background_temperature` (time, y, x) [K] and a result from `separation.solve`.
     """
     names = ("object_temperature", "background_temperature")
     for dataset, label in ((truth, "the truth"), (result, "the result")):
@@ -127,17 +119,9 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
 def separated_film(
     apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
+    """Frames, as of `film`, of the inputs, the emission and the mean-subtracted reflection.
 
-    Parameters
-    ----------
-    apparent, emission, change, title
-        As for `dbthermal.figures.separated_temperatures` [K]; pixels without a value are gray.
-
-    Yields
-    ------
-    ndarray of uint8, shape (rows, columns, 3)
-        As from `dbthermal.figures.film`.
+    All as for `dbthermal.figures.separated_temperatures` [K]; pixels without a value are gray.
     """
     labels = ("the inputs", "the emission", "the reflection")
     for temperature, label in zip((apparent, emission, change), labels, strict=True):
@@ -207,14 +191,8 @@ def error_maps(picture: xr.DataArray, errors: Mapping[str, xr.DataArray]) -> Fig
 def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]) -> Figure:
     """Readings of two bands over a day, above them the flags of the separated stretches.
 
-    Parameters
-    ----------
-    readings : DataArray
-        Temperatures (band, time) [K]; time [s] from midnight.
-    middles : sequence of float
-        Middle of each stretch [h].
-    flags : sequence of str
-        Its flags, by commas.
+    Temperatures (band, time) [K], time [s] from midnight; the middle of each stretch [h], and its
+    flags, by commas.
     """
     figure, ((axis,),) = canvas(1, 1, (8.0, 3.6))
     celsius, time = readings - zero_Celsius, readings["time"] / 3600.0
@@ -235,15 +213,7 @@ def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]
 
 
 def sky_changes(sky: xr.DataArray, gains: xr.DataArray) -> Figure:
-    """Changes of a sky in each band over those in the first one, with their ratio.
-
-    Parameters
-    ----------
-    sky : DataArray
-        Temperatures (band, time) [K].
-    gains : DataArray
-        Ratios (band) [1].
-    """
+    """Changes of a sky (band, time) [K] in each band over those in the first, with their ratio."""
     names = [str(name) for name in sky["band"].values]
     figure, (axes,) = canvas(1, len(names) - 1, (2.4 * (len(names) - 1), 2.7))
     changes = sky.diff("time")

@@ -172,7 +172,7 @@ def bunny(
         on = -np.expm1(-max(time - LAMP_START, 0.0) / LAMP_RISE)
         return np.asarray(LAMP_FLUX * on * facing)
 
-    exchanges = [
+    exchanges: list[heat.Exchange] = [
         heat.Heating(flux),
         heat.Convection(AIR, AMBIENT),
         heat.Radiation(EMISSIVITY, AMBIENT),

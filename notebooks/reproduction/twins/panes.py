@@ -42,7 +42,7 @@ class Pane:
         self, start: float, mesh: trimesh.Trimesh, time: Array, *sources: heat.Exchange
     ) -> Array:
         """Temperature (time, vertex) [K] with both sides to the room and sources from a start."""
-        side = [heat.Convection(self.air, AMBIENT), heat.Radiation(self.emissivity, AMBIENT)]
+        side = (heat.Convection(self.air, AMBIENT), heat.Radiation(self.emissivity, AMBIENT))
         return since(start, mesh, (self.thickness, heat.GLASS), time, [*side, *side, *sources])
 
 
