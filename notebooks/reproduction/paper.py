@@ -37,7 +37,13 @@ Numbers = Mapping[str, Mapping[str, float | int | str | bool]]
 """Stem of a notebook -> name -> number, as `verify.read_run` gives them."""
 
 TWIN: Final = "simulated twin"
-"""What a row is measured on that stands for a scene of the paper."""
+DATA: Final = {
+    **dict.fromkeys(("01_calibration", "05_methods", "06_optimiser"), "simulated"),
+    **dict.fromkeys(("07_bench", "08_twins"), TWIN),
+    "02_emissivity": "spectral libraries",
+    "12_published": "published video",
+}
+"""What each notebook measures on; a twin stands for a scene of the paper."""
 
 _AGREES: Final = 0.1
 _ON_A_TWIN: Final = ", on a twin"
@@ -57,7 +63,6 @@ class Row:
     quantity: str
     stem: str = ""  # of the notebook that measures it here
     names: tuple[str, ...] = ()  # of its numbers there
-    data: str = ""  # that ours is measured on
     published: float | None = None
     unit: str = "1"
     judged: str = "no"
@@ -65,6 +70,11 @@ class Row:
     note: str = "no number published"  # verdict where none is computed
     labels: tuple[str, ...] = ()  # of several numbers
     reference: float | None = None  # true value for the paper and for ours
+
+    @property
+    def data(self) -> str:
+        """What ours is measured on."""
+        return DATA[self.stem] if self.stem else "`mixing`, its tests"
 
     def ours(self, numbers: Numbers) -> dict[str, float]:
         """Numbers measured here, by label or name; without those that were not measured."""
@@ -107,8 +117,6 @@ class Row:
 COLUMNS: Final = ("in the paper", "quantity", "paper", "here", "measured on", "verdict")
 """Columns of the table."""
 
-_PERCENT: Final = "%"
-
 
 def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
     """Cells of `COLUMNS` for every published number beside ours."""
@@ -139,9 +147,7 @@ def rows() -> tuple[Row, ...]:
 def _terms() -> Iterator[Row]:
     for term, value in REDUCTIONS.items():
         names, quantity = (f"{term}: reduction [%]",), f"error saved by the {term} term"
-        yield Row(
-            "Table 1", quantity, "06_optimiser", names, "simulated", value, _PERCENT, "value", 10.0
-        )
+        yield Row("Table 1", quantity, "06_optimiser", names, value, "%", "value", 10.0)
 
 
 def _bench() -> Iterator[Row]:
@@ -152,7 +158,6 @@ def _bench() -> Iterator[Row]:
                 f"emissivity of the {thing}, {name}",
                 "07_bench",
                 (f"{thing}: {name} [1]",),
-                TWIN,
                 value,
                 judged="distance" if name == "bench" else "value",
                 within=0.01 if name == "bench" else 0.03,
@@ -162,16 +167,16 @@ def _bench() -> Iterator[Row]:
 
 def _scenes() -> Iterator[Row]:
     for scene, errors in SCENE_ERRORS.items():
-        shown = scene.replace("_", " ")
+        shown, unit = scene.replace("_", " "), "\N{DEGREE SIGN}C"
         highest = (f"{scene}: highest reading [degC]",)
         quantity = f"{shown}: highest reading of the thermocouple"
-        common = ("08_twins", highest, TWIN, PEAKS[scene], "\N{DEGREE SIGN}C")
+        common = ("08_twins", highest, PEAKS[scene], unit)
         yield Row("Fig. 6", quantity, *common, note="by construction")
         for method, error in errors.items():
             quantity = f"{shown}: error at the thermocouple, {_ROLES.get(method, method)}"
             names = (f"{scene}: error of {method} [%]",)
             judged = "error" if method in _ROLES else "no"
-            ours = ("08_twins", names, TWIN, error, _PERCENT)
+            ours = ("08_twins", names, error, "%")
             yield Row("Fig. 6", quantity, *ours, judged, note="another scene, no target")
 
 
@@ -183,7 +188,6 @@ _FIRST: Final = (
     Row(
         "Fig. 1",
         "image formation: object, background, path, optics, camera",
-        data="`mixing`, its tests",
         note="implemented",
     ),
     Row(
@@ -191,7 +195,6 @@ _FIRST: Final = (
         "error of the object temperature at moderate noise, median over materials",
         "05_methods",
         tuple(f"{name}: error at moderate noise [K]" for name in _METHODS),
-        "simulated",
         unit="K",
         labels=_METHODS,
     ),
@@ -200,7 +203,6 @@ _FIRST: Final = (
         "error of the emissivity at low noise, median over emissivities",
         "05_methods",
         tuple(f"{name}: emissivity error at the lowest noise [1]" for name in _METHODS[:2]),
-        "simulated",
         labels=_METHODS[:2],
     ),
     Row(
@@ -208,7 +210,6 @@ _FIRST: Final = (
         "error of the bunny's temperature, mean over frames, median over its pixels",
         "08_twins",
         tuple(f"{name}: error on the bunny [K]" for name in ("subspace", "naive")),
-        "simulated",
         unit="K",
         labels=("subspace", "naive"),
     ),
@@ -223,7 +224,6 @@ _LAST: Final = (
             ),
             "08_twins",
             (f"{scene}: emissivity unknown less calibrated, {band} [1]",),
-            TWIN,
             value,
             judged="error",
         )
@@ -238,7 +238,6 @@ _LAST: Final = (
         "emissivity of five objects in five bands, largest error in any series",
         "07_bench",
         ("largest error of the bench in any series [1]",),
-        TWIN,
     ),
     Row(
         "Fig. 5",
@@ -246,7 +245,6 @@ _LAST: Final = (
         "finger reflection: share of it that is found as reflection",
         "08_twins",
         tuple(f"{name}: share found [1]" for name in ("fingerprint", "fingers")),
-        TWIN,
         labels=("print", "reflection"),
     ),
     Row(
@@ -254,21 +252,18 @@ _LAST: Final = (
         "coffee pot: map of the reflection, correlation with the authors'",
         "12_published",
         ("coffeepot_map_correlation",),
-        "published video",
     ),
     Row(
         "Fig. 6",
         "glass plate: the same",
         "12_published",
         ("glass-plate_map_correlation",),
-        "published video",
     ),
     Row(
         "Fig. 7",
         "residual of the Sakuma-Hattori curve, and of the line, 0 to 75 \N{DEGREE SIGN}C",
         "01_calibration",
         ("residual_8-14_K", "linear_residual_8-14_K"),
-        "simulated",
         unit="K",
         judged="alike",
         within=2.0,
@@ -279,15 +274,13 @@ _LAST: Final = (
         "ablation over noise: the noise terms' share at the highest level",
         "06_optimiser",
         ("noise: reduction at the highest noise [%]",),
-        "simulated",
-        unit=_PERCENT,
+        unit="%",
     ),
     Row(
         "Fig. 9",
         "median condition number of 8-14 \N{MICRO SIGN}m with each filter",
         "02_emissivity",
         tuple(f"condition_8-14_{name}" for name in _PAIRS),
-        "spectral libraries",
         judged="lowest",
         note="9.5",
         labels=_PAIRS,

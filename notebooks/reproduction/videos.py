@@ -8,6 +8,7 @@ doi:10.48550/arXiv.2509.11334, listed as `scenes` and `other_scenes` in the data
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -58,7 +59,11 @@ def scene(files: Mapping[str, Path], inputs_name: str, results_name: str) -> Sce
     """
     movie = inputs(files, inputs_name)
     width = movie.sizes["x"]
-    theirs = {kind: authors_reflection(files, results_name, kind, width) for kind in KINDS}
+    # The authors' magnitude of the background's change, in units of each frame's own bar; beyond
+    # the width of the input video may lie a printed bar.
+    names = {kind: f"{results_name}_{kind}_Tbdiff_video.mp4" for kind in KINDS}
+    read = partial(palettes.masked_palette_video, palette="turbo", width=width)
+    theirs = {kind: read(_file(files, name)) for kind, name in names.items()}
     outline = theirs["uncalib"]["valid"].mean("time") > 0.5
     first, margin = first_frame(movie, theirs["uncalib"]["value"], outline)
     shown = movie.isel(time=slice(first, first + theirs["uncalib"].sizes["time"]))
@@ -84,16 +89,6 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
     return together.assign_attrs(
         radiometric=0, scene=name, origin="published video", palette_residual=fits
     )
-
-
-def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: int) -> xr.Dataset:
-    """Magnitude of the background's change as published by the authors.
-
-    `kind` is one of `KINDS`; beyond the width of the input video [pixel] may lie a printed bar.
-    `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
-    """
-    path = _file(files, f"{name}_{kind}_Tbdiff_video.mp4")
-    return palettes.masked_palette_video(path, "turbo", width)
 
 
 def first_frame(

@@ -194,7 +194,7 @@ def test_unevenly_spaced_times() -> None:
         called.append(time)
         return 50.0
 
-    air = [heat.Convection(coefficient, 350.0), heat.Radiation(0.9, AMBIENT)]
+    air = (heat.Convection(coefficient, 350.0), heat.Radiation(0.9, AMBIENT))
     even, uneven = (
         spot(times, AMBIENT, air, step=0.5) for times in (np.arange(101.0), [0.0, 3.0, 10.0, 100.0])
     )

@@ -53,8 +53,7 @@ class Views:
 
     def blackbody(self, world: World) -> dict[str, Picture]:
         """Frames, by band, of the world's blackbody, which fills the view."""
-        curves = self._curves().items()
-        return self._pictures({name: _bench(world, it, {}, {}, self._shape) for name, it in curves})
+        return self.samples(world, xr.DataArray(), {})
 
     def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
         """
@@ -63,10 +62,10 @@ class Views:
         The world has a temperature for each material; emissivity is (material, band) [1]; `places`
         are the rows and columns of each material, elsewhere is the blackbody itself.
         """
-        looks = {}
+        looks, shape = {}, (self.detector.sizes["y"], self.detector.sizes["x"])
         for band, curve in self._curves().items():
             values = {name: float(emissivity.sel(material=name, band=band)) for name in places}
-            looks[band] = _bench(world, curve, values, places, self._shape)
+            looks[band] = _bench(world, curve, values, places, shape)
         return self._pictures(looks)
 
     def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
@@ -74,10 +73,6 @@ class Views:
         curves = self._curves()
         names = [str(name) for name in scene["band"].values]
         return self._pictures({name: _shown(scene, curves[name], name) for name in names})
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.detector.sizes["y"], self.detector.sizes["x"]
 
     def _curves(self) -> dict[str, Curve]:
         return {band: responses.curve(self.response, band) for band in self.rig.bands}
@@ -196,15 +191,11 @@ def clear(folder: Path) -> None:
     simulated.
     """
     for path in sorted(folder.glob("*")):
-        if path.suffix != ".zarr" or not _simulated(path):
+        attrs = store.open_dataset(path).attrs if path.suffix == ".zarr" else {"is_simulated": 0}
+        if not attrs.get("is_simulated", path.name.startswith(_TRUTH)):
             raise FileExistsError(f"Invalid folder '{folder}' with '{path.name}', not emulated.")
     if folder.exists():
         shutil.rmtree(folder)
-
-
-def _simulated(path: Path) -> bool:
-    attrs = store.open_dataset(path).attrs
-    return bool(attrs.get("is_simulated", path.name.startswith(_TRUTH)))
 
 
 class Bench(World):
@@ -230,23 +221,17 @@ class Bench(World):
 
     @classmethod
     def of(
-        cls,
-        session: Session,
-        rng: np.random.Generator,
-        errors: Mapping[str, float],
-        *,
-        samples: Mapping[str, tuple[float, float]] | None = None,
-        touched: Mapping[str, xr.DataArray] | None = None,
+        cls, session: Session, rng: np.random.Generator, errors: Mapping[str, float], **objects: Any
     ) -> Self:
         """
         Bench of an emulated session with its cameras, filters and thermocouples; waits for `begin`.
 
         The errors are standard deviations of one reading of the ``blackbody`` and of any other
-        ``thermocouple`` [K]; samples and touched as for `Bench`.
+        ``thermocouple`` [K]; objects are the samples and what is touched, as for `Bench`.
         """
         std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
         std["blackbody"] = errors["blackbody"]
-        bench = cls(rng, std, samples, touched, filters=session.filters, waits=True)
+        bench = cls(rng, std, filters=session.filters, waits=True, **objects)
         bench.furnish(session)
         return bench
 

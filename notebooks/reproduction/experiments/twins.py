@@ -53,18 +53,13 @@ def judge_twin(
     one's place. Of the variants (see `at_thermocouple`), "calibrated" gets the emissivities that
     the bench finds for a piece of the same material, with their deviations.
 
-    Returns
-    -------
-    Dataset
-        Over `cameras`, the registrations (with a baseline) and "one place": variables of
-        `at_thermocouple`; over the `way`, "alone" by `solve`, and if it is judged as a `whole`,
-        with a baseline, "pooled" and "completed" by `separate`, those of `over_the_image`, else
-        NaN; `resting` [1], the share of the pixels whose object changes by less than `RESTING`,
-        where two bands leave the emissivity open; `emissivity_difference` (band) [1], mean
-        magnitude of the default method's emissivity less the calibrated one over the pixels
-        without a flag.
-    Dataset or None
-        As of `separate_twin`, of the first registration; if it is to be shown.
+    The first dataset has, over `cameras`, the registrations (with a baseline) and "one place":
+    variables of `at_thermocouple`; over the `way`, "alone" by `solve`, and if it is judged as a
+    `whole`, with a baseline, "pooled" and "completed" by `separate`, those of `over_the_image`,
+    else NaN; `resting` [1], the share of the pixels whose object changes by less than `RESTING`,
+    where two bands leave the emissivity open; `emissivity_difference` (band) [1], mean magnitude of
+    the default method's emissivity less the calibrated one over the pixels without a flag. The
+    second, if it is to be `shown`, is as of `separate_twin`, of the first registration.
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng)
@@ -203,16 +198,15 @@ def at_thermocouple(
     where it takes one; the default method without arguments is what has been separated. A method
     that looks at whole images, each by itself, gets the first of `EVERY` frames.
 
-    Returns
-    -------
-    Dataset
-        `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes,
-        NaN where a pixel of the bead has no value in some frame;
-        `temperature` (variant, time) and `reading` (time) of the last probe [K], NaN in frames that
-        a method does not get;
-        `highest_reading` [degree Celsius], median over the probes.
+    `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes, NaN
+    where a pixel of the bead has no value in some frame; `temperature` (variant, time) and
+    `reading` (time) of the last probe [K], NaN in frames that a method does not get;
+    `highest_reading` [degree Celsius], median over the probes.
     """
-    square = _square(scene)
+    # Rows and columns that the first bead covers.
+    reach = BEAD // 2
+    centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
+    square = {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
     readings = [
         twins.thermocouple_readings(scene, rng, bead=BEAD).isel(thermocouple=0)
         for _ in range(probes)
@@ -244,13 +238,6 @@ def _relative_error(estimate: xr.DataArray, readings: Sequence[xr.DataArray]) ->
     times = {"time": estimate["time"]}
     errors = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
     return xr.concat(errors, "probe").mean(("probe", "time"), skipna=False)
-
-
-def _square(scene: xr.Dataset) -> dict[str, slice]:
-    """Rows and columns that the first bead covers."""
-    reach = BEAD // 2
-    centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
-    return {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
 
 
 def _mean(
