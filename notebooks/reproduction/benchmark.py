@@ -50,11 +50,9 @@ CAMERAS: Final[Mapping[str, Mapping[str, Any]]] = {
 """Scenes by the cameras' places and the object's heating."""
 
 WHOLE_SCENES: Final = ("one place", "apart")
-SHORT: Final = 8.0
-"""Time from which a call is measured once, not twice [s]."""
+SHORT: Final = 8.0  # time from which a call is measured once, not twice [s]
 
-LONGEST_WHOLE: Final = 900.0
-"""Time of one thread from which a whole frame is left out [s]."""
+LONGEST_WHOLE: Final = 900.0  # time of one thread from which a whole frame is left out [s]
 
 USUAL: Final = {"pixels": 512, "frames": 350, "bands": 2}
 SERIES: Final = {
@@ -152,17 +150,15 @@ def whole_frame(cameras: str, path: Path) -> tuple[float, float]:
 
     In a process of its own, which holds the capture; another one draws it.
     """
-    found = (0.0, 0.0)
-    for step in (partial(_draw, cameras, path), partial(_separate, path)):
-        with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
-            found = fresh.submit(step).result()
-    return found
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        fresh.submit(_draw, cameras, path).result()
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        return fresh.submit(_separate, path).result()
 
 
-def _draw(cameras: str, path: Path) -> tuple[float, float]:
+def _draw(cameras: str, path: Path) -> None:
     """Draw and save a capture of a whole frame."""
     store.save(scene(cameras, WHOLE)[["counts"]], path, {})
-    return (0.0, 0.0)
 
 
 def _separate(path: Path) -> tuple[float, float]:
@@ -182,29 +178,16 @@ def peak_memory() -> float:
 
 def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
     """Yield the head of a table and a row for each call."""
-    yield (
-        "call",
-        "cameras",
-        "us a pixel",
-        "frames/s of 640x512, two cores, from it",
-        "measured",
-        "peak memory",
-        "error",
-        "95 % intervals",
-    )
+    times = ("us a pixel", "frames/s of 640x512, two cores, from it", "measured")
+    yield ("call", "cameras", *times, "peak memory", "error", "95 % intervals")
     for (function, cameras), call in calls.items():
         rate = 2 * FRAMES / (call.pixel * math.prod(WHOLE))
-        whole = np.isfinite(call.frame_rate)
-        yield (
-            f"`{function}`",
-            cameras,
-            f"{1e6 * call.pixel:.0f}",
-            f"{rate:.2g}",
-            f"{call.frame_rate:.2g}" if whole else "",
-            f"{1e-9 * call.peak:.1f} GB" if whole else "",
-            f"{call.rmse:.3f} K",
-            f"{100 * call.cover:.1f} %",
-        )
+        whole = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"]
+        if not np.isfinite(call.frame_rate):
+            whole = ["", ""]
+        times = (f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *whole)
+        errors = (f"{call.rmse:.3f} K", f"{100 * call.cover:.1f} %")
+        yield (f"`{function}`", cameras, *times, *errors)
 
 
 @lru_cache

@@ -117,9 +117,8 @@ def fire_shutter(
     places = schema.band_positions(counts, names, "the capture")
     for time in np.sort(np.atleast_1d(_numbers.real_numbers("times [s]", times))):
         if not clock[0] <= time <= clock[-1]:
-            raise ValueError(
-                f"Invalid time {time} s of the shutter. Must lie in [{clock[0]}, {clock[-1]}] s."
-            )
+            rule = f"Must lie in [{clock[0]}, {clock[-1]}] s"
+            raise ValueError(f"Invalid time {time} s of the shutter. {rule}.")
         first, after = np.searchsorted(clock, [time, time + duration], side="right")
         for band in places:
             movie = counts.values[band]

@@ -180,8 +180,7 @@ class Shell:
             ("face {} without an area", mesh.nondegenerate_faces(_FLATTEST * mesh.scale)),
             ("face {}, as an earlier one", mesh.unique_faces()),
         ):
-            if not np.all(holds):
-                number = np.flatnonzero(~np.asarray(holds))[0]
+            for number in np.flatnonzero(~np.asarray(holds)):
                 raise ValueError(f"Invalid {what.format(number)}. Must be left out.")
 
     @cached_property

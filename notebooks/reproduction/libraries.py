@@ -43,9 +43,8 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
     titles, rows = _table(path)
     codes = titles[1:]
     if titles[0] != "wavelength" or not codes or len({*codes}) < len(codes):
-        raise ValueError(
-            f"Invalid columns {titles} in '{path.name}'. Must be 'wavelength' and distinct codes."
-        )
+        rule = "Must be 'wavelength' and distinct codes"
+        raise ValueError(f"Invalid columns {titles} in '{path.name}'. {rule}.")
     wavelength, *samples = texts.numbers(rows, len(titles), path.name).T
     notes, file = {"type": "manmade", "measurement": "emissivity"}, File(path.name, rows)
     return {

@@ -82,9 +82,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
 def _require_dims(reference: xr.DataArray, values: xr.DataArray) -> None:
     """Refuse a reference with a dim that the other array lacks, which would multiply its pixels."""
     if not {*reference.dims} <= {*values.dims}:
-        raise ValueError(
-            f"Invalid dims {reference.dims} of the reference. Must be among {values.dims}."
-        )
+        rule = f"Must be among {values.dims}"
+        raise ValueError(f"Invalid dims {reference.dims} of the reference. {rule}.")
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:

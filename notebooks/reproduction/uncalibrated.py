@@ -19,8 +19,7 @@ from dbthermal import alignment, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
-CORRELATED: Final = 0.5
-"""Correlation of the bands from which a pixel enters the pooled ratio [1]."""
+CORRELATED: Final = 0.5  # correlation of the bands from which a pixel enters the pooled ratio [1]
 
 _FEWEST_STILL: Final = 200  # still pixels
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
@@ -69,9 +68,8 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     aligned = laid_on(still, signal, "the still pixels", "the signal")
     chosen = aligned.values.astype(bool).ravel()
     if chosen.sum() < _FEWEST_STILL:
-        raise ValueError(
-            f"Invalid still pixels: {chosen.sum()} of them. Must be at least {_FEWEST_STILL}."
-        )
+        rule = f"Must be at least {_FEWEST_STILL}"
+        raise ValueError(f"Invalid still pixels: {chosen.sum()} of them. {rule}.")
     result = signal.astype(np.promote_types(signal.dtype, np.float32))
     gains, shares, bands = np.ones(signal.shape[:2]), [], []
     for place, picture in enumerate(signal.values):
@@ -199,13 +197,11 @@ def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:
 
 def _check_signal(signal: xr.DataArray) -> None:
     if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
-        raise ValueError(
-            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
-        )
+        rule = "Must be (band, time, y, x) of two bands"
+        raise ValueError(f"Invalid signal {dict(signal.sizes)}. {rule}.")
     if not np.all(schema.measured(signal.values)):
-        raise ValueError(
-            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-        )
+        rule = "Must be finite"
+        raise ValueError(f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. {rule}.")
 
 
 def _frame_weight(signal: xr.DataArray) -> Array:
@@ -221,9 +217,8 @@ def _frame_weight(signal: xr.DataArray) -> Array:
 
 def _require(pixels: Mask, rule: str) -> None:
     if pixels.sum() < _FEWEST:
-        raise ValueError(
-            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
-        )
+        message = f"Invalid signal: {pixels.sum()} pixels have a {rule}"
+        raise ValueError(f"{message}. Must be at least {_FEWEST}.")
 
 
 def _correlation(rapid: Array) -> Array:
@@ -235,8 +230,7 @@ def _correlation(rapid: Array) -> Array:
 
 Movie = npt.NDArray[np.float32]
 
-REACH: Final = (6, 48)
-"""Largest displacement that is searched for, rows and columns [pixel]."""
+REACH: Final = (6, 48)  # largest displacement that is searched for, rows and columns [pixel]
 
 _SHARED: Final = 0.4  # share of the object's pixels that still show it when they are displaced
 _PARTS: Final = 5  # of a capture, in which the still edges are registered

@@ -26,11 +26,9 @@ BANDS: Final = {"8-14": 0, "9.5": 1}
 KINDS: Final = ("uncalib", "calib")
 """The authors' results, by estimated and by calibrated emissivities."""
 
-SMOOTHING: Final = 1.0
-"""Standard deviation of the smoothing of a map before it is compared [pixel]."""
+SMOOTHING: Final = 1.0  # standard deviation of the smoothing of a map before it is compared [pixel]
 
-MARGIN: Final = 6
-"""Pixels beyond the object's outline that are not taken as still surroundings."""
+MARGIN: Final = 6  # pixels beyond the object's outline that are not taken as still surroundings
 
 _CHANGE: Final = 2  # frames over which pictures are compared to find out which ones they are
 
@@ -79,9 +77,8 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
         palettes.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
     ]
     if movies[0].shape != movies[1].shape:
-        raise ValueError(
-            f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'. Must agree."
-        )
+        message = f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'"
+        raise ValueError(f"{message}. Must agree.")
     movies[1] = movies[1].assign_coords(time=movies[0]["time"])
     band = xr.DataArray(list(BANDS), dims="band", name="band")
     together = xr.concat(movies, band, combine_attrs="drop_conflicts")
@@ -104,10 +101,8 @@ def first_frame(
     """
     extra = movie.sizes["time"] - theirs.sizes["time"]
     if extra < 0 or movie.shape[2:] != theirs.shape[1:]:
-        raise ValueError(
-            f"Invalid results of {theirs.shape} frames, rows and columns. "
-            f"Must be at most the inputs' {movie.shape[1:]}."
-        )
+        rule = f"Must be at most the inputs' {movie.shape[1:]}"
+        raise ValueError(f"Invalid results of {theirs.shape} frames, rows and columns. {rule}.")
     results = _changes(theirs.values, outline.values)
     scores = np.empty((len(movie), extra + 1))
     for place, band in enumerate(movie.values):
@@ -150,10 +145,8 @@ def agreement(
     number or size.
     """
     if theirs["value"].shape != reflection.shape:
-        raise ValueError(
-            f"Invalid shape {theirs['value'].shape} of the authors' map. "
-            f"Must be {reflection.shape}."
-        )
+        rule = f"Must be {reflection.shape}"
+        raise ValueError(f"Invalid shape {theirs['value'].shape} of the authors' map. {rule}.")
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
     ours, theirs = reflection.isel(time=frames), theirs.isel(time=frames)
     # Smoothed within the object alone: its surroundings neither enter nor dim its edge.

@@ -193,8 +193,7 @@ def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: 
     return together.assign_attrs(origin="simulated", pixels=pixels, seed=seed)
 
 
-INTERVAL: Final = float(ndtri(0.975))
-"""Half-width of a 95 % interval, in standard deviations [1]."""
+INTERVAL: Final = float(ndtri(0.975))  # half-width of a 95 % interval, in standard deviations [1]
 
 
 def rmse(error: xr.DataArray) -> xr.DataArray:

@@ -144,9 +144,8 @@ def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
         place = time * rate
         number = int(place)
         if not 0 <= place <= len(movie) - 1:
-            raise ValueError(
-                f"Invalid time {time} s of a scene. Must lie in [0, {(len(movie) - 1) / rate}] s."
-            )
+            rule = f"Must lie in [0, {(len(movie) - 1) / rate}] s"
+            raise ValueError(f"Invalid time {time} s of a scene. {rule}.")
         after = movie[min(number + 1, len(movie) - 1)]
         return np.asarray(movie[number] + (place - number) * (after - movie[number]))
 

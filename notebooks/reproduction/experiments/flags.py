@@ -19,8 +19,7 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 Film = npt.NDArray[Any]
 Change = Callable[[Film, Mask, np.random.Generator], None]
 
-FAR: Final = 5.0
-"""Standard deviations of error from which a value is wrong [1]."""
+FAR: Final = 5.0  # standard deviations of error from which a value is wrong [1]
 
 PICTURED: Final = frozenset({"bad", "lost", "shift", "still"})
 """Keys of scenes that are pictures: shift of the reflections, at its middle and varying by [pixel];

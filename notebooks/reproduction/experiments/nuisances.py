@@ -23,8 +23,7 @@ VIEWS: Final = ("registered", "registered by the truth", "one view")
 NUISANCES: Final = ("lost frames", "shutter", "lost frames and shutter")
 """What `disturbed` puts into a capture."""
 
-GLASS: Final = (0.86, 0.72)
-"""Emissivities of plate glass in the two bands of the default `Rig` [1]."""
+GLASS: Final = (0.86, 0.72)  # emissivities of plate glass in the two bands of the default `Rig` [1]
 
 COLUMNS: Final = 4
 """Columns of the scene in a pixel of `parallax`, over which its sides see the mean."""
@@ -139,7 +138,12 @@ def parallax(
             f"Invalid shift {list(shift)} and parallax {distance} pixels. Must be multiples of "
             f"1/{COLUMNS} along x and of 1 along y, within {_MARGIN} together."
         )
-    wide, known = _plate(shape, clock, np.random.default_rng(seed)), Rig().response()
+    # People walking by: a margin around the view, and several columns a pixel.
+    value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
+    time, known = np.arange(int(clock[0])) / clock[1], Rig().response()
+    height, width = (size + 2 * _MARGIN for size in shape)
+    rng = np.random.default_rng(seed)
+    wide = simulation.walkers(time, (height, width * COLUMNS), value, rng)
     capture, single = (
         _two_views(wide, moved, more, known, np.random.default_rng(seed + 1))
         for moved, more in ((shift, distance), ((0.0, 0.0), 0.0))
@@ -183,14 +187,6 @@ def _compare(
     rows = [cost(on_clock(scene, result["time"]), result) for result in results]
     label = xr.DataArray(list(names), dims="treatment", name="treatment")
     return xr.concat(rows, label).assign_attrs(origin="simulated")
-
-
-def _plate(shape: Sequence[int], clock: Sequence[float], rng: np.random.Generator) -> xr.Dataset:
-    """People walking by a plate of glass: a margin around the view, and several columns a pixel."""
-    value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
-    time = np.arange(int(clock[0])) / clock[1]
-    height, width = (size + 2 * _MARGIN for size in shape)
-    return simulation.walkers(time, (height, width * COLUMNS), value, rng)
 
 
 def _view(wide: xr.Dataset, shift: Sequence[float]) -> xr.Dataset:

@@ -14,8 +14,7 @@ import xarray as xr
 from dbthermal import simulation
 from dbthermal._arrays import Array
 
-ROOM: Final = 295.15
-"""Temperature of the room [K]."""
+ROOM: Final = 295.15  # temperature of the room [K]
 _RISE: Final = 2.0 * np.log(9.0)  # logistic steps from 10 to 90 % take so many of their scales
 
 

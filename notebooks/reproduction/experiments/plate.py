@@ -104,11 +104,8 @@ def recorded(
 
 def _calibration(run: Run) -> tuple[xr.Dataset, xr.Dataset]:
     """Correction and response of notebook 01, in the bands of the rig."""
-    bands = list(simulation.Rig().bands)
-    stem = "01_calibration"
-    return run.open(stem, "_correction").sel(band=bands), run.open(stem, "_response").sel(
-        band=bands
-    )
+    stem, bands = "01_calibration", {"band": list(simulation.Rig().bands)}
+    return run.open(stem, "_correction").sel(bands), run.open(stem, "_response").sel(bands)
 
 
 def disagreement(apparent: xr.DataArray, status: xr.DataArray) -> tuple[int, int]:
@@ -185,11 +182,9 @@ def scores(
     return {name: float(value) for name, value in values.items()}
 
 
-DIFFERENCE: Final = 0.14
-"""Emissivity of 8-14 um less that of 9.5 um, as of plate glass [1]."""
+DIFFERENCE: Final = 0.14  # emissivity of 8-14 um less that of 9.5 um, as of plate glass [1]
 
-NOISE: Final = (0.03, 0.35)
-"""Noise of the two bands at the slider's middle [K]."""
+NOISE: Final = (0.03, 0.35)  # noise of the two bands at the slider's middle [K]
 
 _PIXELS, _FRAMES, _RATE, _SEED = 12, 350, 10.0, 3
 

@@ -85,9 +85,8 @@ def reflector_sensitivity(
 def _true(response: xr.Dataset, repeats: int) -> xr.DataArray:
     """True emissivity (object, band) of the objects."""
     if repeats < 2:
-        raise ValueError(
-            f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. Must be twice or more."
-        )
+        rule = "Must be twice or more"
+        raise ValueError(f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. {rule}.")
     names = tuple(str(name) for name in response["band"].values)
     return xr.DataArray(
         [band_emissivity(sample, names).values for sample in OBJECTS],

@@ -17,8 +17,7 @@ from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.metrics import relative_error_celsius
 from reproduction.twins.stage import Registration
 
-BEAD: Final = 3
-"""Pixels along a side of the square that a thermocouple's bead covers."""
+BEAD: Final = 3  # pixels along a side of the square that a thermocouple's bead covers
 
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
@@ -26,11 +25,9 @@ SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 PIXELWISE: Final = ("apparent", "calibrated", "dbvt", "naive")
 """Methods that get the surroundings of a bead only, which they treat pixel by pixel."""
 
-REACH: Final = 5
-"""Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
+REACH: Final = 5  # pixels around a bead that it gets: of some shifts, by which it pairs the pixels
 
-RESTING: Final = 0.1
-"""Standard deviation over time [K] below which an object counts as at rest."""
+RESTING: Final = 0.1  # standard deviation over time [K] below which an object counts as at rest
 
 _STRAY: Final = 0.01
 
@@ -220,7 +217,11 @@ def at_thermocouple(
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
-    errors = [_relative_error(estimate, readings) for estimate in estimates]
+    errors = []  # mean over the frames and the probes' readings (time)
+    for estimate in estimates:
+        times = {"time": estimate["time"]}
+        off = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
+        errors.append(xr.concat(off, "probe").mean(("probe", "time"), skipna=False))
     highest = np.median([float(reading.max()) for reading in readings]) - zero_Celsius
     return xr.Dataset(
         {
@@ -231,13 +232,6 @@ def at_thermocouple(
         },
         attrs={"origin": "simulated twin", "twin": scene.attrs["twin"]},
     )
-
-
-def _relative_error(estimate: xr.DataArray, readings: Sequence[xr.DataArray]) -> xr.DataArray:
-    """Error of a temperature (time), mean over its frames and the probes' readings (time)."""
-    times = {"time": estimate["time"]}
-    errors = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
-    return xr.concat(errors, "probe").mean(("probe", "time"), skipna=False)
 
 
 def _mean(

@@ -71,17 +71,17 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     ).drop_vars("exposure_time")
     # The first view begins at the first whole pixel that the second has, too.
     top, left = max(-down, 0), max(-right, 0)
-    views = [
-        seen.isel(band=[band], y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
-        for band, (y, x) in enumerate([(top, left), (top + down, left + right)])
-    ]
-    views = [one.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1])) for one in views]
+
+    def part(wide: xr.Dataset, y: int, x: int) -> xr.Dataset:
+        inner = wide.isel(y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
+        return inner.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
+
+    views = (
+        part(seen.isel(band=[0]), top, left),
+        part(seen.isel(band=[1]), top + down, left + right),
+    )
     seen = xr.concat(views, "band", combine_attrs="override")
-    truth = scene.isel(
-        time=slice(0, _STEPS * count, _STEPS),
-        y=slice(top, top + shape[0]),
-        x=slice(left, left + shape[1]),
-    ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
+    truth = part(scene.isel(time=slice(0, _STEPS * count, _STEPS)), top, left)
     seen = disturbances.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
     seen = disturbances.fire_shutter(seen, last * np.array(shutter), rng)

@@ -127,11 +127,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
     drawn = axis.imshow(values, cmap="viridis_r")
     middle = np.mean(limits_of(summary.copy(data=values)))
-    for row, column in np.ndindex(*values.shape):
-        if np.isfinite(values[row, column]):
-            color = "white" if values[row, column] > middle else "black"
-            text = f"{values[row, column]:.0f}"
-            axis.text(column, row, text, ha="center", va="center", color=color)
+    drawing.number_cells(axis, values, float(middle), "{:.0f}")
     for setter, dim in ((axis.set_xticks, "second"), (axis.set_yticks, "first")):
         setter(np.arange(summary.sizes[dim]), [band_label(name) for name in summary[dim].values])
     figure.colorbar(drawn, ax=axis, label="condition number [1]")

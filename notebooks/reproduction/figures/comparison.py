@@ -32,7 +32,9 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
         axis.set_title(str(name), fontsize=9)
     for axis in axes.flat[panels.sizes["material"] :]:
         axis.remove()
-    axes[0, 0].set_ylim(_decades(panels))
+    positive = errors.values[errors.values > 0]
+    if positive.size:
+        axes[0, 0].set_ylim(0.6 * float(positive.min()), 1.6 * float(positive.max()))
     for axis in axes[:, 0]:
         axis.set_ylabel("median error [K]")
     for axis in axes[-1]:
@@ -41,12 +43,6 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
     figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
     figure.suptitle(title + drawing.provenance_note(errors))
     return figure
-
-
-def _decades(errors: xr.DataArray) -> tuple[float, float]:
-    """Limits a little beyond the least and the largest positive value."""
-    values = errors.values[errors.values > 0]
-    return (0.6 * float(values.min()), 1.6 * float(values.max())) if values.size else (0.1, 10.0)
 
 
 def _lines(axis: Axes, errors: xr.DataArray) -> None:
@@ -70,12 +66,7 @@ def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
         image = errors.sel(variant=name).transpose("emissivity", "noise")[::-1]
         scale = (0.0, highest)
         draw_image(figure, axis, image, str(name), "error [1]", cmap="magma_r", limits=scale)
-        for row, column in np.ndindex(*image.shape):
-            value = float(image[row, column])
-            if np.isfinite(value):
-                color = "white" if value > highest / 2 else "black"
-                place = {"ha": "center", "va": "center", "fontsize": 7}
-                axis.text(column, row, f"{value:.3f}", color=color, **place)
+        drawing.number_cells(axis, image.values, highest / 2, "{:.3f}", fontsize=7)
         axis.set_xticks(range(image.sizes["noise"]), [f"{v:g}" for v in image["noise"].values])
         rows = [f"{v:.2f}" for v in image["emissivity"].values]
         axis.set_yticks(range(image.sizes["emissivity"]), rows)

@@ -106,10 +106,8 @@ class DbvtSettings:
         check_fields(self, "dbvt")
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"Unknown {name} '{getattr(self, name)}' of method 'dbvt'. "
-                    f"Must be one of {allowed}."
-                )
+                message = f"Unknown {name} '{getattr(self, name)}' of method 'dbvt'"
+                raise ValueError(f"{message}. Must be one of {allowed}.")
         weights = ("smoothness", "huber", "reconstruction", "noise", "noise_mean", "bend_updates")
         counts = ("stages", "stage_steps", "steps", "patience", "starts", "batch")
         for least, names in enumerate((weights, counts)):
@@ -127,7 +125,10 @@ def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         search = Search(tile, settings)
         loss, converged = search.run()
-        kept = _least(loss, tile.signals.shape[-1])
+        # Start of least objective, for each pixel.
+        pixels = tile.signals.shape[-1]
+        finite = np.where(np.isfinite(loss), loss, np.inf).reshape(-1, pixels)
+        kept = finite.argmin(axis=0) * pixels + np.arange(pixels)
         lost = ~np.isfinite(loss[kept])
         return _report(tile, search, kept, lost, lost | ~converged[kept])
 
@@ -243,12 +244,6 @@ class Search:
             )
             departures.append(tile.blackbody(1, temperature) - signal)
         return np.where(in_range[:, np.newaxis], mixing.mixed(e2, *departures), 0.0)
-
-
-def _least(loss: Array, pixels: int) -> npt.NDArray[np.intp]:
-    """Column of the start of least objective, for each pixel."""
-    finite = np.where(np.isfinite(loss), loss, np.inf).reshape(-1, pixels)
-    return np.asarray(finite.argmin(axis=0) * pixels + np.arange(pixels))
 
 
 def _report(

@@ -137,20 +137,15 @@ def _filled(
     )
 
 
-EMISSIVITY: Final = 0.9
-"""Total hemispherical emissivity of the bunny [1], for its radiation alone."""
+EMISSIVITY: Final = 0.9  # total hemispherical emissivity of the bunny [1], for its radiation alone
 AIR: Final = 6.0
 """Coefficient to still air [W m^-2 K^-1]; 2 to 25 for free convection in gases, table 1.1 of
 Bergman et al. (2011), Fundamentals of Heat and Mass Transfer."""
 
-BUNNY_HEIGHT: Final = 0.15
-"""Height of the bunny on the table [m]."""
-BUNNY_WALL: Final = (0.0015, heat.CERAMIC)
-"""Thickness [m] and solid of the bunny, a thin shell."""
-LAMP_FLUX: Final = 3000.0
-"""Flux of the lamp that is absorbed where the surface faces it [W m^-2]."""
-LAMP_TOWARDS: Final = (-1.0, -0.8, 1.0)
-"""Direction to the lamp, of any length."""
+BUNNY_HEIGHT: Final = 0.15  # height of the bunny on the table [m]
+BUNNY_WALL: Final = (0.0015, heat.CERAMIC)  # thickness [m] and solid of the bunny, a thin shell
+LAMP_FLUX: Final = 3000.0  # flux of the lamp that is absorbed where the surface faces it [W m^-2]
+LAMP_TOWARDS: Final = (-1.0, -0.8, 1.0)  # direction to the lamp, of any length
 LAMP_START, LAMP_RISE = -2.0, 2.0
 """Time at which the lamp is switched on, and its time constant [s]."""
 
@@ -196,10 +191,8 @@ def _stood(scan: trimesh.Trimesh) -> trimesh.Trimesh:
     return surfaces.moved(turned, translation=-scale * foot, scale=scale)
 
 
-LANE: Final = -0.24
-"""y of the lane of the car [m]."""
-LANE_HALF: Final = 0.45
-"""How far it goes to either side [m]."""
+LANE: Final = -0.24  # y of the lane of the car [m]
+LANE_HALF: Final = 0.45  # how far it goes to either side [m]
 FLIGHT: Final = ((-0.40, -0.35, 0.30), (0.40, -0.05, 0.45))
 """Lowest and highest x, y and z between which a toy is flown about, above the line of sight [m]."""
 

@@ -74,18 +74,14 @@ class Gun:
 
 _BEFORE: Final = 6.0
 """The gun starts to be brought near this many of its rise times before its start [1]."""
-BOARD_SIZE: Final = (0.34, 0.20)
-"""Width and height of the board [m]."""
-BOARD_DISTANCE: Final = 0.55
-"""How far the board is from the plate's middle [m]."""
-BOARD_SPACING: Final = 0.004
-"""Distance of the board's vertices [m]."""
+BOARD_SIZE: Final = (0.34, 0.20)  # width and height of the board [m]
+BOARD_DISTANCE: Final = 0.55  # how far the board is from the plate's middle [m]
+BOARD_SPACING: Final = 0.004  # distance of the board's vertices [m]
 SLANT: Final = Rotation.from_euler("yx", (0.9, -0.6))
 """Orientation of a hand that writes: slanted, so that its index is foremost, and tilted forward."""
 AWAY: Final = (0.0, -0.5)
 """Where the hand comes from and goes to, from the stroke: x and z on the board [m]."""
-WITHDRAWAL: Final = 1.0
-"""Time in which it comes, and goes [s]."""
+WITHDRAWAL: Final = 1.0  # time in which it comes, and goes [s]
 
 
 def glass_plate(
@@ -141,8 +137,7 @@ def pointing(writing: Writing, time: float) -> Pose:
     return Pose(SLANT, np.array([-x, -index.radius, z]) - tip)
 
 
-NEAR: Final = 0.15
-"""How far a hand is in front of the plate [m]."""
+NEAR: Final = 0.15  # how far a hand is in front of the plate [m]
 
 
 def fingers(capture: Capture, rng: np.random.Generator) -> Stage:

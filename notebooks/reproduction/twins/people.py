@@ -17,10 +17,8 @@ from dbthermal._arrays import Array
 from reproduction.twins.surfaces import capsule, ellipsoid
 from reproduction.twins.surroundings import Actor, Motion, Pose, hinged, painted
 
-_SPACING: Final = 0.03
-"""Distance of the vertices of a body [m]."""
-_FINE: Final = 0.004
-"""Distance of the vertices of a hand [m]."""
+_SPACING: Final = 0.03  # distance of the vertices of a body [m]
+_FINE: Final = 0.004  # distance of the vertices of a hand [m]
 
 
 @dataclass(frozen=True)
@@ -80,10 +78,8 @@ def pacing(
 SHOULDER, HIP, CROWN, BREADTH = 1.42, 0.90, 1.75, 0.42
 """Heights of shoulder, hip and crown, and breadth from shoulder to shoulder, of a person who stands
 with the feet at z = 0 and walks along x [m]."""
-SKIN, HAND, CLOTHES = 307.15, 305.15, 302.65
-"""Temperatures of face, hands and clothes [K]."""
-SWING: Final = 0.45
-"""Largest angle of legs and arms [rad]."""
+SKIN, HAND, CLOTHES = 307.15, 305.15, 302.65  # temperatures of face, hands and clothes [K]
+SWING: Final = 0.45  # largest angle of legs and arms [rad]
 
 
 def person(route: Route, *, height: float = 0.0) -> list[Actor]:
@@ -126,8 +122,7 @@ class Finger:
     radius: float
 
 
-PALM: Final = (0.042, 0.014, 0.050)
-"""Semi-axes of the palm, whose middle is the origin [m]."""
+PALM: Final = (0.042, 0.014, 0.050)  # semi-axes of the palm, whose middle is the origin [m]
 FOREARM: Final = ((0.0, 0.0, -0.05), (0.0, 0.0, -0.30), 0.028)
 """Wrist and elbow, and half the thickness [m]."""
 FINGERS: Final = (
@@ -185,8 +180,7 @@ def _to_segment(places: Array, *ends: tuple[float, float]) -> Array:
     return np.asarray(np.linalg.norm(places - start - share[:, np.newaxis] * along, axis=1))
 
 
-_TOY: Final = 0.006
-"""Distance of the vertices of a toy [m]."""
+_TOY: Final = 0.006  # distance of the vertices of a toy [m]
 
 
 def toy(motion: Motion, *, body: float = 303.15, motor: float = 315.15) -> Actor:

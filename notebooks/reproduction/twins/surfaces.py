@@ -35,12 +35,9 @@ COFFEE_POT_PROFILE: Final[Profile] = (
 """Radius and height of the outer wall of a glass coffee pot, bottom to rim, drawn for this
 project after pots of some 1.2 l [m]."""
 
-_ROW: Final = np.sqrt(0.75)
-"""Distance of the rows of equilateral triangles, in their sides [1]."""
-_CORNER: Final = np.deg2rad(30.0)
-"""Angle of a profile's corners, which the mesh keeps [rad]."""
-_SAMPLES: Final = 400
-"""Points along a smooth profile before it is cut into rows."""
+_ROW: Final = np.sqrt(0.75)  # distance of the rows of equilateral triangles, in their sides [1]
+_CORNER: Final = np.deg2rad(30.0)  # angle of a profile's corners, which the mesh keeps [rad]
+_SAMPLES: Final = 400  # points along a smooth profile before it is cut into rows
 
 
 def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
