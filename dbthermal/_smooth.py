@@ -83,10 +83,8 @@ def subspace(
     if not steps:
         return Subspace(plain, plain, 0, plain[:, 1:])
     if order + len(steps) > len(plain):
-        raise ValueError(
-            f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames. "
-            "Must not be more functions than frames."
-        )
+        message = f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames"
+        raise ValueError(f"{message}. Must not be more functions than frames.")
     functions, object_part = _without_steps(plain[:, :1], steps, plain[:, 1:])
     return Subspace(functions, object_part, len(steps), functions[:, len(steps) + 1 :])
 

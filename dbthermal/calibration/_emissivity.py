@@ -64,9 +64,8 @@ class Bias:
         for name in ("contact", "stray"):
             least, largest = _numbers.real_numbers(name, getattr(self, name), shape=(2,))
             if not 0 <= least <= largest < 1:
-                raise ValueError(
-                    f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
-                )
+                rule = "Must be a range within [0, 1)"
+                raise ValueError(f"Invalid {name} ({least}, {largest}). {rule}.")
         _numbers.real_number("air_temperature [K]", self.air_temperature, _numbers.KELVIN)
 
     @property
@@ -306,9 +305,8 @@ def _readings(
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
         if not np.all(schema.measured(variable.values)):
-            raise ValueError(
-                f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-            )
+            message = f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}"
+            raise ValueError(f"{message}. Must be finite.")
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
     return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
 

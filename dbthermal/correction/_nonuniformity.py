@@ -208,9 +208,8 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     _require_rising(_checked(correction))
     schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
-        raise ValueError(
-            f"Invalid dims {flat.dims} of the flat image. Must be (band, y, x), bands by name."
-        )
+        rule = "Must be (band, y, x), bands by name"
+        raise ValueError(f"Invalid dims {flat.dims} of the flat image. {rule}.")
     flat = laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
     if not np.all(schema.measured(flat.values[good])):

@@ -159,9 +159,8 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
     if closed.dtype != bool:
         raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
     if closed.dims not in {("time",), ("band", "time")}:
-        raise ValueError(
-            f"Invalid dims {closed.dims} of the closed frames. Must be (time) or (band, time)."
-        )
+        rule = "Must be (time) or (band, time)"
+        raise ValueError(f"Invalid dims {closed.dims} of the closed frames. {rule}.")
     return np.broadcast_to(closed.values, shape)
 
 
@@ -266,10 +265,8 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
     after = first + events["frames"].values.astype(np.int64)
     wrong = np.flatnonzero((first < 0) | (after <= first) | (after > counts.sizes["time"]))
     if wrong.size:
-        raise ValueError(
-            f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}. Must lie in "
-            f"[0, {counts.sizes['time'] - 1}], not fall."
-        )
+        message = f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}"
+        raise ValueError(f"{message}. Must lie in [0, {counts.sizes['time'] - 1}], not fall.")
     if "start" in events:
         starts = events["start"].rename(event="time").assign_coords(time=events["start"].values)
         laid_on(starts, counts.isel(time=first), "the events", "the capture")

@@ -286,10 +286,8 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too
-        raise ValueError(
-            f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'. "
-            f"Must lie in [0, {correction.DETECTOR_MAXIMUM}]."
-        )
+        message = f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'"
+        raise ValueError(f"{message}. Must lie in [0, {correction.DETECTOR_MAXIMUM}].")
     return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
 
 

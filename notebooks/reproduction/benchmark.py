@@ -185,9 +185,9 @@ def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
         whole = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"]
         if not np.isfinite(call.frame_rate):
             whole = ["", ""]
-        times = (f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *whole)
         errors = (f"{call.rmse:.3f} K", f"{100 * call.cover:.1f} %")
-        yield (f"`{function}`", cameras, *times, *errors)
+        cost = (f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *whole)
+        yield (f"`{function}`", cameras, *cost, *errors)
 
 
 @lru_cache

@@ -76,10 +76,8 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         inner = wide.isel(y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
         return inner.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
 
-    views = (
-        part(seen.isel(band=[0]), top, left),
-        part(seen.isel(band=[1]), top + down, left + right),
-    )
+    first, second = (seen.isel(band=[band]) for band in (0, 1))
+    views = part(first, top, left), part(second, top + down, left + right)
     seen = xr.concat(views, "band", combine_attrs="override")
     truth = part(scene.isel(time=slice(0, _STEPS * count, _STEPS)), top, left)
     seen = disturbances.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")

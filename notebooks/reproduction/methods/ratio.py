@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from dbthermal import _smooth as smooth
 from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
