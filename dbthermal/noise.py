@@ -142,11 +142,8 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
     quiet = int(np.argmin(rough))
     further = [band for band in range(len(signals)) if band != quiet]
-    pairs = [estimate(signals[quiet], signals[band], time) for band in further]
-    result = np.empty(len(signals))
-    result[quiet] = np.median([pair[0] for pair in pairs])
-    result[further] = [pair[1] for pair in pairs]
-    return result
+    pairs = np.array([estimate(signals[quiet], signals[band], time) for band in further])
+    return np.insert(pairs[:, 1], quiet, np.median(pairs[:, 0]))
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:

@@ -184,5 +184,5 @@ def _dataset(scene: xr.Dataset, stds: dict[str, Array], maps: dict[str, Any]) ->
         dims = (*leading.get(name, ()), "y", "x")
         variables[name] = (dims, values.reshape(*values.shape[:-1], *image), {"units": "1"})
     coords = {name: scene[name] for name in ("band", "time", "y", "x") if name in scene.coords}
-    origin = {name: scene.attrs[name] for name in ("origin",) if name in scene.attrs}
+    origin = schema.origin(scene.attrs)
     return xr.Dataset(variables, {**coords, "quantity": list(QUANTITIES)}, origin)

@@ -154,11 +154,11 @@ def observe(
         clean = mixing.leaving(emissivity, emitted[index], reflected[index])
         noise = float(response["noise"].sel(band=name))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
-    twin = {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
+    attrs = {"origin": "simulated"}
+    attrs |= {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
     coords = {"band": names, **{name: scene[name] for name in ("time", "y", "x")}}
     variables = schema.variables("corrected", {"counts": movie})
-    result = xr.Dataset(variables, coords, {"origin": "simulated", **twin})
-    return schema.check(result, "corrected")
+    return schema.check(xr.Dataset(variables, coords, attrs), "corrected")
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dbthermal.figures import REASONS
-from dbthermal.figures._status import first_reason
+from dbthermal.figures._maps import first_reason
 from dbthermal.figures.drawing import (
     COLORS,
     band_label,
