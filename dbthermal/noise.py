@@ -101,9 +101,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
         )
-    if not all(np.all(schema.measured(signal)) for signal in (first, second)):
-        rule = "Must be finite"
-        raise ValueError(f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. {rule}.")
+    for signal in (first, second):
+        schema.require_measured(signal, "signal")
     # Remove the object: smooth functions, then second differences.
     functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]

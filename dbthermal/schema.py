@@ -376,6 +376,13 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
     return np.abs(values) < LARGEST
 
 
+def require_measured(values: npt.NDArray[Any], label: str) -> None:
+    """Refuse samples that are no numbers, see `measured`."""
+    if not np.all(measured(values)):
+        message = f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}"
+        raise ValueError(f"{message}. Must be finite.")
+
+
 def check(
     dataset: xr.Dataset, stage: str, names: Sequence[str] = (), label: str = ""
 ) -> xr.Dataset:
@@ -417,10 +424,8 @@ def check(
     optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
     for name in names or (*STAGES[stage], *optional):
         if name not in dataset:
-            fitting = [
-                stage_name for stage_name in STAGES if STAGES[stage_name].keys() <= set(dataset)
-            ]
-            nearest = max(fitting, key=lambda stage_name: len(STAGES[stage_name]), default="")
+            fitting = [key for key in STAGES if STAGES[key].keys() <= set(dataset)]
+            nearest = max(fitting, key=lambda key: len(STAGES[key]), default="")
             present = f"{sorted(map(str, dataset))}" + (f", as has a {nearest}" if nearest else "")
             raise ValueError(f"Missing variable '{name}' in {label}: {present}. Must be there.")
         variable = STAGES[stage].get(name) or OPTIONAL[stage][name]
@@ -496,11 +501,8 @@ def band_values(
 
 def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Variables of a Dataset of a stage, with the dims and attributes of their definitions."""
-    documented = {**STAGES[stage], **OPTIONAL.get(stage, {})}
-    return {
-        name: (documented[name].dims, value, documented[name].attrs)
-        for name, value in values.items()
-    }
+    known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
+    return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
 
 
 def _require(data: object, kind: type, label: str) -> None:

@@ -6,7 +6,7 @@ some of them common to all measurements.
 """
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -304,9 +304,7 @@ def _readings(
     """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
-        if not np.all(schema.measured(variable.values)):
-            message = f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}"
-            raise ValueError(f"{message}. Must be finite.")
+        schema.require_measured(variable.values, str(name))
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
     return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
 
@@ -316,12 +314,10 @@ def _bands(
 ) -> list[tuple[Curve, float, Array]]:
     """Response, noise and counts (measurement) of each band."""
     names = [str(name) for name in measured["band"].values]
-    noises, bands = responses.noise(response, names), []
-    curves = responses.curves(response, names)
-    for curve, noise, counts in zip(curves, noises, measured["counts"].values, strict=True):
+    noises, curves = responses.noise(response, names).tolist(), responses.curves(response, names)
+    for curve in curves:
         require_range(warm, curve, "object temperature")
-        bands.append((curve, float(noise), counts.astype(np.float64)))
-    return bands
+    return list(zip(curves, noises, measured["counts"].values.astype(np.float64), strict=True))
 
 
 def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
@@ -338,12 +334,10 @@ def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
     """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
     fits = [_fit_band(band, name) for name, band in signals.items()]
     *values, residual = (np.array(column) for column in zip(*fits, strict=True))
-    names = ("emissivity", "emissivity_std", "reduced_chi2")
-    variables = {
-        name: ("band", value, {"units": "1"}) for name, value in zip(names, values, strict=True)
-    }
-    residuals = (("band", "measurement"), residual, {"units": "count"})
-    return xr.Dataset({**variables, "residual": residuals}, {"band": list(signals)})
+    pairs = zip(("emissivity", "emissivity_std", "reduced_chi2"), values, strict=True)
+    variables: dict[str, Any] = {name: ("band", value, {"units": "1"}) for name, value in pairs}
+    variables["residual"] = (("band", "measurement"), residual, {"units": "count"})
+    return xr.Dataset(variables, {"band": list(signals)})
 
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:

@@ -199,9 +199,7 @@ def _check_signal(signal: xr.DataArray) -> None:
     if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
         rule = "Must be (band, time, y, x) of two bands"
         raise ValueError(f"Invalid signal {dict(signal.sizes)}. {rule}.")
-    if not np.all(schema.measured(signal.values)):
-        rule = "Must be finite"
-        raise ValueError(f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. {rule}.")
+    schema.require_measured(signal.values, "signal")
 
 
 def _frame_weight(signal: xr.DataArray) -> Array:
