@@ -28,7 +28,7 @@ import xarray as xr
 
 from dbthermal import alignment, separation, simulation, store
 from reproduction import methods as outside
-from reproduction import paths, verify
+from reproduction import numbers, paths, verify
 from reproduction.experiments import cases
 from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.pictures import Picture, smooth_shift
@@ -295,18 +295,12 @@ Bands: of {pixels} pixels, over the time of two.
 """
 
 
-def rows(*cells: Sequence[str]) -> str:
-    """Table in Markdown of a head and rows."""
-    head, *rest = [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
-
-
 def default_figures(calls: Calls, busy: float) -> str:
     """Figures of the default call, in Markdown."""
     height, width = SHAPE
     size = {"rows": height, "columns": width, "frames": FRAMES}
-    table = rows(*default_rows(calls))
-    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=table)
+    rows = numbers.table(default_rows(calls))
+    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=rows)
 
 
 def table(default: str, times: Times, busy: float) -> str:
@@ -330,7 +324,7 @@ def methods(times: Times) -> str:
         size, span = str(max(of_pixels[method])), " to ".join(map(str, ends))
         of_pixel = (f"{1e6 * seconds:.0f}", f"{seconds / cost['subspace']:.2g}", size)
         lines.append((f"`{method}`", *of_pixel, samples, span, more))
-    return rows(*lines)
+    return numbers.table(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 """Disturbances of real cameras, added one by one to a perfect capture, each with its truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -8,7 +8,6 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import Array
 from dbthermal.correction._temporal import lag_coefficients
 from dbthermal.simulation import observe
 
@@ -52,15 +51,20 @@ def expose(
             f"and lie in [0, {last}], the steps of the scene."
         )
     stamps = scene["time"].values[steps]
-    bands_exposed = [
-        observe(scene.isel(time=row), response.isel(band=[place]), rng).assign_coords(
-            time=("time", stamps[0], scene["time"].attrs)
-        )
-        for place, row in enumerate(steps)
-    ]
-    together = xr.concat(bands_exposed, dim="band", combine_attrs="override")
+    clock = ("time", stamps[0], scene["time"].attrs)
+    views = [scene.isel(time=row).assign_coords(time=clock) for row in steps]
+    together = by_cameras(views, response, rng)
     exposed = schema.variables("corrected", {"exposure_time": stamps})
     return schema.check(together.assign(exposed), "corrected")
+
+
+def by_cameras(
+    views: Iterable[xr.Dataset], response: xr.Dataset, rng: np.random.Generator
+) -> xr.Dataset:
+    """Capture, as of `observe`, of a scene for each band of a response: what its camera sees."""
+    pairs = enumerate(views)
+    parts = [observe(view, response.isel(band=[band]), rng) for band, view in pairs]
+    return xr.concat(parts, "band", combine_attrs="override")
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
@@ -146,7 +150,11 @@ def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) 
             case "noisy":
                 signal += rng.normal(0.0, _NOISE, frames).astype(signal.dtype)
             case "blinking":
-                signal += (_STEP * _telegraph(time, _DWELL, rng)).astype(signal.dtype)
+                # Random telegraph signal of 0 and 1 with a mean dwell time and at least a step.
+                chance, level = -np.expm1(-np.diff(time) / _DWELL), np.zeros(time.size)
+                steps = np.flatnonzero(rng.random(chance.size) < chance)
+                level[1 + (steps if steps.size else rng.integers(0, chance.size, 1))] = 1.0
+                signal += (_STEP * (np.cumsum(level) % 2)).astype(signal.dtype)
             case "stuck":
                 signal[:] = signal[0]
     numbers = np.arange(len(SPOILED), dtype=np.int8)
@@ -188,14 +196,3 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 def _floating(corrected: xr.Dataset) -> xr.DataArray:
     """Floating copy of the counts of a capture."""
     return schema.check_corrected(corrected)["counts"].copy(deep=True)
-
-
-def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
-    """Random telegraph signal (time) of 0 and 1 with a mean dwell time [s] and at least a step."""
-    chance = -np.expm1(-np.diff(time) / dwell)
-    steps = np.flatnonzero(rng.random(chance.size) < chance)
-    if steps.size == 0:
-        steps = rng.integers(0, chance.size, 1)
-    level = np.zeros(time.size)
-    level[steps + 1] = 1.0
-    return np.asarray(np.cumsum(level) % 2)

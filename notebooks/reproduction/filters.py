@@ -26,7 +26,9 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     >>> numbers.sel(material=["plate window glass", "water"]).values.round(1).tolist()
     [9.4, 649.2]
     """
-    values = _emissivities(table)
+    values = schema.check(table, "emissivity_table")["emissivity"]
+    tabulated = values.values[~np.isnan(values.values)]  # averages of measured spectra may exceed 1
+    _numbers.real_numbers("emissivity of the table", tabulated, within=schema.EMISSIVITY_LIMITS)
     names = values["band"].values
     if len(names) < 2:
         raise ValueError(f"Invalid bands {names.tolist()} of the table. Must be at least two.")
@@ -147,11 +149,3 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, camera_band: str) 
         name="object_temperature_std",
         attrs={"units": "K", "long_name": "standard deviation of the object temperature"},
     )
-
-
-def _emissivities(table: xr.Dataset) -> xr.DataArray:
-    """Checked emissivity (material, band) of a table; averages of measured spectra may exceed 1."""
-    values = schema.check(table, "emissivity_table")["emissivity"]
-    tabulated = values.values[~np.isnan(values.values)]
-    _numbers.real_numbers("emissivity of the table", tabulated, within=schema.EMISSIVITY_LIMITS)
-    return values

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,17 @@ def read(path: str | Path) -> dict[str, Number]:
     if content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
     return dict(content["numbers"])
+
+
+def table(rows: Iterable[Sequence[str]]) -> str:
+    """Table in Markdown, the first row as its head."""
+    head, *lines = rows
+    rule = "|---" * len(head) + "|"
+    return "\n".join([_row(head), rule, *map(_row, lines)])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _digest(content: Mapping[str, Any]) -> str:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Final
 
+from reproduction.numbers import table
+
 _OBJECTS: Final = ("chrome ball", "aluminium cup", "blue paint", "glass jar", "wineglass")
 
 EMISSIVITIES: Final = {
@@ -135,8 +137,7 @@ def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
 
 def markdown(numbers: Numbers) -> str:
     """Comparison as a table in Markdown."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS), *compare(numbers)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return table([COLUMNS, *compare(numbers)]) + "\n"
 
 
 def rows() -> tuple[Row, ...]:

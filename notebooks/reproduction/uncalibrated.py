@@ -269,7 +269,10 @@ def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArra
     # Between whole pixels by a parabola, unless the largest lies at the end of the search.
     if np.any(place == 0) or np.any(place == np.array(scores.shape) - 1):
         return _displacement(np.full(2, np.nan)).assign_attrs(attrs)
-    peak = place - REACH + np.array([_parabola(scores, place, axis) for axis in (0, 1)])
+    peak = (place - REACH).astype(np.float64)
+    for axis, step in enumerate(np.eye(2, dtype=int)):
+        below, here, above = (scores[tuple(place + k * step)] for k in (-1, 0, 1))
+        peak[axis] += 0.5 * (below - above) / (below - 2 * here + above)
     return _displacement(peak).assign_attrs(attrs)
 
 
@@ -300,13 +303,6 @@ def _correlations(first: Movie, second: Movie, inside: Mask) -> Array:
     energy = lagged(np.sum(first**2, axis=0), mask) * lagged(mask, np.sum(second**2, axis=0))
     found = (shared >= _SHARED * mask.sum()) & (energy > 0)
     return np.where(found, cross / np.sqrt(np.where(found, energy, 1.0)), -1.0)
-
-
-def _parabola(scores: Array, place: npt.NDArray[np.intp], axis: int) -> float:
-    """Place of the extreme of the parabola through three neighbours, from the middle one."""
-    step = np.eye(2, dtype=int)[axis]
-    below, here, above = (scores[tuple(place + k * step)] for k in (-1, 0, 1))
-    return float(0.5 * (below - above) / (below - 2 * here + above))
 
 
 def moved(movie: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:

@@ -18,7 +18,7 @@ import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from dbthermal._arrays import Array
-from reproduction import metrics, palettes, uncalibrated
+from reproduction import metrics, numbers, palettes, uncalibrated
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
@@ -232,36 +232,29 @@ def compare_all(
 
 def report(compared: Mapping[str, Comparison]) -> str:
     """Tables in Markdown of the displacements and of the agreement, a row a scene and way."""
-    lines = [
-        "Published videos, not radiometric. Displacements: the second band shows at p the first's",
-        "p + d, to the right.",
-        "",
-        "| scene | still edges [pixel] | reflections [pixel] | their correlation, at 0 |",
-        "|---|--:|--:|--:|",
-    ]
-    for name, one in compared.items():
-        both = " | ".join(
-            f"{float(part.sel(axis='x')):.2f}" for part in (one.edges, one.reflections)
-        )
-        peak, at_0 = (one.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
-        lines.append(f"| {name} | {both} | {peak:.2f}, {at_0:.2f} |")
     columns = [f"{kind}, {where}" for kind in KINDS for where in ("object", "moving")]
-    lines += [
-        "",
-        "Correlation of the reflection's map with the authors', median of the frames.",
-        "",
-    ]
-    lines += [f"| scene | way | {' | '.join(columns)} |", "|---|---|" + "--:|" * len(columns)]
-    for name, one in compared.items():
+    heads = ("scene", "still edges [pixel]", "reflections [pixel]", "their correlation, at 0")
+    shifts, rows, notes = [heads], [("scene", "way", *columns)], []
+    for name, found in compared.items():
+        both = [f"{float(part.sel(axis='x')):.2f}" for part in (found.edges, found.reflections)]
+        peak, at_0 = (found.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
+        shifts.append((name, both[0], both[1], f"{peak:.2f}, {at_0:.2f}"))
         for way in WAYS:
-            cells = [f"{value:.3f}" for value in one.table.sel(way=way).values.ravel()]
-            lines.append(f"| {name} | {way} | {' | '.join(cells)} |")
-        undone = one.undone.attrs["scale_undone"] or "no band"
-        shares = ", ".join(f"{share:.2f}" for share in one.undone.attrs["scale_explained"])
+            scores = found.table.sel(way=way).values.ravel()
+            rows.append((name, way, *(f"{score:.3f}" for score in scores)))
+        undone = found.undone.attrs["scale_undone"] or "no band"
+        shares = ", ".join(f"{share:.2f}" for share in found.undone.attrs["scale_explained"])
         note = f"{name}: scale undone in {undone}; it explains {shares} of the surroundings' change"
-        reasons = "".join(f"; {way} left out: {why}" for way, why in one.left_out.items())
-        lines.append(f"| {note}{reasons} |" + " |" * (len(columns) + 1))
-    return "\n".join(lines) + "\n"
+        reasons = "".join(f"; {way} left out: {why}" for way, why in found.left_out.items())
+        notes.append(f"- {note}{reasons}")
+    parts = (
+        "Published videos, not radiometric. The second band shows at p the first's p + d, [pixel].",
+        numbers.table(shifts),
+        "Correlation of the reflection's map with the authors', median of the frames.",
+        numbers.table(rows),
+        "\n".join(notes),
+    )
+    return "\n\n".join(parts) + "\n"
 
 
 def _file(files: Mapping[str, Path], name: str) -> Path:

@@ -16,6 +16,7 @@ from dbthermal._arrays import Array
 from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.simulation import Background, Rig
 from reproduction import disturbances
+from reproduction.cache import gridded
 
 Case = Mapping[str, Any]
 
@@ -51,6 +52,13 @@ class Jump:
         if self.duration == 0:
             return np.where(elapsed >= 0, self.height, 0.0)
         return np.asarray(self.height * np.interp(elapsed / self.duration, [0.0, 1.0], [0.0, 1.0]))
+
+
+def scalars(**values: xr.DataArray | float) -> xr.Dataset:
+    """Numbers by name, in [1] but for an error of the object temperature [K]."""
+    units = {"object_temperature_rmse": "K"}
+    scores = {name: ((), float(it), {"units": units.get(name, "1")}) for name, it in values.items()}
+    return xr.Dataset(scores)
 
 
 def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
@@ -189,7 +197,7 @@ def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: 
         scatter = efficiency(scene, result, (first, second), _ORDER)
         rows.append(score(scene, result).assign(efficiency=scatter))
         names.append(str(case["case"]))
-    together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
+    together = gridded(rows, {"case": names})
     return together.assign_attrs(origin="simulated", pixels=pixels, seed=seed)
 
 

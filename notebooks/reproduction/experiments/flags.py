@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from dbthermal import correction, separation, simulation
 from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status
-from reproduction import disturbances
+from reproduction import disturbances, numbers
 from reproduction.experiments import cases, limits
 from reproduction.experiments.pictures import Picture, smooth_shift
 
@@ -84,15 +84,14 @@ def rates(
 def table(rates: xr.Dataset) -> str:
     """Table in Markdown of the `rates` [%] of the flags that should have come somewhere."""
     heads = ("false alarms", "not flagged by it", "by no flag", "by no flag, and wrong")
-    columns = ("false_alarms", *_SHARES)
-    lines = [f"| flag | pixels | {' | '.join(heads)} |", f"| --- |{' --: |' * (len(heads) + 1)}"]
+    rows: list[tuple[str, ...]] = [("flag", "pixels", *heads)]
     for name in rates["flag"].values:
         row = rates.sel(flag=name)
         if row["pixels"] > 0 or name == "any":
-            shown = [100.0 * float(row[column]) for column in columns]
-            cells = ["" if np.isnan(one) else f"{one:.2f} %" for one in shown]
-            lines.append(f"| `{name}` | {int(row['pixels'])} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            shown = [100.0 * float(row[column]) for column in ("false_alarms", *_SHARES)]
+            cells = ["" if np.isnan(share) else f"{share:.2f} %" for share in shown]
+            rows.append((f"`{name}`", str(int(row["pixels"])), *cells))
+    return numbers.table(rows) + "\n"
 
 
 def _solved(

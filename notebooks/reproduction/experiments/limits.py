@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from dbthermal import alignment, limits, separation
 from dbthermal.simulation import Rig
+from reproduction.cache import gridded
 from reproduction.experiments import cases
 
 KNOWING: Final = ("nothing", "slope", "rest")
@@ -76,10 +77,8 @@ def near_bound(
     slope = limits.bounds(
         truth, _as_line(response, rig), resting=False, response_kind="linear"
     ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
-    told = xr.concat(
-        [part[list(_BOUNDED.values())] for part in (free, slope, limits.bounds(truth, response))],
-        xr.DataArray(list(KNOWING), dims="knowing", name="knowing"),
-    )
+    bounds = [part[[*_BOUNDED.values()]] for part in (free, slope, limits.bounds(truth, response))]
+    told = gridded(bounds, {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     measured = {
@@ -150,7 +149,7 @@ def pooled(
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
         parts.append(_of_groups(size, truth, result, ratio))
         parts[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
-    groups = xr.concat(parts, xr.DataArray(list(sizes), dims="size", name="size"))
+    groups = gridded(parts, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
 
@@ -222,13 +221,7 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
     sides = [set(np.unique(part[part >= 0])) for part in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
-    units = {"units": "1"}
-    return xr.Dataset(
-        {
-            "right": ((), right / sum(part.size for part in inner), units),
-            "bleeding": ((), bleeding, units),
-        }
-    )
+    return cases.scalars(right=right / sum(part.size for part in inner), bleeding=bleeding)
 
 
 def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:
@@ -292,7 +285,11 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
         - `status` (pixel), and `bad` (kind, pixel), true where bad.
     """
     statistics = _coverage(truth, result)
-    bad, flagged = _bad(truth, result), _flat(result["status"] != 0)
+    # Pixels (kind, pixel) with an error beyond four standard deviations.
+    of_object, of_emissivity = _beyond(truth, result, FAR)
+    beyond = [_flat(of_object), _flat(of_object | of_emissivity)]
+    bad = xr.concat(beyond, xr.DataArray(list(KINDS), dims="kind", name="kind"))
+    flagged = _flat(result["status"] != 0)
     statistics |= {
         "flagged": flagged.mean(),
         "width": _width(truth, result),
@@ -357,10 +354,3 @@ def _beyond(truth: xr.Dataset, result: xr.Dataset, far: float) -> tuple[xr.DataA
     of_object = squared.mean("time") > far**2 * allowed.mean("time")
     apart = abs(result["emissivity"] - truth["emissivity"])
     return of_object, (apart > far * result["emissivity_std"]).any("band")
-
-
-def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
-    """Pixels (kind, pixel) with an error beyond four standard deviations."""
-    of_object, of_emissivity = _beyond(truth, result, FAR)
-    label = xr.DataArray(list(KINDS), dims="kind", name="kind")
-    return xr.concat([_flat(of_object), _flat(of_object | of_emissivity)], label)

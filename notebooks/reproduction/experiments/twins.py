@@ -12,7 +12,7 @@ from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
-from reproduction.experiments.cases import held, rmse
+from reproduction.experiments.cases import held, rmse, scalars
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
 from reproduction.metrics import relative_error_celsius
 from reproduction.twins.stage import Registration
@@ -87,7 +87,10 @@ def judge_twin(
                 picture = _with_truth(result, scene, corrected, response)
         image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))
         image = image.reindex(way=["alone", "pooled", "completed"])
-        both = {**image.data_vars, "resting": _resting(scene), "emissivity_difference": away}
+        # Share of the pixels with a moving background whose object rests.
+        moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
+        resting = ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
+        both = {**image.data_vars, "resting": resting, "emissivity_difference": away}
         parts.append(read.assign_coords(way=image["way"]).assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
     return xr.concat(parts, label, join="outer", combine_attrs="override"), picture
@@ -140,12 +143,6 @@ def _moving(scene: xr.Dataset) -> xr.DataArray:
     return (scene["background_temperature"].std("time") > MOVING) & scene["on_object"]
 
 
-def _resting(scene: xr.Dataset) -> xr.DataArray:
-    """Share of the pixels with a moving background whose object rests [1]."""
-    moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
-    return ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
-
-
 def over_the_image(
     scene: xr.Dataset, separated: xr.Dataset, *, completed: bool = False
 ) -> xr.Dataset:
@@ -158,12 +155,11 @@ def over_the_image(
     moving, status = _moving(scene), separated["status"]
     good = moving & ((status & int(COMPLETED)) != 0 if completed else status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
-    values = {
-        "good": (good.sum() / moving.sum(), "1"),
-        "object_temperature_rmse": (rmse(error), "K"),
-        "covered": (held(error, separated["object_temperature_std"]), "1"),
-    }
-    return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
+    return scalars(
+        good=good.sum() / moving.sum(),
+        object_temperature_rmse=rmse(error),
+        covered=held(error, separated["object_temperature_std"]),
+    )
 
 
 def on_bench(response: xr.Dataset, material: str, rng: np.random.Generator) -> xr.Dataset:

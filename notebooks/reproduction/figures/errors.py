@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -122,17 +121,13 @@ def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
         share = 100 * mask.mean(axis=1)
         if share.any() or color in {_RIGHT, _WRONG}:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
-        if color == _WRONG:
-            _count(axis, share)
+        for row in (
+            np.flatnonzero(share).tolist() if color == _WRONG else ()
+        ):  # some are too small to see
+            text = f"{percent(share[row] / 100)} wrong"
+            axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
         reached += share
     axis.set(xlim=(0, 100), xlabel="share of the pixels [%]")
-
-
-def _count(axis: Axes, share: npt.NDArray[np.float64]) -> None:
-    """Shares of wrong pixels [%] as numbers at the end of the bars; some are too small to see."""
-    for row in np.flatnonzero(share).tolist():
-        text = f"{percent(share[row] / 100)} wrong"
-        axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
 
 
 def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:

@@ -133,19 +133,6 @@ def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
         return _report(tile, search, kept, lost, lost | ~converged[kept])
 
 
-def _even(time: Array) -> float:
-    """Interval of an even clock [s]."""
-    steps = np.diff(time)
-    interval = float(np.median(steps))
-    worst = int(np.argmax(np.abs(steps - interval)))
-    if abs(steps[worst] - interval) > _UNEVEN * interval:
-        raise ValueError(
-            f"Invalid interval {steps[worst]:.3g} s of 'time' after {time[worst]:.6g} s for method "
-            f"'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
-        )
-    return interval
-
-
 def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
     """Overwrite a start with the subspace separator's solution, where it is complete."""
     solution = subspace.separate(tile, subspace.SubspaceSettings())
@@ -182,7 +169,16 @@ class Search:
         self.films = np.zeros((columns, 3, frames))
         self.films[:, 0] = smooth.T
         values = {name: float(getattr(settings, name)) for name in objective.Weights._fields}
-        values["curvature"] *= _even(tile.time) ** 2
+        steps = np.diff(tile.time)
+        interval = float(np.median(steps))
+        worst = int(np.argmax(np.abs(steps - interval)))
+        if abs(steps[worst] - interval) > _UNEVEN * interval:
+            raise ValueError(
+                f"Invalid interval {steps[worst]:.3g} s of 'time' after {tile.time[worst]:.6g} s "
+                f"for method 'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is "
+                "of even frames."
+            )
+        values["curvature"] *= interval**2
         self.weights = objective.Weights(**values)
 
     def run(self) -> tuple[Array, Mask]:

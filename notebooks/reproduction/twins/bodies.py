@@ -199,7 +199,9 @@ FLIGHT: Final = ((-0.40, -0.35, 0.30), (0.40, -0.05, 0.45))
 
 def _toys(time: Array, rng: np.random.Generator) -> list[Actor]:
     """A car that runs to and fro on the table, and a toy that a hand flies about above it."""
-    flight = _flown(time, rng)
+    steps = rng.uniform(0.6, 1.8, 2 + int((time[-1] - time[0]) / 0.6))
+    times = time[0] + np.concatenate([[0.0], np.cumsum(steps)])
+    flight = gliding(times, rng.uniform(*FLIGHT, (times.size, 3)))
     hold = Pose(Rotation.from_euler("x", 180.0, degrees=True), (0.0, 0.03, 0.16))
     return [
         toy(_to_and_fro(time, rng)),
@@ -216,12 +218,6 @@ def _to_and_fro(time: Array, rng: np.random.Generator) -> Motion:
         times += [start, start + 2.0 * LANE_HALF / rng.uniform(0.25, 0.6)]
         places += [places[-1], (side * LANE_HALF, LANE, 0.0)]
     return gliding(times, places)
-
-
-def _flown(time: Array, rng: np.random.Generator) -> Motion:
-    steps = rng.uniform(0.6, 1.8, 2 + int((time[-1] - time[0]) / 0.6))
-    times = time[0] + np.concatenate([[0.0], np.cumsum(steps)])
-    return gliding(times, rng.uniform(*FLIGHT, (times.size, 3)))
 
 
 RABBIT: Final = (

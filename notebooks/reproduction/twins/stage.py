@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from dbthermal import alignment, schema, simulation
 from dbthermal._arrays import Array
 from reproduction import heat
+from reproduction.disturbances import by_cameras
 from reproduction.twins.people import pacing, person
 from reproduction.twins.rays import Camera, Caster, unit
 from reproduction.twins.surroundings import Actor, incident, painted
@@ -314,9 +315,7 @@ def observe(scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator) -
         return simulation.observe(scene, response, rng)
     names = ("object_temperature", "background_temperature")
     second = scene.assign({name: scene[f"second_{name}"] for name in names})
-    pairs = enumerate((scene, second))
-    views = [simulation.observe(view, response.isel(band=[band]), rng) for band, view in pairs]
-    return xr.concat(views, "band", combine_attrs="override")
+    return by_cameras((scene, second), response, rng)
 
 
 def registered(
