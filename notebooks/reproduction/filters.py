@@ -60,17 +60,13 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     schema.check_variable(numbers, _NUMBERS, "the condition numbers")
     finite = numbers.copy(data=np.isfinite(numbers.values))
     mean = numbers.where(finite).mean("material").fillna(np.inf)
+    median, count = numbers.median("material", skipna=False), finite.sum("material")
     statistics = {
-        "median": (numbers.median("material", skipna=False), "condition number, median"),
-        "mean": (mean, "its finite mean"),
-        "finite": (finite.sum("material"), "materials with a finite condition number"),
+        "median": median.assign_attrs(long_name="condition number, median"),
+        "mean": mean.assign_attrs(long_name="its finite mean"),
+        "finite": count.assign_attrs(long_name="materials with a finite condition number"),
     }
-    return xr.Dataset(
-        {
-            name: values.assign_attrs(units="1", long_name=meaning)
-            for name, (values, meaning) in statistics.items()
-        }
-    )
+    return xr.Dataset({name: it.assign_attrs(units="1") for name, it in statistics.items()})
 
 
 def rank_filters(

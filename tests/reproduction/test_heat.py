@@ -173,7 +173,7 @@ def test_stiff_step_is_damped() -> None:
 
 def test_heat_is_kept() -> None:
     """Conduction conserves heat and spreads a step between its extremes; a flux is kept as well."""
-    glass = surfaces.wineglass(0.004)
+    glass = surfaces.vessel(surfaces.WINEGLASS_PROFILE, 0.004)
     body, first = shell(glass), AMBIENT + 40.0 * (glass.vertices[:, 2] > 0.1)
     spread = heat.simulate(body, [0.0, 0.01, 0.1, 1.0, 10.0, 60.0], first, step=10.0)
     np.testing.assert_allclose(spread @ body.capacity, first @ body.capacity, rtol=1e-12)

@@ -7,7 +7,6 @@ thermometers of `Bench` err, its samples are heated. Everything here is simulate
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -32,7 +31,6 @@ Places = Mapping[str, tuple[slice, slice]]
 _TRUTH: Final = "truth_"
 
 
-@dataclass(frozen=True)
 class Views:
     """Views of the cameras of a simulated rig.
 
@@ -40,16 +38,9 @@ class Views:
     recording has its own: that of a calibration would else cancel against the scene's.
     """
 
-    rig: Rig
-    detector: xr.Dataset
-    seed: int
-    response: xr.Dataset = field(init=False)
-    _noise: np.random.SeedSequence = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Compute the rig's response, once."""
-        object.__setattr__(self, "response", self.rig.response())
-        object.__setattr__(self, "_noise", np.random.SeedSequence(self.seed))
+    def __init__(self, rig: Rig, detector: xr.Dataset, seed: int) -> None:
+        self.rig, self.detector, self.response = rig, detector, rig.response()
+        self._noise = np.random.SeedSequence(seed)
 
     def blackbody(self, world: World) -> dict[str, Picture]:
         """Frames, by band, of the world's blackbody, which fills the view."""

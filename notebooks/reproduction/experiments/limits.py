@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt
 
@@ -28,10 +27,7 @@ BEFOREHAND: Final = 0.29
 BORDER: Final = 2.0
 """Distance from a border of two materials within which no label is judged [pixel]."""
 
-_BOUNDED: Final = {
-    "reflection_ratio": "reflection_ratio_std",
-    "object_temperature": "object_temperature_std",
-}
+_BOUNDED: Final = ("reflection_ratio", "object_temperature")
 _UNITS: Final = {"object_temperature": "K"}
 
 
@@ -70,15 +66,15 @@ def near_bound(
     """
     rig = Rig(bands=tuple(bands), noise=tuple(noise))
     case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
-    truth, result = cases.run_case(case, rig, _times(clock), pixels, seed)
+    truth, result = cases.run_case(case, rig, np.arange(int(clock[0])) / clock[1], pixels, seed)
     known = result["object_temperature"].notnull().all("time")
     response = rig.response()
     free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
     slope = limits.bounds(
         truth, _as_line(response, rig), resting=False, response_kind="linear"
     ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
-    bounds = [part[[*_BOUNDED.values()]] for part in (free, slope, limits.bounds(truth, response))]
-    told = gridded(bounds, {"knowing": KNOWING})
+    names, kinds = [f"{it}_std" for it in _BOUNDED], (free, slope, limits.bounds(truth, response))
+    told = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     measured = {
@@ -139,7 +135,8 @@ def pooled(
     if uneven:
         raise ValueError(f"Invalid size {uneven[0]} of a group. Must divide the {pixels} pixels.")
     rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
-    truth, capture, response = cases.simulate(case, rig, _times(clock), pixels, seed)
+    time = np.arange(int(clock[0])) / clock[1]
+    truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
     linear = _as_line(response, rig)
     bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
@@ -184,7 +181,7 @@ def stressed(
     Aligned, the bands are first brought onto one clock by `alignment.align`; `frames_lost` [1] is
     the number of frames that this leaves empty in a band.
     """
-    rig, time = Rig(), _times(clock)
+    rig, time = Rig(), np.arange(int(clock[0])) / clock[1]
     if not aligned:
         judged = judge(*cases.run_case(case, rig, time, pixels, seed))
         return judged.assign(frames_lost=((), 0, {"units": "1"}))
@@ -222,11 +219,6 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     sides = [set(np.unique(part[part >= 0])) for part in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
     return cases.scalars(right=right / sum(part.size for part in inner), bleeding=bleeding)
-
-
-def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:
-    """Times [s] of a clock: number of frames, and their rate [Hz]."""
-    return np.arange(int(clock[0])) / clock[1]
 
 
 def _as_line(response: xr.Dataset, rig: Rig) -> xr.Dataset:

@@ -204,7 +204,7 @@ def trial(emissivity: float, noise: float) -> Figure:
     reading = responses.apparent_temperature(rig.response(), capture["counts"])[0, :, 0, 0]
     figure.axes[0].plot(time, reading - zero_Celsius, color="0.6", linewidth=0.6, zorder=0)
     first = result.isel(y=0, x=0)
-    flags = [name for name, bit in schema.Status.bits().items() if int(first["status"]) & bit]
+    flags = [bit.label for bit in schema.Status if int(first["status"]) & bit]
     found = f"{float(first['emissivity'][0]):.3f} +- {float(first['emissivity_std'][0]):.3f}"
     text = f"emissivity {emissivity:.2f}, estimated {found}; flags: {', '.join(flags) or 'none'}"
     figure.axes[0].set_title(text, fontsize=8)

@@ -68,15 +68,13 @@ def reflector_sensitivity(
     """
     true = _true(response, repeats)
     benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]
-    mean = [
-        [
-            np.mean([_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)], axis=0)
-            for bench in benches
-        ]
+    runs = [
+        [[_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)] for bench in benches]
         for it in OBJECTS
     ]
+    mean = np.mean(runs, axis=2)
     return xr.Dataset(
-        {"true": true, "mean": (("object", "excess", "band"), np.array(mean), {"units": "1"})},
+        {"true": true, "mean": (("object", "excess", "band"), mean, {"units": "1"})},
         coords={"excess": ("excess", [float(excess) for excess in excesses], {"units": "K"})},
         attrs={"origin": "simulated twin", "repeats": repeats},
     )

@@ -1,6 +1,6 @@
 """Figures of errors: accuracy and error bars, pixels to trust, limits, disturbances, flags."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -169,9 +169,7 @@ def offsets(measured: xr.Dataset) -> Figure:
     _lines(right, 100 * measured["flagged"], "delay")
     _kelvin(middle)
     right.set(ylabel="flagged [%]", ylim=(-3, 103))
-    for axis in (left, middle, right):
-        axis.set(xlabel="offset of the second band [frame]")
-        axis.grid(visible=True, color="0.9")
+    _over((left, middle, right), "offset of the second band [frame]")
     middle.legend(frameon=False, fontsize=8)
     figure.suptitle("Bands exposed apart" + provenance_note(measured))
     return figure
@@ -214,9 +212,7 @@ def parallax(measured: xr.Dataset) -> Figure:
     middle.set(ylabel="flagged [%]", ylim=(-3, 103))
     right.axhspan(92, 98, color=COLORS[2], alpha=0.3, linewidth=0)
     right.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
-    for axis in (left, middle, right):
-        axis.set(xlabel="parallax of the reflection [pixel]")
-        axis.grid(visible=True, color="0.9")
+    _over((left, middle, right), "parallax of the reflection [pixel]")
     left.legend(frameon=False, fontsize=8)
     figure.suptitle("Two cameras side by side" + provenance_note(measured))
     return figure
@@ -228,6 +224,13 @@ def _lines(axis: Axes, values: xr.DataArray, over: str) -> None:
         line, thin = values.sel(treatment=treatment), max(0, 2 - index)
         style = marked_line(index) | {"linewidth": 1.2 + 1.6 * thin, "markersize": 4.0 + 2.5 * thin}
         axis.plot(values[over], line, label=treatment, **style)
+
+
+def _over(axes: Iterable[Axes], label: str) -> None:
+    """Label and grid of axes over one quantity."""
+    for axis in axes:
+        axis.set(xlabel=label)
+        axis.grid(visible=True, color="0.9")
 
 
 def _kelvin(axis: Axes) -> None:

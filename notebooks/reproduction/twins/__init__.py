@@ -6,13 +6,14 @@ project's own; known of the originals are their names and two thermocouple readi
 """
 
 from collections.abc import Callable
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from reproduction.twins.bodies import bunny, coffee_pot, wineglass
+from reproduction.twins.bodies import COFFEE_POT, WINEGLASS, bunny, filled
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
 from reproduction.twins.stage import (
     Capture,
@@ -36,8 +37,8 @@ __all__ = [
 
 TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
     {
-        "wineglass": wineglass,
-        "coffee_pot": coffee_pot,
+        "wineglass": partial(filled, vessel=WINEGLASS),
+        "coffee_pot": partial(filled, vessel=COFFEE_POT),
         "glass_plate": glass_plate,
         "fingers": fingers,
         "fingerprint": fingerprint,

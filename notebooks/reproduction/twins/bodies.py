@@ -11,7 +11,7 @@ from dbthermal._arrays import Array
 from reproduction import heat
 from reproduction.twins import surfaces
 from reproduction.twins.people import hand, toy
-from reproduction.twins.rays import Camera, vertex_normals
+from reproduction.twins.rays import Camera, Point, vertex_normals
 from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since, table
 from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 
@@ -23,8 +23,12 @@ class Vessel:
     The wall is a thin shell: below the level of the drink, heat passes from the drink through half
     of the wall to its middle, :math:`1 / h = 1 / h_\mathrm{drink} + d / 2k`; above it from warm,
     moist air; outside it goes to air and by radiation to the room.
-
     """
+
+    name: str
+    profile: surfaces.Profile  # of the outer wall [m]
+    spacing: float  # distance of the mesh's vertices [m]
+    view: tuple[Point, Point]  # position and target of the first camera [m]
 
     # Temperature of the drink when it is poured [K]; those of the two vessels below are chosen so
     # that the thermocouple peaks where the paper's did: 63.6 and 63.1 degrees Celsius.
@@ -85,6 +89,10 @@ class Vessel:
 
 
 WINEGLASS: Final = Vessel(
+    "wineglass",
+    surfaces.WINEGLASS_PROFILE,
+    spacing=0.003,
+    view=((0.0, -0.55, 0.165), (0.0, 0.0, 0.145)),
     drink=340.09,
     bottom=0.096,
     level=0.175,
@@ -95,6 +103,10 @@ WINEGLASS: Final = Vessel(
 """A wineglass with a wall of 1.5 mm."""
 
 COFFEE_POT: Final = Vessel(
+    "coffee_pot",
+    surfaces.COFFEE_POT_PROFILE,
+    spacing=0.004,
+    view=((0.0, -0.65, 0.11), (0.0, 0.0, 0.08)),
     drink=342.11,
     bottom=0.0,
     level=0.110,
@@ -105,33 +117,15 @@ COFFEE_POT: Final = Vessel(
 """A coffee pot of borosilicate glass with a wall of 2.2 mm."""
 
 
-def wineglass(capture: Capture, rng: np.random.Generator, vessel: Vessel = WINEGLASS) -> Stage:
-    """Wineglass being filled, with two people walking near."""
-    camera = Camera((0.0, -0.55, 0.165), (0.0, 0.0, 0.145), capture.shape)
-    return _filled("wineglass", surfaces.wineglass(), vessel, camera, capture, rng)
-
-
-def coffee_pot(capture: Capture, rng: np.random.Generator, vessel: Vessel = COFFEE_POT) -> Stage:
-    """Coffee pot being filled, with two people walking near."""
-    camera = Camera((0.0, -0.65, 0.11), (0.0, 0.0, 0.08), capture.shape)
-    return _filled("coffee_pot", surfaces.coffee_pot(), vessel, camera, capture, rng)
-
-
-def _filled(
-    name: str,
-    mesh: trimesh.Trimesh,
-    vessel: Vessel,
-    camera: Camera,
-    capture: Capture,
-    rng: np.random.Generator,
-) -> Stage:
-    """Stage of a vessel on a table."""
+def filled(capture: Capture, rng: np.random.Generator, vessel: Vessel) -> Stage:
+    """Vessel on a table that is being filled, with two people walking near."""
+    mesh = surfaces.vessel(vessel.profile, vessel.spacing)
     wall = (vessel.thickness, vessel.solid)
     return Stage(
-        name,
+        vessel.name,
         mesh,
         since(vessel.start, mesh, wall, capture.time, vessel.exchanges(mesh)),
-        camera,
+        Camera(*vessel.view, capture.shape),
         [table(), *passers_by(capture.time, rng)],
         [surfaces.on_wall(mesh, *vessel.probe)],
     )
