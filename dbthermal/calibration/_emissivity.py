@@ -128,16 +128,6 @@ class _Signals(NamedTuple):
     emitted: _Signal
     reflected: _Signal
 
-    @property
-    def x(self) -> Array:
-        """Abscissa of the line through the origin, W_o - W_b [count]."""
-        return self.emitted.values - self.reflected.values
-
-    @property
-    def y(self) -> Array:
-        """Ordinate of the line, I - W_b [count]."""
-        return self.counts - self.reflected.values
-
     def weighted(self, emissivity: float, values: Array) -> Array:
         """Inverse covariance of the residual y - e x, times values (n)."""
         # s_I^2 + e^2 cov(W_o) + (1 - e)^2 cov(W_b)
@@ -342,7 +332,9 @@ def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
-    x, y = signals.x, signals.y
+    # Line through the origin, of I - W_b over W_o - W_b [count].
+    x = signals.emitted.values - signals.reflected.values
+    y = signals.counts - signals.reflected.values
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,
