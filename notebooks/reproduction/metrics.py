@@ -137,8 +137,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     True
     """
     schema.check_numbers(apparent, "the apparent temperature", "K")
-    if not isinstance(result, xr.Dataset):
-        raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
+    schema.require(result, xr.Dataset, "result")
     if apparent.dims != ("band", "time", "y", "x"):
         rule = "Must be ('band', 'time', 'y', 'x')"
         raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")

@@ -23,13 +23,11 @@ CORRELATED: Final = 0.5  # correlation of the bands from which a pixel enters th
 
 _FEWEST_STILL: Final = 200  # still pixels
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
-_UNCORRELATED: Final = 0.1
-_FEWEST: Final = 100
+_UNCORRELATED, _FEWEST = 0.1, 100
 _ORDER: Final = 9  # smooth functions of time
 # Share of the variance of still surroundings over time that their scale must explain.
 _EXPLAINED: Final = 0.9
-_ROUNDS: Final = 20
-_TINY: Final = np.finfo(np.float64).tiny
+_ROUNDS, _TINY = 20, np.finfo(np.float64).tiny
 
 
 def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:

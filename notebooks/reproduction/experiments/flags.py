@@ -28,11 +28,9 @@ share at rest; share of the samples lost in every second column; and of bad pixe
 _SHARES: Final = ("without_it", "without_any", "wrong")
 _COUNTED: Final = ("pixels", *_SHARES)
 # Shares of the samples that are no numbers, and that lie beyond the detector's limit [1].
-_INVALID: Final = 0.6
-_CLIPPED: Final = 0.1
+_INVALID, _CLIPPED = 0.6, 0.1
 # Share of the frames that repeat the one before, in runs of so many frames.
-_FROZEN: Final = 0.3
-_RUN: Final = 10
+_FROZEN, _RUN = 0.3, 10
 _HIGHEST: Final = 313.15  # of a response that was calibrated too little [K]
 _FLICKER: Final = 2.0  # of an object, standard deviation [K]
 _SHAPE: Final = (36, 48)  # of a picture

@@ -31,8 +31,7 @@ from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Pixe
 _FIRST_DAMPING: Final = 1e-2
 _DAMPING: Final = (1e-8, 1e12)
 # Factors of the damping after a step that lowers the objective, and one that does not.
-_EASIER: Final = 0.2
-_HARDER: Final = 8.0
+_EASIER, _HARDER = 0.2, 8.0
 # A step that changes a logit by more is not taken: it would end where the logit's slope is nil.
 _LONGEST: Final = 3.0
 
