@@ -27,6 +27,18 @@ BEFOREHAND: Final = 0.29
 BORDER: Final = 2.0
 """Distance from a border of two materials within which no label is judged [pixel]."""
 
+FAR: Final = 4.0
+"""Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""
+
+AMONG: Final = ("unflagged", "all")
+"""Pixels whose intervals are counted: those with status 0, or all that have a value."""
+
+KINDS: Final = ("object", "any")
+"""Quantities by which a pixel is bad: its object temperature; or that, or an emissivity."""
+
+_PIXELS: Final = ("y", "x")
+_INNER: Final = (0.1587, 0.8413)
+
 _BOUNDED: Final = ("reflection_ratio", "object_temperature")
 _UNITS: Final = {"object_temperature": "K"}
 
@@ -237,19 +249,6 @@ def _row(image: xr.DataArray, name: str) -> xr.DataArray:
 def _rms(part: xr.DataArray) -> xr.DataArray:
     """Root mean square over the pixels that have a value."""
     return ((part**2).mean("pixel") ** 0.5).assign_attrs(part.attrs)
-
-
-FAR: Final = 4.0
-"""Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""
-
-AMONG: Final = ("unflagged", "all")
-"""Pixels whose intervals are counted: those with status 0, or all that have a value."""
-
-KINDS: Final = ("object", "any")
-"""Quantities by which a pixel is bad: its object temperature; or that, or an emissivity."""
-
-_PIXELS: Final = ("y", "x")
-_INNER: Final = (0.1587, 0.8413)
 
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
