@@ -27,9 +27,7 @@ def laid_on(
     dims: Sequence[str] = ("band", "time", "temperature", "material", "y", "x"),
 ) -> Laid:
     """Array with the bands, order and coordinates of a reference; a ValueError names the two."""
-    if not isinstance(array, xr.DataArray | xr.Dataset):
-        message = f"Invalid {label.removeprefix('the ')} of type {type(array).__name__}"
-        raise TypeError(f"{message}. Must be a DataArray or a Dataset.")
+    schema.require(array, (xr.DataArray, xr.Dataset), label)
     # Bands by name, then every common dim.
     shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
     if "band" in shared and "band" in array.coords and "band" in reference.coords:

@@ -84,16 +84,12 @@ def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray
 
 def by_pixels(compute: Callable[[slice, slice], Values], like: xr.DataArray) -> xr.DataArray:
     """As `lazy`, by a function of rows and columns, that needs no others."""
-    array = _Rows(_once(compute, like.shape) if made_on_disk() else compute, like.shape)
+    array = _Rows(compute, like.shape)
+    if made_on_disk():  # all rows are computed once, into a film
+        film = empty(like.shape, _Rows.dtype)
+        for rows in blocks(like.shape):
+            film[..., rows, :] = compute(rows, slice(None))
+            release()
+        array = _Rows(lambda rows, columns: film[..., rows, columns], like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)
-
-
-def _once(compute: Callable[[slice, slice], Values], shape: tuple[int, ...]) -> Any:
-    """Compute all rows once, into a film; return the function that reads some of it."""
-    film = empty(shape, _Rows.dtype)
-    for rows in blocks(shape):
-        film[..., rows, :] = compute(rows, slice(None))
-        release()
-
-    return lambda rows, columns: film[..., rows, columns]

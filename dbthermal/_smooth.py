@@ -83,11 +83,14 @@ def subspace(
     if not steps:
         return Subspace(plain, plain, 0, plain[:, 1:])
     if order + len(steps) > len(plain):
-        raise ValueError(
-            f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames. "
-            "Must not be more functions than frames."
-        )
-    functions, object_part = _without_steps(plain[:, :1], steps, plain[:, 1:])
+        message = f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames"
+        raise ValueError(f"{message}. Must not be more functions than frames.")
+    together = np.column_stack([plain[:, :1], *steps, plain[:, 1:]])
+    # QR makes the columns orthonormal, F = Q R; the object's part of Q is F R^-1 with the camera's
+    # columns of F set to zero.
+    functions, triangle = np.linalg.qr(together)
+    together[:, 1 : 1 + len(steps)] = 0.0
+    object_part = np.linalg.solve(triangle.T, together.T).T
     return Subspace(functions, object_part, len(steps), functions[:, len(steps) + 1 :])
 
 
@@ -205,16 +208,6 @@ def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:
     if segment is None:
         return []
     return [np.where(segment >= number, 1.0, 0.0) for number in np.unique(segment)[1:]]
-
-
-def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Array, Array]:
-    """Columns made orthonormal with steps of the camera among them, and the object's part."""
-    together = np.column_stack([before, *steps, after])
-    # QR makes the columns orthonormal, F = Q R; the object's part of Q is F R^-1 with the camera's
-    # columns of F set to zero.
-    functions, triangle = np.linalg.qr(together)
-    together[:, before.shape[1] : before.shape[1] + len(steps)] = 0.0
-    return functions, np.linalg.solve(triangle.T, together.T).T
 
 
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:

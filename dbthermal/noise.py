@@ -101,10 +101,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
         )
-    if not all(np.all(schema.measured(signal)) for signal in (first, second)):
-        raise ValueError(
-            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-        )
+    for signal in (first, second):
+        schema.require_measured(signal, "signal")
     # Remove the object: smooth functions, then second differences.
     functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
@@ -143,11 +141,8 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
     quiet = int(np.argmin(rough))
     further = [band for band in range(len(signals)) if band != quiet]
-    pairs = [estimate(signals[quiet], signals[band], time) for band in further]
-    result = np.empty(len(signals))
-    result[quiet] = np.median([pair[0] for pair in pairs])
-    result[further] = [pair[1] for pair in pairs]
-    return result
+    pairs = np.array([estimate(signals[quiet], signals[band], time) for band in further])
+    return np.insert(pairs[:, 1], quiet, np.median(pairs[:, 0]))
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:

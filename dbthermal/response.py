@@ -307,10 +307,8 @@ def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
     with np.errstate(over="ignore"):  # of a wavelength far too short: a slope of zero, refused
         slopes = result.count_slope(np.linspace(result.lowest, result.highest, _SLOPE_POINTS))
     if not np.all(slopes > 0):
-        raise ValueError(
-            f"Invalid slope {slopes.min()} count/K of the response in band '{band}'. "
-            "Must be positive over its whole range."
-        )
+        message = f"Invalid slope {slopes.min()} count/K of the response in band '{band}'"
+        raise ValueError(f"{message}. Must be positive over its whole range.")
     return result
 
 

@@ -376,6 +376,13 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
     return np.abs(values) < LARGEST
 
 
+def require_measured(values: npt.NDArray[Any], label: str) -> None:
+    """Refuse samples that are no numbers, see `measured`."""
+    if not np.all(measured(values)):
+        message = f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}"
+        raise ValueError(f"{message}. Must be finite.")
+
+
 def check(
     dataset: xr.Dataset, stage: str, names: Sequence[str] = (), label: str = ""
 ) -> xr.Dataset:
@@ -412,15 +419,13 @@ def check(
     if stage not in STAGES:
         raise ValueError(f"Unknown stage '{stage}'. Must be one of {sorted(STAGES)}.")
     label = label or f"the {stage}"
-    _require(dataset, xr.Dataset, label)
+    require(dataset, xr.Dataset, label)
     # Name the missing variable, with the stage that the dataset fits.
     optional = [name for name in OPTIONAL.get(stage, ()) if name in dataset]
     for name in names or (*STAGES[stage], *optional):
         if name not in dataset:
-            fitting = [
-                stage_name for stage_name in STAGES if STAGES[stage_name].keys() <= set(dataset)
-            ]
-            nearest = max(fitting, key=lambda stage_name: len(STAGES[stage_name]), default="")
+            fitting = [key for key in STAGES if STAGES[key].keys() <= set(dataset)]
+            nearest = max(fitting, key=lambda key: len(STAGES[key]), default="")
             present = f"{sorted(map(str, dataset))}" + (f", as has a {nearest}" if nearest else "")
             raise ValueError(f"Missing variable '{name}' in {label}: {present}. Must be there.")
         variable = STAGES[stage].get(name) or OPTIONAL[stage][name]
@@ -442,7 +447,7 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
 
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
     """Check one array against its definition, with the errors of `check`."""
-    _require(array, xr.DataArray, label)
+    require(array, xr.DataArray, label)
     if array.dims != variable.dims:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
@@ -463,7 +468,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
     """Check that an array holds real numbers, of a unit if it states one, and return it."""
-    _require(array, xr.DataArray, label)
+    require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui":
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
     if units is not None and array.attrs.get("units", units) != units:
@@ -473,7 +478,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
     """Positions of bands by name; ValueError if one, or the coordinate, is missing or repeated."""
-    _require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
+    require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
@@ -496,18 +501,16 @@ def band_values(
 
 def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Variables of a Dataset of a stage, with the dims and attributes of their definitions."""
-    documented = {**STAGES[stage], **OPTIONAL.get(stage, {})}
-    return {
-        name: (documented[name].dims, value, documented[name].attrs)
-        for name, value in values.items()
-    }
+    known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
+    return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
 
 
-def _require(data: object, kind: type, label: str) -> None:
+def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
     """Refuse what is of another type."""
-    if not isinstance(data, kind):
+    if not isinstance(data, kinds):
+        names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
         message = f"Invalid {label.removeprefix('the ')} of type {type(data).__name__}"
-        raise TypeError(f"{message}. Must be a {kind.__name__}.")
+        raise TypeError(f"{message}. Must be a {' or a '.join(names)}.")
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

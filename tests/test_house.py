@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3530, 18),
-    "_cli": (1265, 7),
-    "alignment": (3010, 13),
-    "calibration": (850, 3),
-    "correction": (1925, 8),
-    "emissivity": (460, 4),
+    "": (3513, 18),
+    "_cli": (1263, 7),
+    "alignment": (3007, 13),
+    "calibration": (827, 3),
+    "correction": (1850, 7),
+    "emissivity": (452, 3),
     "explorer": (1345, 7),
-    "figures": (665, 6),
+    "figures": (655, 5),
     "instruments": (5696, 20),
-    "limits": (765, 4),
+    "limits": (750, 4),
     "readers": (2745, 12),
     "reporting": (430, 3),
-    "separation": (12865, 54),
-    "simulation": (635, 3),
-    "store": (1485, 6),
+    "separation": (12969, 54),
+    "simulation": (630, 3),
+    "store": (1484, 6),
 }
-INSTALLED = 37_860  # lines of all rooms
+INSTALLED = 37_616  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

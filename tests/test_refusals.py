@@ -35,7 +35,7 @@ from reproduction import figures as drawings
 from reproduction import metrics
 from reproduction.filters import rank_filters
 from reproduction.methods.dbvt import DbvtSettings
-from reproduction.reflection import reflected_change
+from reproduction.metrics import reflected_change
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()
@@ -239,7 +239,9 @@ def few(part: xr.DataArray) -> xr.DataArray:
 
 def film(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> list[Any]:
     """A film of two frames."""
-    return list(drawings.separated_film(few(APPARENT), few(emission), few(change), title="a"))
+    return list(
+        drawings.scenes.separated_film(few(APPARENT), few(emission), few(change), title="a")
+    )
 
 
 def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
@@ -313,7 +315,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "time y x",
     ),
     "truth_and_estimate": (
-        lambda it: drawings.truth_and_estimate(it, RESULT, (1, 1)),
+        lambda it: drawings.scenes.truth_and_estimate(it, RESULT, (1, 1)),
         SCENE,
         "y x",
     ),
@@ -322,7 +324,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "separated_film emission": (lambda it: film(emission=it), OBJECT, "time y x"),
     "separated_film change": (lambda it: film(change=it), CHANGE, "time y x"),
     "emissivity_by_contact": (
-        lambda it: drawings.emissivity_by_contact(CONTACT, it),
+        lambda it: drawings.calibration.emissivity_by_contact(CONTACT, it),
         CONTACT["emissivity"],
         "material band",
     ),

@@ -6,7 +6,7 @@ some of them common to all measurements.
 """
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -64,9 +64,8 @@ class Bias:
         for name in ("contact", "stray"):
             least, largest = _numbers.real_numbers(name, getattr(self, name), shape=(2,))
             if not 0 <= least <= largest < 1:
-                raise ValueError(
-                    f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
-                )
+                rule = "Must be a range within [0, 1)"
+                raise ValueError(f"Invalid {name} ({least}, {largest}). {rule}.")
         _numbers.real_number("air_temperature [K]", self.air_temperature, _numbers.KELVIN)
 
     @property
@@ -128,16 +127,6 @@ class _Signals(NamedTuple):
     noise: float
     emitted: _Signal
     reflected: _Signal
-
-    @property
-    def x(self) -> Array:
-        """Abscissa of the line through the origin, W_o - W_b [count]."""
-        return self.emitted.values - self.reflected.values
-
-    @property
-    def y(self) -> Array:
-        """Ordinate of the line, I - W_b [count]."""
-        return self.counts - self.reflected.values
 
     def weighted(self, emissivity: float, values: Array) -> Array:
         """Inverse covariance of the residual y - e x, times values (n)."""
@@ -305,10 +294,7 @@ def _readings(
     """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
-        if not np.all(schema.measured(variable.values)):
-            raise ValueError(
-                f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-            )
+        schema.require_measured(variable.values, str(name))
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
     return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
 
@@ -318,12 +304,10 @@ def _bands(
 ) -> list[tuple[Curve, float, Array]]:
     """Response, noise and counts (measurement) of each band."""
     names = [str(name) for name in measured["band"].values]
-    noises, bands = responses.noise(response, names), []
-    curves = responses.curves(response, names)
-    for curve, noise, counts in zip(curves, noises, measured["counts"].values, strict=True):
+    noises, curves = responses.noise(response, names).tolist(), responses.curves(response, names)
+    for curve in curves:
         require_range(warm, curve, "object temperature")
-        bands.append((curve, float(noise), counts.astype(np.float64)))
-    return bands
+    return list(zip(curves, noises, measured["counts"].values.astype(np.float64), strict=True))
 
 
 def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
@@ -340,17 +324,17 @@ def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
     """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
     fits = [_fit_band(band, name) for name, band in signals.items()]
     *values, residual = (np.array(column) for column in zip(*fits, strict=True))
-    names = ("emissivity", "emissivity_std", "reduced_chi2")
-    variables = {
-        name: ("band", value, {"units": "1"}) for name, value in zip(names, values, strict=True)
-    }
-    residuals = (("band", "measurement"), residual, {"units": "count"})
-    return xr.Dataset({**variables, "residual": residuals}, {"band": list(signals)})
+    pairs = zip(("emissivity", "emissivity_std", "reduced_chi2"), values, strict=True)
+    variables: dict[str, Any] = {name: ("band", value, {"units": "1"}) for name, value in pairs}
+    variables["residual"] = (("band", "measurement"), residual, {"units": "count"})
+    return xr.Dataset(variables, {"band": list(signals)})
 
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
-    x, y = signals.x, signals.y
+    # Line through the origin, of I - W_b over W_o - W_b [count].
+    x = signals.emitted.values - signals.reflected.values
+    y = signals.counts - signals.reflected.values
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,

@@ -170,15 +170,16 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         slopes = [curve.reference_slope for curve in curves]
         scatter = np.sqrt((result["residual"].values ** 2).mean(axis=1)) / slopes
         offset_std = np.hypot(ACCURACY["offset_std"], scatter).tolist()
+    drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
     known: dict[str, Any] = {
+        **drifts,
         "blackbody_accuracy": blackbody_accuracy,
         "blackbody_emissivity": blackbody_emissivity,
         "room_temperature": room_temperature,
         "background_ratio_std": background_ratio_std,
     }
-    drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
-    for name, drift in drifts.items():
-        values = _numbers.real_numbers(name, drift)
+    for name in drifts:
+        values = _numbers.real_numbers(name, known[name])
         if values.shape not in {(), (len(names),)}:
             rule = f"Must be one for all bands, or {len(names)}"
             raise ValueError(f"Invalid {name} of shape {values.shape}. {rule}.")
@@ -198,17 +199,19 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
     """Sentences on bands that are much quieter than one that contains them."""
     filters = [name for name in netd if name in bands.FILTERS]
-    pairs = []
-    for inner, outer in permutations(filters, 2):
-        narrow, wide = bands.get(inner), bands.get(outer)
-        within = wide.lower <= narrow.lower and narrow.upper <= wide.upper
-        if within and netd[inner] < _QUIETER * netd[outer]:
-            pairs.append(
-                f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in "
-                f"'{outer}', which contains it. A filter must raise the noise: are the names of "
-                "the bands, or the files of the blackbody, exchanged?"
-            )
-    return pairs
+    pairs = [
+        (inner, outer)
+        for inner, outer in permutations(filters, 2)
+        if bands.get(outer).lower <= bands.get(inner).lower
+        and bands.get(inner).upper <= bands.get(outer).upper
+        and netd[inner] < _QUIETER * netd[outer]
+    ]
+    return [
+        f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in '{outer}', "
+        "which contains it. A filter must raise the noise: are the names of the bands, or the "
+        "files of the blackbody, exchanged?"
+        for inner, outer in pairs
+    ]
 
 
 def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
@@ -325,11 +328,7 @@ def _check_blackbody(counts: xr.DataArray) -> None:
         rule = f"Must be at least {MINIMUM_TEMPERATURES}"
         raise ValueError(f"Invalid number of blackbody temperatures {temperature.size}. {rule}.")
     for name, row in zip(counts["band"].values, counts.values, strict=True):
-        if not np.all(schema.measured(row)):
-            raise ValueError(
-                f"Invalid counts in band '{name}': NaN or infinite, or beyond {schema.LARGEST:g}. "
-                "Must be finite."
-            )
+        schema.require_measured(row, f"counts in band '{name}'")
 
 
 def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> None:
@@ -404,15 +403,10 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
         return np.array([amplitude, offset]), amplitude * planckian + offset - counts
 
     shortest, longest = np.array(_wavelengths(band)) * middle / _SHAPE_UNIT
-    fit = least_squares(
-        lambda shape: linear_part(shape)[1] / span,
-        (np.sqrt(shortest * longest), 1.0),
-        bounds=((shortest, _GROWTH[0]), (longest, _GROWTH[1])),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-        max_nfev=1000,
-    )
+    options: Any = {"bounds": ((shortest, _GROWTH[0]), (longest, _GROWTH[1])), "max_nfev": 1000}
+    options |= dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    first = np.sqrt(shortest * longest), 1.0
+    fit = least_squares(lambda shape: linear_part(shape)[1] / span, first, **options)
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])

@@ -17,9 +17,8 @@ from dbthermal.correction._nonuniformity import (
     renew_offset,
 )
 from dbthermal.correction._pixels import mark_bad
-from dbthermal.correction._reference import Reference
 from dbthermal.correction._shutter import find_shutter, mark_shutter
-from dbthermal.correction._temporal import undo_drift, undo_lag
+from dbthermal.correction._temporal import Reference, undo_drift, undo_lag
 
 __all__ = [
     "DETECTOR_MAXIMUM",

@@ -13,9 +13,8 @@ from dbthermal._warnings import warned
 from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
-from dbthermal.correction._reference import Reference, refer
 from dbthermal.correction._shutter import distinct, events_of, mark_shutter
-from dbthermal.correction._temporal import undo_drift, undo_lag
+from dbthermal.correction._temporal import Reference, refer, undo_drift, undo_lag
 
 
 def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
@@ -160,9 +159,13 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         """Correct some rows and columns, in the steps that need no others."""
         pixels = {"y": rows, "x": columns}
         corrected = correct(stamped.isel(pixels), before.isel(pixels), maximum=maximum)
-        corrected = _without_damaged(
-            corrected if events is None else mark_shutter(corrected, events)
-        )
+        corrected = corrected if events is None else mark_shutter(corrected, events)
+        if "exposure_time" in corrected:  # NaN in frames that have none, and their number by band
+            counts, valid = corrected["counts"], corrected["exposure_time"].notnull()
+            if not valid.all():
+                counts = counts.where(valid).assign_attrs(counts.attrs)
+            damaged = (~valid).sum("time").values.tolist()
+            corrected = corrected.assign(counts=counts).assign_attrs(damaged_frames=damaged)
         return corrected if time_constant is None else undo_lag(corrected, time_constant)
 
     result = _by_rows(measured, capture["counts"]) if lazy else measured(slice(None))
@@ -233,13 +236,3 @@ def _closed(capture: xr.Dataset) -> xr.DataArray | None:
     if schema.SHUTTER_CLOSED not in str(flags.attrs.get("flag_meanings", "")).split():
         return None  # of a file that does not tell
     return schema.has_flag(flags, schema.SHUTTER_CLOSED)
-
-
-def _without_damaged(corrected: xr.Dataset) -> xr.Dataset:
-    """NaN in frames that have no exposure time, and their number by band as an attribute."""
-    if "exposure_time" not in corrected:
-        return corrected
-    counts, valid = corrected["counts"], corrected["exposure_time"].notnull()
-    if not valid.all():
-        corrected = corrected.assign(counts=counts.where(valid).assign_attrs(counts.attrs))
-    return corrected.assign_attrs(damaged_frames=(~valid).sum("time").values.tolist())

@@ -70,10 +70,8 @@ class Findings:
 
     def notes(self, bands: list[str]) -> list[str]:
         """Sentences for a user."""
-        said = []
-        for band, bad, shutter, steps in zip(
-            bands, self.bad, self.shutter, self.steps, strict=True
-        ):
+        said, rows = [], zip(bands, self.bad, self.shutter, self.steps, strict=True)
+        for band, bad, shutter, steps in rows:
             edges = np.flatnonzero(np.diff(np.pad(bad.astype(np.int8), 1))).reshape(-1, 2)
             runs = [
                 f"{first}{f' to {stop - 1}' if stop - first > 1 else ''}"
@@ -210,16 +208,15 @@ def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, in
         before = start - 1 if start > 0 else 2 * stop
         after = stop if stop < len(film) else 2 * start - stop - 1
         places = [(start + stop - 1) // 2, before, after]
-        if max(places) < len(film) and _deviates(film[places], limit):
+        if max(places) >= len(film):
+            continue
+        # The frame in the middle deviates from both sides, which are alike.
+        middle, *sides = film[places]
+        least = np.minimum(*(np.abs(middle - side) for side in sides))
+        deviant = (least > limit) & (np.abs(sides[1] - sides[0]) < _RETURN * least)
+        torn = deviant.mean(axis=1) > _ROW
+        if deviant.mean() > _MOST or torn.mean() > _ROWS:
             yield start, stop, places
-
-
-def _deviates(film: Film, limit: np.float32) -> bool:
-    """Return whether a frame deviates from two others, which are alike."""
-    least = np.abs(film[0] - film[1:]).min(axis=0)
-    deviant = (least > limit) & (np.abs(film[2] - film[1]) < _RETURN * least)
-    torn = deviant.mean(axis=1) > _ROW
-    return bool(deviant.mean() > _MOST or torn.mean() > _ROWS)
 
 
 def _coarse(film: Film) -> Array:
@@ -292,9 +289,8 @@ def _usual_gain(band: int, film: Film, sections: list[Array], valid: Mask) -> Ma
             continue
         gain = np.log(noises[1] / noises[0])
         contrast = np.log(scenes[1].std() / scenes[0].std())
-        alike = (
-            np.asarray(np.corrcoef(scenes))[0, 1] > _ALIKE and 0.5 * contrast**2 < gain * contrast
-        )
+        alike = 0.5 * contrast**2 < gain * contrast
+        alike &= np.asarray(np.corrcoef(scenes))[0, 1] > _ALIKE
         jump = float(np.median(np.abs(np.diff(film[place] - film[place - 1], axis=1))))
         alike &= min(abs(gain), abs(contrast)) > _GAIN and abs(gain) < 1.5 * abs(contrast)
         renewed = abs(gain) > _GAIN and jump > OUTLIER * max(noises)

@@ -165,15 +165,9 @@ def fit_correction(
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = counts.shape[2:]
     # Fit each band by itself.
-    fits = [
-        _fit_band(
-            band.values.astype(np.float64).reshape(len(band), -1),
-            str(band["band"].item()),
-            threshold,
-            maximum,
-        )
-        for band in counts
-    ]
+    fits = []
+    for name, band in zip(counts["band"].values, counts.values.astype(np.float64), strict=True):
+        fits.append(_fit_band(band.reshape(len(band), -1), str(name), threshold, maximum))
     gain, offset, bad, residual, level = (np.stack(values) for values in zip(*fits, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
     values = {name: values.reshape(-1, *image) for name, values in maps.items()}
@@ -208,9 +202,8 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     _require_rising(_checked(correction))
     schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
-        raise ValueError(
-            f"Invalid dims {flat.dims} of the flat image. Must be (band, y, x), bands by name."
-        )
+        rule = "Must be (band, y, x), bands by name"
+        raise ValueError(f"Invalid dims {flat.dims} of the flat image. {rule}.")
     flat = laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
     if not np.all(schema.measured(flat.values[good])):
@@ -264,7 +257,8 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
-    maps = _maps(correction, counts)
+    maps = laid_on(_checked(correction), counts, "the correction", "the capture")
+    maps = _require_rising(maps[["gain", "offset", "bad"]])
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
     for band in range(len(counts)):
@@ -287,9 +281,7 @@ def correct(
     )
     if correction.keys() >= _PATTERN:
         result["pattern_std"] = _pattern_std(correction, result["counts"], status == 0)
-    done = {
-        f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
-    }
+    done = {f"gain_offset_{key}": it for key, it in correction.attrs.items() if key in _PARAMETERS}
     done |= {"gain_offset_corrected": 1 - correction.attrs.get("by_camera", 0)}
     done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
     done |= {"detector_maximum": maximum} | schema.origin(capture.attrs, correction.attrs)
@@ -353,16 +345,12 @@ def _fit_band(
 def _level(frames: Array, good: Mask, band: str) -> Array:
     """Mean (temperature) over the good pixels, which must be most of them."""
     if 2 * good.sum() <= good.size:
-        raise ValueError(
-            f"Invalid blackbody frames in band '{band}': {good.sum()} of {good.size} pixels are "
-            "usable. Must be more than half."
-        )
+        label = f"Invalid blackbody frames in band '{band}': {good.sum()} of {good.size} pixels"
+        raise ValueError(f"{label} are usable. Must be more than half.")
     level = frames[:, good].mean(axis=1)
     if np.any(np.diff(level) <= 0):
-        raise ValueError(
-            f"Invalid levels {level.round(1).tolist()} count of the blackbody in band '{band}'. "
-            "Must rise with its temperature."
-        )
+        label = f"Invalid levels {level.round(1).tolist()} count of the blackbody in band '{band}'"
+        raise ValueError(f"{label}. Must rise with its temperature.")
     return np.asarray(level)
 
 
@@ -391,12 +379,6 @@ def _checked(correction: xr.Dataset) -> xr.Dataset:
     if "bad" not in schema.check(correction, "correction"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
     return correction
-
-
-def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
-    """Maps of a correction for the bands and pixels of a capture."""
-    correction = laid_on(_checked(correction), counts, "the correction", "the capture")
-    return _require_rising(correction[["gain", "offset", "bad"]])
 
 
 def _require_rising(maps: xr.Dataset) -> xr.Dataset:

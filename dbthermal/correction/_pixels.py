@@ -106,7 +106,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     stds = np.zeros(counts.sizes["band"])
     if "pattern_std" in corrected:
         stds = np.nan_to_num(corrected["pattern_std"].values)
-    reach = _reach(counts["time"].values.astype(np.float64))
+    # Frames within which a neighbour may change as well: those of 0.2 s, or five if more.
+    time, reach = counts["time"].values.astype(np.float64), _REACH_FRAMES
+    if time.size >= MINIMUM_FRAMES:
+        reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
@@ -121,10 +124,8 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
             still[:, *window] = [_mean(block[segment_numbers == number]) for number in segments]
         judged = np.isfinite(level)
         if not judged.any():
-            raise ValueError(
-                f"Invalid band '{movie['band'].item()}': no pixel has "
-                f"{MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
-            )
+            label = f"Invalid band '{movie['band'].item()}': no pixel has {MINIMUM_FRAMES} samples"
+            raise ValueError(f"{label} that are not NaN. Must have them, to be judged.")
         # Noise around each pixel.
         unjudged |= ~judged
         usual = np.where(judged, level, np.median(level[judged]))
@@ -136,7 +137,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         number = [np.count_nonzero(segment_numbers == segment) for segment in segments]
         excess = min(np.square(pattern) - noise**2 / np.array(number)) - stds[band] ** 2
         stds[band] = np.sqrt(stds[band] ** 2 + _SMOOTH * max(excess, 0.0))
-        noisy |= _outliers(level, usual, threshold)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithm = np.log(level / usual)  # minus infinity where nothing changes
+        noisy |= outlying(logarithm, np.isfinite(logarithm), threshold) | (level == 0)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
@@ -251,21 +254,6 @@ def _samples(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
     """Counts of some rows and columns, NaN where they are no measurement."""
     counts = movie.isel(y=rows, x=columns).values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
-
-
-def _reach(time: Array) -> int:
-    """Frames within which a neighbour may change as well: those of 0.2 s, or five if more."""
-    if time.size < MINIMUM_FRAMES:
-        return _REACH_FRAMES
-    return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
-
-
-def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
-    """Pixels whose noise differs from that around them by more than the threshold."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logarithm = np.log(level / usual)  # minus infinity where nothing changes
-    outliers = outlying(logarithm, np.isfinite(logarithm), threshold)
-    return np.asarray(outliers | (level == 0))
 
 
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _rows, schema
-from dbthermal._arrays import Array, Mask, stride
+from dbthermal._arrays import Mask, stride
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 
@@ -83,7 +83,15 @@ def events_of(
     First frames (band, time) of `steps` of the pattern are events of two frames: the place of a
     step is uncertain by one.
     """
-    shut = _closed_frames(counts, closed)
+    shut = np.zeros((counts.sizes["band"], counts.sizes["time"]), dtype=bool)
+    if closed is not None:
+        closed = laid_on(closed, counts, "the closed frames", "the capture")
+        if closed.dtype != bool:
+            raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
+        if closed.dims not in {("time",), ("band", "time")}:
+            rule = "Must be (time) or (band, time)"
+            raise ValueError(f"Invalid dims {closed.dims} of the closed frames. {rule}.")
+        shut |= closed.values
     places = () if steps is None else np.argwhere(steps)
     runs = [(str(counts["band"].values[band]), frame - 1, 2, True) for band, frame in places]
     for index, name in enumerate(counts["band"].values):
@@ -92,7 +100,21 @@ def events_of(
         for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
             renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
-    return _events(runs, counts["time"].values.astype(np.float64))
+    # Rows of `find_shutter`, in the order of their starts.
+    runs, time = sorted(runs, key=lambda run: run[1]), counts["time"].values.astype(np.float64)
+    bands, first, number, renewals = zip(*runs, strict=True) if runs else ([], [], [], [])
+    start = np.array(first, dtype=np.int64)
+    stop = start + np.array(number, dtype=np.int64) - 1
+    return xr.Dataset(
+        {
+            "band": ("event", np.array(bands, dtype=str)),
+            "first_frame": ("event", start),
+            "frames": ("event", np.array(number, dtype=np.int64)),
+            "start": ("event", time[start], {"units": "s"}),
+            "stop": ("event", time[stop], {"units": "s"}),
+            "renewed": ("event", np.array(renewals, dtype=bool)),
+        }
+    )
 
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
@@ -150,21 +172,6 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     )
 
 
-def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
-    """Frames (band, time) stated to be taken with the shutter closed."""
-    shape = counts.sizes["band"], counts.sizes["time"]
-    if closed is None:
-        return np.zeros(shape, dtype=bool)
-    closed = laid_on(closed, counts, "the closed frames", "the capture")
-    if closed.dtype != bool:
-        raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
-    if closed.dims not in {("time",), ("band", "time")}:
-        raise ValueError(
-            f"Invalid dims {closed.dims} of the closed frames. Must be (time) or (band, time)."
-        )
-    return np.broadcast_to(closed.values, shape)
-
-
 def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     """Capture without the repetitions of a stream faster than its sensor, and its copies.
 
@@ -182,10 +189,8 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     if shown[slowest] < 2:
         return capture, repeats
     # Places within the showings of a frame, of which every r-th is kept.
-    place, least = (
-        frames - first[slowest],
-        np.maximum(1, np.rint(numbers[slowest] / shown[slowest])),
-    )
+    place = frames - first[slowest]
+    least = np.maximum(1, np.rint(numbers[slowest] / shown[slowest]))
     least = np.repeat(least, numbers[slowest]) * shown[slowest]
     kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
     first, result = first[:, kept], capture.isel(time=kept)
@@ -195,11 +200,8 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
         stamps = np.take_along_axis(capture.get("exposure_time", even).values, first, axis=1)
         stamps = np.where(again, np.nan, stamps)
         result = result.assign(exposure_time=(("band", "time"), stamps, schema.EXPOSURE_TIME.attrs))
-    label = ", ".join(
-        f"{number} times in band '{band}'"
-        for band, number in zip(counts["band"].values, shown, strict=True)
-        if number > 1
-    )
+    pairs = zip(counts["band"].values, shown, strict=True)
+    label = ", ".join(f"{number} times in band '{band}'" for band, number in pairs if number > 1)
     said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
     return warned(result, said), again
 
@@ -216,10 +218,9 @@ def _copies(counts: xr.DataArray) -> Mask:
     changed, valid = _changed(sample[:-1], sample[1:])
     moving = changed.any(axis=0)
     if moving.sum() < _MINIMUM_PIXELS:
-        raise ValueError(
-            f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the "
-            f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
-        )
+        label = f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the"
+        rule = f"Must be at least {_MINIMUM_PIXELS}"
+        raise ValueError(f"{label} {moving.size} pixels looked at change. {rule}.")
     repeats = np.zeros(counts.sizes["time"], dtype=bool)
     # Compare the whole image where the sample of pixels repeats.
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
@@ -239,23 +240,6 @@ def _changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> tuple[Mask, M
     return (before != after) & valid, valid
 
 
-def _events(runs: list[tuple[str, int, int, bool]], time: Array) -> xr.Dataset:
-    """Rows of `find_shutter`, in the order of their starts."""
-    runs = sorted(runs, key=lambda run: run[1])
-    first = np.array([run[1] for run in runs], dtype=np.int64)
-    number = np.array([run[2] for run in runs], dtype=np.int64)
-    return xr.Dataset(
-        {
-            "band": ("event", np.array([run[0] for run in runs], dtype=str)),
-            "first_frame": ("event", first),
-            "frames": ("event", number),
-            "start": ("event", time[first], {"units": "s"}),
-            "stop": ("event", time[first + number - 1], {"units": "s"}),
-            "renewed": ("event", np.array([run[3] for run in runs], dtype=bool)),
-        }
-    )
-
-
 def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Integers, list[int]]:
     """First frame, frame after the last, and position of the band of each event."""
     missing = [name for name in _EVENT if name not in events]
@@ -266,10 +250,8 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
     after = first + events["frames"].values.astype(np.int64)
     wrong = np.flatnonzero((first < 0) | (after <= first) | (after > counts.sizes["time"]))
     if wrong.size:
-        raise ValueError(
-            f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}. Must lie in "
-            f"[0, {counts.sizes['time'] - 1}], not fall."
-        )
+        message = f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}"
+        raise ValueError(f"{message}. Must lie in [0, {counts.sizes['time'] - 1}], not fall.")
     if "start" in events:
         starts = events["start"].rename(event="time").assign_coords(time=events["start"].values)
         laid_on(starts, counts.isel(time=first), "the events", "the capture")

@@ -1,4 +1,6 @@
-"""Behaviour of the detector in time: thermal lag of its pixels, common drift of its offsets."""
+"""Behaviour of the detector in time: lag of its pixels, drift, and references that renew levels."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -6,6 +8,7 @@ import xarray as xr
 
 from dbthermal import _numbers, _rows, schema
 from dbthermal import _smooth as smooth
+from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
@@ -119,15 +122,20 @@ def undo_drift(
     patch = counts.isel(y=xr.DataArray(rows, dims="p"), x=xr.DataArray(columns, dims="p"))
     level = patch.mean("p", dtype=np.float64, skipna=False)
     torn = np.isnan(level.values) & patch.notnull().any("p").values
-    if torn.any():  # its mean would jump with the pixels that remain
-        band, frame = np.argwhere(torn)[0]
-        raise ValueError(
-            f"Invalid reference: a part of it is NaN in frame {frame} of band "
-            f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
-        )
+    for band, frame in np.argwhere(torn):  # its mean would jump with the pixels that remain
+        label = f"Invalid reference: a part of it is NaN in frame {frame} of band"
+        rule = "Must be NaN as a whole, or not at all"
+        raise ValueError(f"{label} '{patch['band'].values[band]}'. {rule}.")
     # Smooth curve of the patch, segment by segment.
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
-    curves = np.stack([_smooth_change(band, segment, order) for band in level])
+    time, curves = level["time"].values.astype(np.float64), np.full(level.shape, np.nan)
+    for number in np.unique(segment):
+        for values, curve in zip(level.values, curves, strict=True):
+            frames = (segment == number) & np.isfinite(values)
+            if frames.any():
+                functions = smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
+                fitted = functions @ (functions.T @ values[frames])
+                curve[frames] = fitted - fitted[0]  # change since the segment's first frame
 
     def undone(window: slice) -> npt.NDArray[np.floating]:
         """Counts of some rows without the drift."""
@@ -165,14 +173,81 @@ def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
     return good
 
 
-def _smooth_change(level: xr.DataArray, segment: npt.NDArray[np.generic], order: int) -> Array:
-    """Smooth change (time) of a level (time) since the first frame of each segment."""
-    values, time = level.values, level["time"].values.astype(np.float64)
-    curve = np.full(values.shape, np.nan)
-    for number in np.unique(segment):
-        frames = (segment == number) & np.isfinite(values)
-        if frames.any():
-            functions = smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
-            fitted = functions @ (functions.T @ values[frames])
-            curve[frames] = fitted - fitted[0]
-    return curve
+_PATCHES = schema.Variable(("patch", "y", "x"), "bool", "1", "pixels of a patch")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Patches in view, nearly black, whose temperature is known, for `correct_capture`.
+
+    TypeError or ValueError if an attribute is not as described.
+
+    Attributes
+    ----------
+    response : Dataset
+        Stage `response` of `schema`: the counts that a patch should have.
+    patches : DataArray
+        True at the pixels of each patch, (patch, y, x), bool.
+    temperatures : tuple of float
+        Of each patch, mean over the capture [K]; two or more differ.
+    temperature_std : float
+        Standard deviation of the error that they share [K].
+    """
+
+    response: xr.Dataset
+    patches: xr.DataArray
+    temperatures: tuple[float, ...]
+    temperature_std: float = 0.1
+
+    def __post_init__(self) -> None:
+        schema.check(self.response, "response")
+        schema.check_variable(self.patches, _PATCHES, "the patches")
+        shape = (self.patches.sizes["patch"],)
+        values = _numbers.real_numbers("temperatures [K]", self.temperatures, shape=shape)
+        if len(values) > 1 and not np.ptp(values) > 0.0:
+            raise ValueError(f"Invalid temperatures {values.tolist()} K of patches. Must differ.")
+        _numbers.real_number("temperature_std [K]", self.temperature_std, _numbers.POSITIVE)
+
+
+def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Dataset:
+    """Counts (band, time, y, x) with the level, and by several patches the gain, of a reference.
+
+    Attribute ``level_reference`` has what remains unknown, see `response.accuracy`.
+    """
+    counts, names = corrected["counts"], [str(name) for name in corrected["band"].values]
+    masks = laid_on(reference.patches, corrected, "the patches", "the capture").values.copy()
+    if "status" in corrected:
+        masks &= corrected["status"].values == 0
+    if np.any(few := masks.sum(axis=(1, 2)) < 2):
+        raise ValueError(f"Invalid patch {int(np.argmax(few))}. Must have two good pixels or more.")
+    # Mean of the patches over time, and how it scatters over their pixels.
+    means, stds = [], []
+    for mask in masks:
+        rows, columns = (xr.DataArray(places, dims="pixel") for places in np.nonzero(mask))
+        pixels = counts.isel(y=rows, x=columns).mean("time", dtype=np.float64)
+        means.append(pixels.mean("pixel").values)
+        stds.append(pixels.std("pixel", ddof=1).values / np.sqrt(rows.size))
+    # Line from the measured to the expected counts of each band.
+    temperatures = np.asarray(reference.temperatures, dtype=np.float64)
+    remaining, lines = {}, np.empty((2, len(names), 1, 1, 1))
+    for band, curve in enumerate(responses.curves(reference.response, names)):
+        seen = np.array([mean[band] for mean in means])
+        wanted = curve.counts(temperatures)
+        gain = np.polyfit(seen, wanted, 1)[0] if len(seen) > 1 else 1.0
+        lines[:, band, 0, 0, 0] = gain, np.mean(wanted - gain * seen)
+        errors = np.array([std[band] for std in stds]) / curve.count_slope(temperatures)
+        remaining[names[band]] = {"offset_std": float(np.sqrt(np.mean(errors**2) / len(errors)))}
+        if len(errors) > 1:
+            scatter = np.sum((temperatures - temperatures.mean()) ** 2)
+            remaining[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
+
+    def referred(window: slice) -> npt.NDArray[np.floating]:
+        """Counts of some rows on the line."""
+        values = counts.isel(y=window).values
+        return np.asarray(lines[0] * values + lines[1], dtype=values.dtype)
+
+    result = _rows.lazy(referred, counts) if lazy else counts.copy(data=referred(slice(None)))
+    level = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
+    return corrected.assign(counts=result).assign_attrs(
+        level_reference={**level, "bands": remaining}
+    )

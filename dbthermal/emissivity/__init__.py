@@ -6,12 +6,12 @@ noise behind it (`filter_noise`). A colour of what is mirrored is seen in foil (
 """
 
 from dbthermal.emissivity._background import background_ratio
-from dbthermal.emissivity._filters import filter_noise
 from dbthermal.emissivity._tables import (
     CAMERA_BAND,
     MINIMUM_COVERAGE,
     band_table,
     embedded_table,
+    filter_noise,
     library_mixture,
 )
 

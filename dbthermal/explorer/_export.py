@@ -18,7 +18,7 @@ from dbthermal import figures, store
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
-from dbthermal.figures._status import legend
+from dbthermal.figures._maps import legend
 
 ANIMATED: Final = (".gif", ".webp")
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc", *ANIMATED)

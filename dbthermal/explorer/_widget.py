@@ -20,7 +20,7 @@ from dbthermal.explorer._films import FILMS, Values
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import COMPLETED, View
 from dbthermal.figures import drawing
-from dbthermal.figures._status import legend
+from dbthermal.figures._maps import legend
 
 PALETTES: Final = ("inferno", "cividis", "gray", "gnuplot2", "turbo")
 _DPI: Final = 80

@@ -8,8 +8,8 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 """
 
 from dbthermal.figures import drawing
-from dbthermal.figures._limits import plan
 from dbthermal.figures._live import Panel, live
+from dbthermal.figures._maps import REASONS, plan, status
 from dbthermal.figures._scenes import (
     FilmPanel,
     film,
@@ -17,7 +17,6 @@ from dbthermal.figures._scenes import (
     separated_frames,
     separated_temperatures,
 )
-from dbthermal.figures._status import REASONS, status
 
 __all__ = [
     "REASONS",

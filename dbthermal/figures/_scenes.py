@@ -1,16 +1,14 @@
 """Figures and films of separated scenes."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
@@ -186,26 +184,18 @@ def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.
         image = panel.values.isel(time=0)
         draw_image(figure, axis, image, panel.title, panel.unit, cmap=cmap, limits=scale)
     heading = figure.suptitle(f"{title}, {' ' * 7}")
-    yield from _frames(FigureCanvasAgg(figure), axes[0], panels, heading)
-
-
-def _frames(
-    drawing: Any,  # FigureCanvasAgg, whose methods have no types
-    axes: Iterable[Axes],
-    panels: Sequence[FilmPanel],
-    heading: Text,
-) -> Iterator[npt.NDArray[np.uint8]]:
-    """Draw the axes and labels once, and over them the images of each time."""
-    images, title = [axis.images[0] for axis in axes], heading.get_text().rstrip(" ,")
+    # Draw the axes and labels once, and over them the images of each time.
+    sheet: Any = FigureCanvasAgg(figure)  # whose methods have no types
+    images = [axis.images[0] for axis in axes[0]]
     for artist in (*images, heading):
         artist.set_animated(True)
-    drawing.draw()
-    still = drawing.copy_from_bbox(drawing.figure.bbox)
+    sheet.draw()
+    still = sheet.copy_from_bbox(figure.bbox)
     for index, moment in enumerate(panels[0].values["time"].values):
-        drawing.restore_region(still)
+        sheet.restore_region(still)
         heading.set_text(f"{title}, {moment:.1f} s")
         for image, panel in zip(images, panels, strict=True):
             image.set_data(panel.values.values[index])
             image.axes.draw_artist(image)
-        drawing.figure.draw_artist(heading)
-        yield np.asarray(drawing.buffer_rgba())[..., :3].copy()
+        figure.draw_artist(heading)
+        yield np.asarray(sheet.buffer_rgba())[..., :3].copy()

@@ -143,6 +143,16 @@ def plain_decades(axis: Axes) -> None:
     axis.yaxis.set_minor_locator(NullLocator())
 
 
+def number_cells(
+    axis: Axes, values: npt.NDArray[np.floating], middle: float, form: str, **style: Any
+) -> None:
+    """Write the finite values (row, column) of a map on it, white where they are above a middle."""
+    for row, column in np.argwhere(np.isfinite(values)):
+        color = "white" if values[row, column] > middle else "black"
+        text = form.format(values[row, column])
+        axis.text(column, row, text, ha="center", va="center", color=color, **style)
+
+
 def percent(share: float) -> str:
     """Share [1] in percent as text; less than 0.1 % is not rounded to zero."""
     return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

@@ -142,10 +142,8 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
     bad = ~((emissivity > 0) & (emissivity < 1))
     if np.any(bad):
         band = scene["band"].values[np.argmax(bad.any(axis=1))]
-        raise ValueError(
-            f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene. "
-            "Must lie in (0, 1)."
-        )
+        message = f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene"
+        raise ValueError(f"{message}. Must lie in (0, 1).")
     from scipy.stats import mode  # noqa: PLC0415 - slow to import, and nothing else here needs it
 
     # A pixel rests at its most frequent temperature, the lowest of several, if frames share one.
@@ -186,5 +184,5 @@ def _dataset(scene: xr.Dataset, stds: dict[str, Array], maps: dict[str, Any]) ->
         dims = (*leading.get(name, ()), "y", "x")
         variables[name] = (dims, values.reshape(*values.shape[:-1], *image), {"units": "1"})
     coords = {name: scene[name] for name in ("band", "time", "y", "x") if name in scene.coords}
-    origin = {name: scene.attrs[name] for name in ("origin",) if name in scene.attrs}
+    origin = schema.origin(scene.attrs)
     return xr.Dataset(variables, {**coords, "quantity": list(QUANTITIES)}, origin)

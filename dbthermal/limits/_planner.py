@@ -146,10 +146,16 @@ def plan(
     bodies = [TopHat(bands.get(name), temperature) for name in names]
     # Deviations of each combination for every material.
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
-    cases = [
-        _expected(truth, [bodies[band] for band in chosen], std[chosen])
-        for truth, chosen in zip(truths, sets, strict=True)
-    ]
+    cases = []  # temperatures (material), the others (band, material)
+    for truth, chosen in zip(truths, sets, strict=True):
+        behind, noises = [bodies[band] for band in chosen], std[chosen]
+        order = smallest_order(truth, truth.sensitivity(behind, noises))
+        sensitivity = truth.smoothed(order).sensitivity(behind, noises)
+        stds = deviations(sensitivity, truth.time, order, reference=0)
+        for name in TEMPERATURES:
+            stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
+        stds["condition_number"] = mixing.condition_number(truth.emissivity.T)
+        cases.append(stds)
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
@@ -246,25 +252,11 @@ def _sky(emissivity: Array, noise: Array, names: list[str]) -> Array:
 def _emissivities(table: xr.Dataset) -> Array:
     """Emissivity (band, material) of a table, in (0, 1)."""
     values = schema.check(table, "emissivity_table")["emissivity"]
-    bad = np.argwhere(~((values.values > 0) & (values.values < 1)))
-    if bad.size:
-        row, column = bad[0]
-        raise ValueError(
-            f"Invalid emissivity {values.values[row, column]} of "
-            f"'{values['material'].values[row]}' in band '{values['band'].values[column]}'. "
-            "Must lie in (0, 1)."
-        )
+    for row, column in np.argwhere(~((values.values > 0) & (values.values < 1))):
+        material, band = values["material"].values[row], values["band"].values[column]
+        label = f"Invalid emissivity {values.values[row, column]} of '{material}' in band '{band}'"
+        raise ValueError(f"{label}. Must lie in (0, 1).")
     return np.asarray(values.values.T, dtype=np.float64)
-
-
-def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:
-    """Deviations of one combination: temperatures (material), the others (band, material)."""
-    order = smallest_order(truth, truth.sensitivity(bodies, noise))
-    sensitivity = truth.smoothed(order).sensitivity(bodies, noise)
-    stds = deviations(sensitivity, truth.time, order, reference=0)
-    for name in TEMPERATURES:
-        stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
-    return stds | {"condition_number": mixing.condition_number(truth.emissivity.T)}
 
 
 def _dataset(

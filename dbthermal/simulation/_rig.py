@@ -154,11 +154,11 @@ def observe(
         clean = mixing.leaving(emissivity, emitted[index], reflected[index])
         noise = float(response["noise"].sel(band=name))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
-    twin = {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
+    attrs = {"origin": "simulated"}
+    attrs |= {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
     coords = {"band": names, **{name: scene[name] for name in ("time", "y", "x")}}
     variables = schema.variables("corrected", {"counts": movie})
-    result = xr.Dataset(variables, coords, {"origin": "simulated", **twin})
-    return schema.check(result, "corrected")
+    return schema.check(xr.Dataset(variables, coords, attrs), "corrected")
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
@@ -286,10 +286,8 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too
-        raise ValueError(
-            f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'. "
-            f"Must lie in [0, {correction.DETECTOR_MAXIMUM}]."
-        )
+        message = f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'"
+        raise ValueError(f"{message}. Must lie in [0, {correction.DETECTOR_MAXIMUM}].")
     return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
 
 

@@ -295,7 +295,6 @@ def increasing(times: npt.ArrayLike, name: str) -> Array:
     # A NaN fails the comparison, too.
     wrong = np.flatnonzero(~np.isfinite(array) | ~(np.diff(array, prepend=-np.inf) > 0))
     if wrong.size:
-        raise ValueError(
-            f"Invalid time {array[wrong[0]]} s of {name}. Must be finite, and increase strictly."
-        )
+        rule = "Must be finite, and increase strictly"
+        raise ValueError(f"Invalid time {array[wrong[0]]} s of {name}. {rule}.")
     return array

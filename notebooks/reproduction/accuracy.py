@@ -1,9 +1,10 @@
 """Tables of docs/accuracy.md, and the paper's figure 6 in README.md, from the reference numbers."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
+from reproduction.numbers import table
 from reproduction.paper import SCENE_ERRORS, Numbers
 
 MARKS: Final = ("<!-- accuracy, by make record -->", "<!-- end of accuracy -->")
@@ -144,9 +145,9 @@ def markdown(numbers: Numbers) -> str:
             for stem, lines in sources.items()
             for quantity, pattern, unit in lines
         ]
-        parts.append(_table(title, [("quantity", "value"), *rows]))
+        parts.append(f"## {title}\n\n{table([('quantity', 'value'), *rows])}")
     for title, (stem, pattern, heads) in _TABLES.items():
-        parts.append(_table(title, _pivot(numbers.get(stem, {}), pattern, heads)))
+        parts.append(f"## {title}\n\n{table(_pivot(numbers.get(stem, {}), pattern, heads))}")
     return "\n\n".join(parts) + "\n"
 
 
@@ -156,20 +157,7 @@ def figure_6(numbers: Numbers) -> str:
     for scene, errors in SCENE_ERRORS.items():
         ours = _value(numbers, "08_twins", f"{scene}: error of subspace", "")
         rows.append((_WORDS.get(scene, scene), f"{errors['subspace']:g} %", f"{ours} %"))
-    return "\n".join(_lines(rows)) + "\n"
-
-
-def _table(title: str, rows: Iterable[tuple[str, ...]]) -> str:
-    """Heading and table."""
-    return "\n".join([f"## {title}", "", *_lines(rows)])
-
-
-def _lines(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
-    """Lines of a table in Markdown, the first row as its head."""
-    for number, row in enumerate(rows):
-        yield f"| {' | '.join(row)} |"
-        if number == 0:
-            yield "|---" * len(row) + "|"
+    return table(rows) + "\n"
 
 
 def _value(numbers: Numbers, stem: str, pattern: str, unit: str) -> str:

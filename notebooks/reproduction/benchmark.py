@@ -27,10 +27,11 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment, separation, simulation, store
-from reproduction import experiments, paths, verify
 from reproduction import methods as outside
+from reproduction import numbers, paths, verify
+from reproduction.experiments import cases
+from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.pictures import Picture, smooth_shift
-from reproduction.experiments.scores import held, rmse
 
 T = TypeVar("T")
 
@@ -49,11 +50,9 @@ CAMERAS: Final[Mapping[str, Mapping[str, Any]]] = {
 """Scenes by the cameras' places and the object's heating."""
 
 WHOLE_SCENES: Final = ("one place", "apart")
-SHORT: Final = 8.0
-"""Time from which a call is measured once, not twice [s]."""
+SHORT: Final = 8.0  # time from which a call is measured once, not twice [s]
 
-LONGEST_WHOLE: Final = 900.0
-"""Time of one thread from which a whole frame is left out [s]."""
+LONGEST_WHOLE: Final = 900.0  # time of one thread from which a whole frame is left out [s]
 
 USUAL: Final = {"pixels": 512, "frames": 350, "bands": 2}
 SERIES: Final = {
@@ -151,17 +150,15 @@ def whole_frame(cameras: str, path: Path) -> tuple[float, float]:
 
     In a process of its own, which holds the capture; another one draws it.
     """
-    found = (0.0, 0.0)
-    for step in (partial(_draw, cameras, path), partial(_separate, path)):
-        with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
-            found = fresh.submit(step).result()
-    return found
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        fresh.submit(_draw, cameras, path).result()
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        return fresh.submit(_separate, path).result()
 
 
-def _draw(cameras: str, path: Path) -> tuple[float, float]:
+def _draw(cameras: str, path: Path) -> None:
     """Draw and save a capture of a whole frame."""
     store.save(scene(cameras, WHOLE)[["counts"]], path, {})
-    return (0.0, 0.0)
 
 
 def _separate(path: Path) -> tuple[float, float]:
@@ -181,29 +178,16 @@ def peak_memory() -> float:
 
 def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
     """Yield the head of a table and a row for each call."""
-    yield (
-        "call",
-        "cameras",
-        "us a pixel",
-        "frames/s of 640x512, two cores, from it",
-        "measured",
-        "peak memory",
-        "error",
-        "95 % intervals",
-    )
+    times = ("us a pixel", "frames/s of 640x512, two cores, from it", "measured")
+    yield ("call", "cameras", *times, "peak memory", "error", "95 % intervals")
     for (function, cameras), call in calls.items():
         rate = 2 * FRAMES / (call.pixel * math.prod(WHOLE))
-        whole = np.isfinite(call.frame_rate)
-        yield (
-            f"`{function}`",
-            cameras,
-            f"{1e6 * call.pixel:.0f}",
-            f"{rate:.2g}",
-            f"{call.frame_rate:.2g}" if whole else "",
-            f"{1e-9 * call.peak:.1f} GB" if whole else "",
-            f"{call.rmse:.3f} K",
-            f"{100 * call.cover:.1f} %",
-        )
+        whole = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"]
+        if not np.isfinite(call.frame_rate):
+            whole = ["", ""]
+        errors = (f"{call.rmse:.3f} K", f"{100 * call.cover:.1f} %")
+        cost = (f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *whole)
+        yield (f"`{function}`", cameras, *cost, *errors)
 
 
 @lru_cache
@@ -217,7 +201,7 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     """Simulated plate glass of so many pixels; beyond 128 those are repeated in another order."""
     few, rig = min(pixels, 128), simulation.Rig(bands=BANDS[:bands], noise=NOISE[:bands])
     glass: dict[str, Any] = {"emissivity": list(EMISSIVITY[:bands]), "start": 20, "stop": 60}
-    row = experiments.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
+    row = cases.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
     rng, counts = np.random.default_rng(1), row["counts"].values.reshape(bands, frames, few)
     # Frames as a store gives them: an index of NumPy would leave pixels the slowest axis.
     some = [counts.take(rng.permutation(few), axis=2) for _ in range(pixels // few)]
@@ -311,18 +295,12 @@ Bands: of {pixels} pixels, over the time of two.
 """
 
 
-def rows(*cells: Sequence[str]) -> str:
-    """Table in Markdown of a head and rows."""
-    head, *rest = [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
-
-
 def default_figures(calls: Calls, busy: float) -> str:
     """Figures of the default call, in Markdown."""
     height, width = SHAPE
     size = {"rows": height, "columns": width, "frames": FRAMES}
-    table = rows(*default_rows(calls))
-    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=table)
+    rows = numbers.table(default_rows(calls))
+    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=rows)
 
 
 def table(default: str, times: Times, busy: float) -> str:
@@ -346,7 +324,7 @@ def methods(times: Times) -> str:
         size, span = str(max(of_pixels[method])), " to ".join(map(str, ends))
         of_pixel = (f"{1e6 * seconds:.0f}", f"{seconds / cost['subspace']:.2g}", size)
         lines.append((f"`{method}`", *of_pixel, samples, span, more))
-    return rows(*lines)
+    return numbers.table(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 """Disturbances of real cameras, added one by one to a perfect capture, each with its truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -8,7 +8,6 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import Array
 from dbthermal.correction._temporal import lag_coefficients
 from dbthermal.simulation import observe
 
@@ -29,34 +28,14 @@ def expose(
 ) -> xr.Dataset:
     r"""Capture of bands that are exposed at different times, with time stamps.
 
-    The scene has a fine clock; frame n of band m is exposed at its step :math:`o_m + n \, q_m`.
+    The scene, as for `observe`, has a clock finer than the frames; frame n of band m is exposed at
+    its step :math:`o_m + n \, q_m`: offsets o, one a band, and steps `every` frame q, of each band
+    or of all. The response has `noise`.
 
-    Parameters
-    ----------
-    scene : Dataset
-        See `observe`; its times are finer than the frames'.
-    response : Dataset
-        With `noise`, e.g. from `Rig.response`.
-    rng : Generator
-        Source of the noise.
-    every : int or sequence of int
-        q, steps of the fine clock from frame to frame; of each band, or of all.
-    offsets : sequence of int
-        o, step of each band's first frame.
-    frames : int
-        Number of frames.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, time, y, x) [count], and `exposure_time` (band, time) [s], the true times
-        on the scene's clock: drop the variable for cameras without stamps. `time` is that of the
-        first band.
-
-    Raises
-    ------
-    ValueError
-        If there are not as many offsets and rates as bands, or a frame lies outside the scene.
+    The result has `counts` (band, time, y, x) [count], and `exposure_time` (band, time) [s], the
+    true times on the scene's clock: drop the variable for cameras without stamps. `time` is that of
+    the first band. ValueError if there are not as many offsets and rates as bands, or a frame lies
+    outside the scene.
     """
     bands = schema.check(response, "response").sizes["band"]
     last = schema.check(scene, "separated", ("object_temperature",), "the scene").sizes["time"] - 1
@@ -72,35 +51,27 @@ def expose(
             f"and lie in [0, {last}], the steps of the scene."
         )
     stamps = scene["time"].values[steps]
-    bands_exposed = [
-        observe(scene.isel(time=row), response.isel(band=[place]), rng).assign_coords(
-            time=("time", stamps[0], scene["time"].attrs)
-        )
-        for place, row in enumerate(steps)
-    ]
-    together = xr.concat(bands_exposed, dim="band", combine_attrs="override")
+    clock = ("time", stamps[0], scene["time"].attrs)
+    views = [scene.isel(time=row).assign_coords(time=clock) for row in steps]
+    together = by_cameras(views, response, rng)
     exposed = schema.variables("corrected", {"exposure_time": stamps})
     return schema.check(together.assign(exposed), "corrected")
+
+
+def by_cameras(
+    views: Iterable[xr.Dataset], response: xr.Dataset, rng: np.random.Generator
+) -> xr.Dataset:
+    """Capture, as of `observe`, of a scene for each band of a response: what its camera sees."""
+    pairs = enumerate(views)
+    parts = [observe(view, response.isel(band=[band]), rng) for band, view in pairs]
+    return xr.concat(parts, "band", combine_attrs="override")
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """Replace lost frames at random by the one before, as a driver does that stamps none.
 
-    The result has no `exposure_time`, but `repeated` (band, time), bool.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    share : float
-        Share of frames that are lost, in [0, 1).
-    rng : Generator
-        Source of the losses.
-
-    Raises
-    ------
-    ValueError
-        If the share is outside, or the dataset is not of the stage.
+    The result has no `exposure_time`, but `repeated` (band, time), bool. ValueError if the share of
+    lost frames lies outside [0, 1), or the dataset is not of the stage `corrected`.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= _numbers.real_number("share", share) < 1:
@@ -126,18 +97,9 @@ def fire_shutter(
 ) -> xr.Dataset:
     """Shutter events: a frozen image while it is closed, new offsets of the pixels afterwards.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    times : array_like, shape (event,)
-        Times in the capture at which the shutter closes [s]; the frame before is repeated.
-    rng : Generator
-        Source of the offsets.
-    duration, offset_std : float
-        Time for which it stays closed [s]; standard deviation of a pixel's step [count].
-    bands : tuple of str, optional
-        Bands whose cameras close; by default all.
+    The shutter closes at times (event,) in the capture, stage `corrected`, for a duration [s], and
+    the frame before is repeated; then each pixel steps by `offset_std` [count], standard deviation.
+    Only the cameras of some bands close, if they are named.
 
     Examples
     --------
@@ -159,9 +121,8 @@ def fire_shutter(
     places = schema.band_positions(counts, names, "the capture")
     for time in np.sort(np.atleast_1d(_numbers.real_numbers("times [s]", times))):
         if not clock[0] <= time <= clock[-1]:
-            raise ValueError(
-                f"Invalid time {time} s of the shutter. Must lie in [{clock[0]}, {clock[-1]}] s."
-            )
+            rule = f"Must lie in [{clock[0]}, {clock[-1]}] s"
+            raise ValueError(f"Invalid time {time} s of the shutter. {rule}.")
         first, after = np.searchsorted(clock, [time, time + duration], side="right")
         for band in places:
             movie = counts.values[band]
@@ -174,16 +135,8 @@ def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) 
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
     Noisy pixels have 15 counts more noise; blinking ones step by 60, every 3 s on average and at
-    least once. The result has `spoiled` (band, y, x), int8, the position in `SPOILED`.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    share : float
-        Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
-    rng : Generator
-        Source of the pixels and of their signals.
+    least once. The share in [0, 1) is that of a band, a third of each kind on average. The result,
+    of the stage `corrected`, has `spoiled` (band, y, x), int8, the position in `SPOILED`.
     """
     counts = _floating(corrected)
     if not 0 <= _numbers.real_number("share", share) < 1:
@@ -197,7 +150,11 @@ def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) 
             case "noisy":
                 signal += rng.normal(0.0, _NOISE, frames).astype(signal.dtype)
             case "blinking":
-                signal += (_STEP * _telegraph(time, _DWELL, rng)).astype(signal.dtype)
+                # Random telegraph signal of 0 and 1 with a mean dwell time and at least a step.
+                chance, level = -np.expm1(-np.diff(time) / _DWELL), np.zeros(time.size)
+                steps = np.flatnonzero(rng.random(chance.size) < chance)
+                level[1 + (steps if steps.size else rng.integers(0, chance.size, 1))] = 1.0
+                signal += (_STEP * (np.cumsum(level) % 2)).astype(signal.dtype)
             case "stuck":
                 signal[:] = signal[0]
     numbers = np.arange(len(SPOILED), dtype=np.int8)
@@ -211,15 +168,9 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
-    at rest before the first frame; `correction.undo_lag` is the inverse.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, without noise: that of the read-out does not pass through
-        the pixel.
-    time_constant : float or DataArray
-        Time constant [s], of all bands or (band), by name.
+    at rest before the first frame, of a time constant [s], of all bands or (band), by name;
+    `correction.undo_lag` is the inverse. The capture, stage `corrected`, is without noise: that of
+    the read-out does not pass through the pixel.
 
     Examples
     --------
@@ -245,14 +196,3 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 def _floating(corrected: xr.Dataset) -> xr.DataArray:
     """Floating copy of the counts of a capture."""
     return schema.check_corrected(corrected)["counts"].copy(deep=True)
-
-
-def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
-    """Random telegraph signal (time) of 0 and 1 with a mean dwell time [s] and at least a step."""
-    chance = -np.expm1(-np.diff(time) / dwell)
-    steps = np.flatnonzero(rng.random(chance.size) < chance)
-    if steps.size == 0:
-        steps = rng.integers(0, chance.size, 1)
-    level = np.zeros(time.size)
-    level[steps + 1] = 1.0
-    return np.asarray(np.cumsum(level) % 2)

@@ -13,19 +13,11 @@ _NUMBERS = schema.Variable(("material", "first", "second"), "float64", "1", "con
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
-    """Condition number of the mixing matrix for each material and pair of bands.
+    """Condition number (material, first, second) [1] of the mixing matrix of each pair of bands.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table` of `schema`, of at least two bands, its emissivities NaN or within
-        `schema.EMISSIVITY_LIMITS`, or a ValueError.
-
-    Returns
-    -------
-    DataArray
-        Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
-        where the two emissivities are equal. See `mixing.condition_number`.
+    Of a table, stage `emissivity_table`, of at least two bands, its emissivities NaN or within
+    `schema.EMISSIVITY_LIMITS`, or a ValueError. Symmetric; infinite on the diagonal and where the
+    two emissivities are equal. See `mixing.condition_number`.
 
     Examples
     --------
@@ -34,7 +26,9 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     >>> numbers.sel(material=["plate window glass", "water"]).values.round(1).tolist()
     [9.4, 649.2]
     """
-    values = _emissivities(table)
+    values = schema.check(table, "emissivity_table")["emissivity"]
+    tabulated = values.values[~np.isnan(values.values)]  # averages of measured spectra may exceed 1
+    _numbers.real_numbers("emissivity of the table", tabulated, within=schema.EMISSIVITY_LIMITS)
     names = values["band"].values
     if len(names) < 2:
         raise ValueError(f"Invalid bands {names.tolist()} of the table. Must be at least two.")
@@ -49,20 +43,12 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
 
 
 def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
-    """Condition number of each pair of bands, over the materials.
+    """Condition number of each pair of bands, over the materials, of `condition_numbers`.
 
-    Parameters
-    ----------
-    numbers : DataArray
-        Condition numbers (material, first, second) [1], from `condition_numbers`.
-
-    Returns
-    -------
-    Dataset
-        `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
-        materials in the mean. A gray material counts in the median as infinite and not in the mean,
-        which a few nearly gray ones govern: choose by the median. Both are infinite where every
-        material is gray, as on the diagonal.
+    `median` and `mean` (first, second) [1], and `finite` (first, second), the number of materials
+    in the mean. A gray material counts in the median as infinite and not in the mean, which a few
+    nearly gray ones govern: choose by the median. Both are infinite where every material is gray,
+    as on the diagonal.
 
     Examples
     --------
@@ -74,17 +60,13 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     schema.check_variable(numbers, _NUMBERS, "the condition numbers")
     finite = numbers.copy(data=np.isfinite(numbers.values))
     mean = numbers.where(finite).mean("material").fillna(np.inf)
+    median, count = numbers.median("material", skipna=False), finite.sum("material")
     statistics = {
-        "median": (numbers.median("material", skipna=False), "condition number, median"),
-        "mean": (mean, "its finite mean"),
-        "finite": (finite.sum("material"), "materials with a finite condition number"),
+        "median": median.assign_attrs(long_name="condition number, median"),
+        "mean": mean.assign_attrs(long_name="its finite mean"),
+        "finite": count.assign_attrs(long_name="materials with a finite condition number"),
     }
-    return xr.Dataset(
-        {
-            name: values.assign_attrs(units="1", long_name=meaning)
-            for name, (values, meaning) in statistics.items()
-        }
-    )
+    return xr.Dataset({name: it.assign_attrs(units="1") for name, it in statistics.items()})
 
 
 def rank_filters(
@@ -94,26 +76,17 @@ def rank_filters(
 
     The first criterion is the paper's, the lowest condition number (its section 5 says highest, a
     slip). The second is the standard deviation of the object temperature from one frame, which
-    includes the noise of a narrow filter. Both are medians over the materials.
+    includes the noise of a narrow filter, (band) [K] as from `filter_noise`. Both are medians over
+    the materials of a table, stage `emissivity_table`.
 
-    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`
-    and another, or the noise lacks a band, is in another unit, or is not finite and positive.
+    TypeError or ValueError if the table is not as for `condition_numbers` or has no band `beside`,
+    the camera's own, and another, or the noise lacks a band, is in another unit, or is not finite
+    and positive.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `filter_noise`.
-    beside : str
-        Name of the camera's own band.
-
-    Returns
-    -------
-    Dataset
-        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
-        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
-        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
+    The result has, each (band) in the order of the first criterion: `condition_number` [1];
+    `condition_number_mean` [1], over the materials where it is finite; `object_temperature_std`
+    [K]; `noise` [K]. Attributes `lowest_condition_number` and `lowest_std` name the filter of each
+    criterion.
 
     Examples
     --------
@@ -172,11 +145,3 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, camera_band: str) 
         name="object_temperature_std",
         attrs={"units": "K", "long_name": "standard deviation of the object temperature"},
     )
-
-
-def _emissivities(table: xr.Dataset) -> xr.DataArray:
-    """Checked emissivity (material, band) of a table; averages of measured spectra may exceed 1."""
-    values = schema.check(table, "emissivity_table")["emissivity"]
-    tabulated = values.values[~np.isnan(values.values)]
-    _numbers.real_numbers("emissivity of the table", tabulated, within=schema.EMISSIVITY_LIMITS)
-    return values

@@ -5,37 +5,23 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
+from dbthermal._arrays import Array
 from dbthermal.readers._spectra import File, spectrum
-
-Array = npt.NDArray[np.float64]
 
 
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
     r"""Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with a column ``wavelength`` [micrometre], in steps that change little from one to the
-        next, and one of emissivity [1] per sample.
-    reach : tuple of float
-        Wavelengths that the table must reach [micrometre], so that a file that was cut is refused;
-        by default those of the library.
+    A file with a column ``wavelength`` [micrometre], in steps that change little from one to the
+    next, and one of emissivity [1] per sample. The table must `reach` these wavelengths
+    [micrometre], by default those of the library, so that a file that was cut is refused. Maps the
+    sample code, such as ``"A001"``, to a spectrum as `ecostress`.
 
-    Returns
-    -------
-    dict of str to Dataset
-        Sample code, such as ``"A001"``, to a spectrum as `ecostress`.
-
-    Raises
-    ------
-    OSError, ValueError
-        As `ecostress`, or if the columns are not these, a row is short, missing or added, or the
-        table does not reach so far.
+    OSError or ValueError as `ecostress`, or if the columns are not these, a row is short, missing
+    or added, or the table does not reach so far.
 
     References
     ----------
@@ -57,9 +43,8 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
     titles, rows = _table(path)
     codes = titles[1:]
     if titles[0] != "wavelength" or not codes or len({*codes}) < len(codes):
-        raise ValueError(
-            f"Invalid columns {titles} in '{path.name}'. Must be 'wavelength' and distinct codes."
-        )
+        rule = "Must be 'wavelength' and distinct codes"
+        raise ValueError(f"Invalid columns {titles} in '{path.name}'. {rule}.")
     wavelength, *samples = texts.numbers(rows, len(titles), path.name).T
     notes, file = {"type": "manmade", "measurement": "emissivity"}, File(path.name, rows)
     return {
@@ -71,18 +56,9 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
     r"""Spectrum, as `ecostress`, of the MODIS UCSB emissivity library in comma-separated columns.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>``
-        emissivity [1], in steps as for `slum`.
-    reach : tuple of float
-        Wavelengths that the table must reach [micrometre], as for `slum`.
-
-    Raises
-    ------
-    OSError, ValueError
-        As `slum`, or if wavelength and wavenumber disagree by more than 0.1 %.
+    Columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>`` emissivity
+    [1], in steps and with a `reach` as for `slum`. OSError or ValueError as `slum`, or if
+    wavelength and wavenumber disagree by more than 0.1 %.
 
     Examples
     --------
@@ -120,14 +96,8 @@ def _reaching(
     file: File,
     reach: tuple[float, float],
 ) -> xr.Dataset:
-    """Spectrum of a table without a missing row."""
+    """Spectrum of a table; ValueError if rows are missing, at the ends or between two others."""
     result = spectrum(wavelength, emissivity, notes, file)
-    _check_reach(wavelength, reach, file)
-    return result
-
-
-def _check_reach(wavelength: Array, reach: tuple[float, float], file: File) -> None:
-    """Raise ValueError if rows are missing, at the ends or between two others."""
     (low, high), (shortest, longest) = (wavelength.min(), wavelength.max()), reach
     if low > shortest or high < longest:
         raise ValueError(
@@ -136,9 +106,10 @@ def _check_reach(wavelength: Array, reach: tuple[float, float], file: File) -> N
         )
     steps = np.abs(np.diff(1 / wavelength))
     if steps.size < 3:
-        return
+        return result
     # A missing row makes a step twice as long as those beside it, whatever the grid.
     neighbour = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
     for i in np.flatnonzero(steps > 1.6 * neighbour) + 1:
         step = f"Uneven step to {wavelength[i]:g} micrometres, longer than those beside it"
         raise ValueError(f"{file.at(i)}: {step}. Must follow the row before: rows are missing.")
+    return result

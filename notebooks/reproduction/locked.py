@@ -30,17 +30,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-LOCK: Final = ".make.lock"
-"""File in the checkout that is locked; while it is, it says by whom."""
+LOCK: Final = ".make.lock"  # file in the checkout that is locked; while it is, it says by whom
 
-HELD: Final = "DBTHERMAL_LOCK"
-"""Variable with the number of the open file that holds the lock."""
+HELD: Final = "DBTHERMAL_LOCK"  # variable with the number of the open file that holds the lock
 
 LOCKED: Final = "DBTHERMAL_LOCKED"
 """Variable with the folder that is locked, which tells the Makefile that it is."""
 
-MIRROR: Final = "DBTHERMAL_DATA"
-"""Variable that names the folder with a copy of the outside files."""
+MIRROR: Final = "DBTHERMAL_DATA"  # variable that names the folder with a copy of the outside files
 
 _PATIENCE: Final = 3.0  # the kernels of a make that was killed notice it within a second [s]
 _POLL: Final = 0.2  # [s]

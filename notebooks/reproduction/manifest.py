@@ -228,13 +228,11 @@ def _download(file: File) -> Callable[[str, str, object], None]:
             while part := response.raw.read1(2**16, decode_content=False):
                 size += output.write(part)
                 if size > file.bytes:
-                    raise OSError(
-                        f"Invalid size of '{url}'. Must be the listed {file.bytes} bytes."
-                    )
+                    rule = f"Must be the listed {file.bytes} bytes"
+                    raise OSError(f"Invalid size of '{url}'. {rule}.")
                 if time.monotonic() > end:
-                    raise OSError(
-                        f"Slow download of '{url}'. Must have {_SLOWEST} bytes/s or more."
-                    )
+                    rule = f"Must have {_SLOWEST} bytes/s or more"
+                    raise OSError(f"Slow download of '{url}'. {rule}.")
 
     return download
 
@@ -245,22 +243,18 @@ def _check_redirect(response: requests.Response, **_: object) -> None:
         response.close()
         following = urljoin(response.url, response.headers["location"])
         if urlsplit(following).scheme not in {urlsplit(response.url).scheme, "https"}:
-            raise OSError(
-                f"Invalid redirect of '{response.url}' to '{following}'. Must stay at its scheme."
-            )
+            rule = "Must stay at its scheme"
+            raise OSError(f"Invalid redirect of '{response.url}' to '{following}'. {rule}.")
 
 
 def _verified(path: Path, file: File) -> Path:
     """Path of a file that exists and has the listed checksum."""
     if not path.is_file():
-        raise FileNotFoundError(
-            f"Missing file '{path}'. Must be in the folder {locked.MIRROR} names."
-        )
+        rule = f"Must be in the folder {locked.MIRROR} names"
+        raise FileNotFoundError(f"Missing file '{path}'. {rule}.")
     if (sha256 := store.checksum(path)) != file.sha256:
-        raise ValueError(
-            f"Wrong checksum of '{path}': {sha256}. Must be {file.sha256}; remove the file and "
-            "fetch it again."
-        )
+        rule = f"Must be {file.sha256}; remove the file and fetch it again"
+        raise ValueError(f"Wrong checksum of '{path}': {sha256}. {rule}.")
     return path
 
 

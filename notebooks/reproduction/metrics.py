@@ -1,9 +1,4 @@
-"""Agreement of maps with a reference.
-
-Arguments are labelled arrays of the same coordinates, bands by name; a reference of fewer dims is
-broadcast, and one of other dims refused. A value inside the mask that is not finite is an error: an
-average over the pixels that happened to work would flatter the method.
-"""
+"""Agreement of maps with a reference, and reflections as pictures."""
 
 import numpy as np
 import xarray as xr
@@ -22,15 +17,9 @@ def correlation(
 ) -> xr.DataArray:
     """Pearson's correlation of two maps, in [-1, 1], over the dims other than y and x.
 
-    ValueError if dims or places differ, fewer than two pixels count, one is not finite, or a map is
-    constant.
-
-    Parameters
-    ----------
-    first, second : DataArray
-        Maps (..., y, x), each in a unit of its own.
-    mask : DataArray of bool, optional
-        Pixels (y, x) that count; all by default.
+    Of maps (..., y, x), each in a unit of its own, over the pixels (y, x) of a mask, all by
+    default. ValueError if dims or places differ, fewer than two pixels count, one is not finite, or
+    a map is constant.
 
     Examples
     --------
@@ -63,13 +52,9 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     .. math:: 100 \, |\hat T - T| / (T - 273.15)
 
     The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
-    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled.
-
-    Parameters
-    ----------
-    estimate, truth : DataArray
-        Temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError.
-        The result is NaN where the estimate is.
+    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled. Both
+    are temperatures [K] of the same coordinates, the true ones above 273.15 K, or a ValueError. NaN
+    where the estimate is.
 
     Examples
     --------
@@ -97,9 +82,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
 def _require_dims(reference: xr.DataArray, values: xr.DataArray) -> None:
     """Refuse a reference with a dim that the other array lacks, which would multiply its pixels."""
     if not {*reference.dims} <= {*values.dims}:
-        raise ValueError(
-            f"Invalid dims {reference.dims} of the reference. Must be among {values.dims}."
-        )
+        rule = f"Must be among {values.dims}"
+        raise ValueError(f"Invalid dims {reference.dims} of the reference. {rule}.")
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
@@ -123,3 +107,57 @@ def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
     # The correlation has no unit: in that of the largest value no square overflows.
     chosen /= max(float(np.abs(chosen).max()), np.finfo(np.float64).tiny)
     return np.asarray(chosen - chosen.mean(axis=-1, keepdims=True))
+
+
+def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
+    r"""Change of the first band's apparent temperature that the reflection causes.
+
+    .. math:: (1 - e_1) (y - \bar y)
+
+    with the mean over time, in the linear response of small changes, (time, y, x) [K], float32; NaN
+    where the reflection is unknown. Of a constant object without a completed background it is the
+    change of the apparent temperature. That is of the inputs (band, time, y, x) [K], from
+    `response.apparent_temperature`; the result from `solve`, `separate` or `complete`, of the same
+    capture. ValueError if a variable is missing, emissivities are in per cent, or the first bands,
+    dims, sizes or coordinates differ.
+
+    Examples
+    --------
+    Plate glass, of reflectivity 0.14, reflects people who are 10 K warmer than the room:
+
+    >>> import numpy as np
+    >>> from dbthermal import response, separation, simulation
+    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
+    >>> glass = xr.DataArray([0.86, 0.72], coords={"band": list(rig.bands)}, dims="band")
+    >>> scene = simulation.walkers(np.arange(200) / 10, (4, 6), glass, rng)
+    >>> capture = simulation.observe(scene, rig.response(), rng)
+    >>> apparent = response.apparent_temperature(rig.response(), capture["counts"])
+    >>> change = reflected_change(apparent, separation.solve(capture, rig.response()))
+    >>> bool(1.2 < (change.max("time") - change.min("time")).median() < 1.8)  # 1.4 K and noise
+    True
+    """
+    schema.check_numbers(apparent, "the apparent temperature", "K")
+    schema.require(result, xr.Dataset, "result")
+    if apparent.dims != ("band", "time", "y", "x"):
+        rule = "Must be ('band', 'time', 'y', 'x')"
+        raise ValueError(f"Invalid dims {apparent.dims} of the apparent temperature. {rule}.")
+    if str(apparent["band"].values[0]) != str(result["band"].values[0]):
+        raise ValueError(
+            f"Invalid first band '{apparent['band'].values[0]}'. "
+            f"Must be '{result['band'].values[0]}', as in the result."
+        )
+    needed = ("background_temperature", "emissivity", "status")
+    schema.check(result, "separated", needed, "the result")
+    if (usual := float(result["emissivity"].median())) > schema.EMISSIVITY_LIMITS[1]:
+        message = f"Invalid emissivities of the result, {usual:.3g} in the median"
+        raise ValueError(f"{message}. Must be shares of one, not per cent.")
+    first = apparent.isel(band=0, drop=True)
+    first = laid_on(first, result, "the apparent temperature", "the result")
+    background = result["background_temperature"]
+    reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
+    change = (background - background.mean("time")) * reflectivity
+    constant = (result["status"] & int(schema.Status.CONSTANT_OBJECT)) != 0
+    without = constant & background.isnull().all("time")
+    change = change.where(~without, first - first.mean("time"))
+    attrs = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
+    return change.astype("float32").rename("reflected_change").assign_attrs(attrs)

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,10 @@ Number = float | int | str | bool
 def save(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """Save headline numbers as strict JSON, with sorted names.
+    """Save headline numbers as strict JSON, with sorted names, and a provenance, see `store.save`.
 
-    Parameters
-    ----------
-    numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
-        TypeError or ValueError for any other value.
-    path, provenance : str or Path, mapping
-        File ``*.json``; see `store.save`.
+    Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; TypeError
+    or ValueError for any other value.
 
     Examples
     --------
@@ -51,16 +46,8 @@ def save(
 def read(path: str | Path) -> dict[str, Number]:
     """Read a file of `save`: name to value.
 
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.json``.
-
-    Raises
-    ------
-    ValueError
-        With file and line, if it is not such a file, a name is listed twice, a number is not
-        finite, or it differs from what was written.
+    ValueError with the file if it is not such a file, a name is listed twice, a number is not
+    finite, or it differs from what was written.
     """
     content = _parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
@@ -68,6 +55,17 @@ def read(path: str | Path) -> dict[str, Number]:
     if content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
     return dict(content["numbers"])
+
+
+def table(rows: Iterable[Sequence[str]]) -> str:
+    """Table in Markdown, the first row as its head."""
+    head, *lines = rows
+    rule = "|---" * len(head) + "|"
+    return "\n".join([_row(head), rule, *map(_row, lines)])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _digest(content: Mapping[str, Any]) -> str:

@@ -51,9 +51,8 @@ def read(stem: str, files: Iterable[Path], texts: Iterable[tuple[str, str]] = ()
         content = readers.read_yaml(path)
         check(content, small, f"'{path}'")
         if path.absolute() == paths.params(stem) and (missing := small.keys() - content.keys()):
-            raise ValueError(
-                f"Missing parameter '{min(missing)}' in '{path}'. Must have all values."
-            )
+            rule = "Must have all values"
+            raise ValueError(f"Missing parameter '{min(missing)}' in '{path}'. {rule}.")
         values |= content
     for name, text in texts:
         if name in named:
@@ -72,9 +71,8 @@ def check(values: Mapping[str, Any], small: Mapping[str, Any], source: str) -> N
     """
     for name, value in values.items():
         if name not in small:
-            raise ValueError(
-                f"Unknown parameter '{name}' in {source}. Must be one of {sorted(small)}."
-            )
+            message = f"Unknown parameter '{name}' in {source}"
+            raise ValueError(f"{message}. Must be one of {sorted(small)}.")
         place, known = f"parameter '{name}' in {source}", small[name]
         _check_kind(place, value, known, whole=type(known) is int)
         if type(known) is int and known >= 0 > value:

@@ -32,10 +32,8 @@ def root() -> Path:
         for folder in (start, *start.parents):
             if (folder / _MARKER).is_file():
                 return folder
-    raise FileNotFoundError(
-        f"No {_MARKER} in or above '{starts[0]}', nor '{starts[1]}'. "
-        "Must be run inside the project's folder."
-    )
+    rule = "Must be run inside the project's folder"
+    raise FileNotFoundError(f"No {_MARKER} in or above '{starts[0]}', nor '{starts[1]}'. {rule}.")
 
 
 def manifest() -> Path:
@@ -80,9 +78,8 @@ def results(run: str) -> Path:
 def result(run: str, stem: str, ending: str) -> Path:
     """File or folder of one result; `ending` follows the stem: ``".zarr"``, ``"_scene.png"``."""
     if not re.fullmatch(r"(_[a-z0-9_-]+)?\.[a-z0-9]+", ending):
-        raise ValueError(
-            f"Invalid ending {ending!r}. Must be '.suffix' or '_name.suffix', in lower case."
-        )
+        rule = "Must be '.suffix' or '_name.suffix', in lower case"
+        raise ValueError(f"Invalid ending {ending!r}. {rule}.")
     return results(run) / f"{_stem(stem)}{ending}"
 
 

@@ -29,15 +29,10 @@ _RATE = 10.0  # of the pane's capture [Hz]
 
 
 def readings(path: Path) -> xr.DataArray:
-    r"""Temperatures (band, time) [K] of a day, as of blackbodies; time [s] from midnight, UTC.
+    r"""Temperatures (band, time) [K] of the day of a file `TOWER`, as of blackbodies; UTC [s].
 
     Of the pyrgeometer :math:`(E / \sigma)^{1/4}`, with the voltage U, and the temperatures of case
     and dome, :math:`E = K_1 U + \sigma T_c^4 - K_3 \sigma (T_d^4 - T_c^4)`.
-
-    Parameters
-    ----------
-    path : Path
-        The file `TOWER`.
     """
     with xr.open_dataset(path, engine="scipy", decode_times=False) as file:
         data = file.load().astype(np.float64)
@@ -74,12 +69,7 @@ def flags(result: xr.Dataset) -> str:
 def spectra(path: Path, names: Sequence[str]) -> xr.DataArray:
     """Temperatures (band, time) [K] of the sky overhead, as of blackbodies, in bands of `FILTERS`.
 
-    Parameters
-    ----------
-    path : Path
-        The file `SPECTRA`, a spectrum every 18 s.
-    names : list of str
-        Bands.
+    Of a file `SPECTRA`, a spectrum every 18 s.
     """
     with h5py.File(path) as file:
         wavenumber = file["wnum"][:].astype(np.float64)  # [1/cm]
@@ -107,18 +97,8 @@ def pane(
 ) -> xr.Dataset:
     """Scene, as of `simulation.scene`, of a pane that warms up, with a background for each band.
 
-    Clouds move over the picture from left to right.
-
-    Parameters
-    ----------
-    sky : DataArray
-        From `spectra`.
-    emissivity : DataArray
-        Of the pane (band) [1].
-    shape : tuple of int
-        Rows and columns.
-    faster : float
-        Seconds of the sky in a second of the capture.
+    Clouds of a sky, from `spectra`, so much faster than measured, move over the picture of rows and
+    columns from left to right. The pane has an emissivity (band) [1].
     """
     span = float(sky["time"][-1] - sky["time"][0]) / faster
     time = np.arange(0.0, 0.8 * span, 1.0 / _RATE)

@@ -16,8 +16,7 @@ from typing import Final
 from reproduction import accuracy, integrity, paper, paths
 from reproduction import numbers as headline
 
-TOLERANCE: Final = 0.01
-"""Largest difference of two numbers, relative to the larger of the two [1]."""
+TOLERANCE: Final = 0.01  # largest difference of two numbers, relative to the larger of the two [1]
 
 MARKS: Final = ("<!-- paper_vs_ours -->", "<!-- end of paper_vs_ours -->")
 """Marks around the comparison with the paper in docs/paper.md."""
@@ -43,9 +42,8 @@ def read_run(run: str) -> dict[str, Numbers]:
     top = paths.results(run)
     files = sorted({file for file in listed if file.parent == top} | {*top.glob("*.json")})
     if not files:
-        raise FileNotFoundError(
-            f"Missing numbers of run '{run}'. Must be made by 'make reproduce'."
-        )
+        rule = "Must be made by 'make reproduce'"
+        raise FileNotFoundError(f"Missing numbers of run '{run}'. {rule}.")
     numbers = {}
     for path in files:
         with integrity.reading(path):

@@ -8,6 +8,7 @@ doi:10.48550/arXiv.2509.11334, listed as `scenes` and `other_scenes` in the data
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,9 +17,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from reproduction import metrics, palettes, parallax, scales
-
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
+from reproduction import metrics, numbers, palettes, uncalibrated
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
@@ -26,11 +26,9 @@ BANDS: Final = {"8-14": 0, "9.5": 1}
 KINDS: Final = ("uncalib", "calib")
 """The authors' results, by estimated and by calibrated emissivities."""
 
-SMOOTHING: Final = 1.0
-"""Standard deviation of the smoothing of a map before it is compared [pixel]."""
+SMOOTHING: Final = 1.0  # standard deviation of the smoothing of a map before it is compared [pixel]
 
-MARGIN: Final = 6
-"""Pixels beyond the object's outline that are not taken as still surroundings."""
+MARGIN: Final = 6  # pixels beyond the object's outline that are not taken as still surroundings
 
 _CHANGE: Final = 2  # frames over which pictures are compared to find out which ones they are
 
@@ -59,7 +57,11 @@ def scene(files: Mapping[str, Path], inputs_name: str, results_name: str) -> Sce
     """
     movie = inputs(files, inputs_name)
     width = movie.sizes["x"]
-    theirs = {kind: authors_reflection(files, results_name, kind, width) for kind in KINDS}
+    # The authors' magnitude of the background's change, in units of each frame's own bar; beyond
+    # the width of the input video may lie a printed bar.
+    names = {kind: f"{results_name}_{kind}_Tbdiff_video.mp4" for kind in KINDS}
+    read = partial(palettes.masked_palette_video, palette="turbo", width=width)
+    theirs = {kind: read(_file(files, name)) for kind, name in names.items()}
     outline = theirs["uncalib"]["valid"].mean("time") > 0.5
     first, margin = first_frame(movie, theirs["uncalib"]["value"], outline)
     shown = movie.isel(time=slice(first, first + theirs["uncalib"].sizes["time"]))
@@ -75,9 +77,8 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
         palettes.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
     ]
     if movies[0].shape != movies[1].shape:
-        raise ValueError(
-            f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'. Must agree."
-        )
+        message = f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'"
+        raise ValueError(f"{message}. Must agree.")
     movies[1] = movies[1].assign_coords(time=movies[0]["time"])
     band = xr.DataArray(list(BANDS), dims="band", name="band")
     together = xr.concat(movies, band, combine_attrs="drop_conflicts")
@@ -85,16 +86,6 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
     return together.assign_attrs(
         radiometric=0, scene=name, origin="published video", palette_residual=fits
     )
-
-
-def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: int) -> xr.Dataset:
-    """Magnitude of the background's change as published by the authors.
-
-    `kind` is one of `KINDS`; beyond the width of the input video [pixel] may lie a printed bar.
-    `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
-    """
-    path = _file(files, f"{name}_{kind}_Tbdiff_video.mp4")
-    return palettes.masked_palette_video(path, "turbo", width)
 
 
 def first_frame(
@@ -110,10 +101,8 @@ def first_frame(
     """
     extra = movie.sizes["time"] - theirs.sizes["time"]
     if extra < 0 or movie.shape[2:] != theirs.shape[1:]:
-        raise ValueError(
-            f"Invalid results of {theirs.shape} frames, rows and columns. "
-            f"Must be at most the inputs' {movie.shape[1:]}."
-        )
+        rule = f"Must be at most the inputs' {movie.shape[1:]}"
+        raise ValueError(f"Invalid results of {theirs.shape} frames, rows and columns. {rule}.")
     results = _changes(theirs.values, outline.values)
     scores = np.empty((len(movie), extra + 1))
     for place, band in enumerate(movie.values):
@@ -156,10 +145,8 @@ def agreement(
     number or size.
     """
     if theirs["value"].shape != reflection.shape:
-        raise ValueError(
-            f"Invalid shape {theirs['value'].shape} of the authors' map. "
-            f"Must be {reflection.shape}."
-        )
+        rule = f"Must be {reflection.shape}"
+        raise ValueError(f"Invalid shape {theirs['value'].shape} of the authors' map. {rule}.")
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
     ours, theirs = reflection.isel(time=frames), theirs.isel(time=frames)
     # Smoothed within the object alone: its surroundings neither enter nor dim its edge.
@@ -181,10 +168,10 @@ class Comparison:
     """A scene separated in several ways, each beside the authors' maps."""
 
     undone: xr.DataArray  # inputs (band, time, y, x) without the frames' scale, where it allows
-    separated: xr.Dataset  # from `scales.uncalibrated_reflection` of that
+    separated: xr.Dataset  # from `uncalibrated.uncalibrated_reflection` of that
     scores: xr.DataArray  # its agreement (time) [1] with the authors' first map
-    edges: xr.DataArray  # from `parallax.edges_shift`
-    reflections: xr.DataArray  # from `parallax.reflections_shift`
+    edges: xr.DataArray  # from `uncalibrated.edges_shift`
+    reflections: xr.DataArray  # from `uncalibrated.reflections_shift`
     table: xr.DataArray  # median agreement (way, map, pixels) [1], NaN where left out
     left_out: Mapping[str, str]  # way -> why
 
@@ -198,16 +185,16 @@ def compare(scene: Scene, number: int) -> Comparison:
     the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
     """
     # Undo the frames' scale; find the displacement, and the pixels that both bands show.
-    undone = scales.unscaled(scene.movie, still(scene.outline))
-    reflections = parallax.reflections_shift(undone, scene.outline)
-    shared = parallax.shared_outline(scene.outline, reflections)
+    undone = uncalibrated.unscaled(scene.movie, still(scene.outline))
+    reflections = uncalibrated.reflections_shift(undone, scene.outline)
+    shared = uncalibrated.shared_outline(scene.outline, reflections)
     # Separate in each way.
     found: dict[str, xr.Dataset] = {}
     left_out = {}
     for way, of_reflections in WAYS.items():
         try:
-            movie = parallax.moved(undone, reflections) if of_reflections else undone
-            parts = scales.uncalibrated_reflection(movie)
+            movie = uncalibrated.moved(undone, reflections) if of_reflections else undone
+            parts = uncalibrated.uncalibrated_reflection(movie)
         except ValueError as error:
             left_out[way] = str(error)
         else:
@@ -216,7 +203,7 @@ def compare(scene: Scene, number: int) -> Comparison:
         raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
     # Choose pixels and frames by the first separation.
     first = found[next(iter(found))]
-    pixels = {"object": shared, "moving": shared & (first["correlation"] > scales.CORRELATED)}
+    pixels = {"object": shared, "moving": shared & (first["correlation"] > uncalibrated.CORRELATED)}
     frames = strongest(first["reflection"], shared, number)
     # Correlate each reflection with each of the authors' maps.
     coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
@@ -226,7 +213,7 @@ def compare(scene: Scene, number: int) -> Comparison:
         score = agreement(reflection, scene.theirs[kind], frames, pixels[where]).median()
         table.loc[{"way": way, "map": kind, "pixels": where}] = score
     scores = agreement(first["reflection"], scene.theirs[KINDS[0]], frames, shared)
-    edges = parallax.edges_shift(undone)
+    edges = uncalibrated.edges_shift(undone)
     return Comparison(undone, first, scores, edges, reflections, table, left_out)
 
 
@@ -245,36 +232,29 @@ def compare_all(
 
 def report(compared: Mapping[str, Comparison]) -> str:
     """Tables in Markdown of the displacements and of the agreement, a row a scene and way."""
-    lines = [
-        "Published videos, not radiometric. Displacements: the second band shows at p the first's",
-        "p + d, to the right.",
-        "",
-        "| scene | still edges [pixel] | reflections [pixel] | their correlation, at 0 |",
-        "|---|--:|--:|--:|",
-    ]
-    for name, one in compared.items():
-        both = " | ".join(
-            f"{float(part.sel(axis='x')):.2f}" for part in (one.edges, one.reflections)
-        )
-        peak, at_0 = (one.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
-        lines.append(f"| {name} | {both} | {peak:.2f}, {at_0:.2f} |")
     columns = [f"{kind}, {where}" for kind in KINDS for where in ("object", "moving")]
-    lines += [
-        "",
-        "Correlation of the reflection's map with the authors', median of the frames.",
-        "",
-    ]
-    lines += [f"| scene | way | {' | '.join(columns)} |", "|---|---|" + "--:|" * len(columns)]
-    for name, one in compared.items():
+    heads = ("scene", "still edges [pixel]", "reflections [pixel]", "their correlation, at 0")
+    shifts, rows, notes = [heads], [("scene", "way", *columns)], []
+    for name, found in compared.items():
+        both = [f"{float(part.sel(axis='x')):.2f}" for part in (found.edges, found.reflections)]
+        peak, at_0 = (found.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
+        shifts.append((name, both[0], both[1], f"{peak:.2f}, {at_0:.2f}"))
         for way in WAYS:
-            cells = [f"{value:.3f}" for value in one.table.sel(way=way).values.ravel()]
-            lines.append(f"| {name} | {way} | {' | '.join(cells)} |")
-        undone = one.undone.attrs["scale_undone"] or "no band"
-        shares = ", ".join(f"{share:.2f}" for share in one.undone.attrs["scale_explained"])
+            scores = found.table.sel(way=way).values.ravel()
+            rows.append((name, way, *(f"{score:.3f}" for score in scores)))
+        undone = found.undone.attrs["scale_undone"] or "no band"
+        shares = ", ".join(f"{share:.2f}" for share in found.undone.attrs["scale_explained"])
         note = f"{name}: scale undone in {undone}; it explains {shares} of the surroundings' change"
-        reasons = "".join(f"; {way} left out: {why}" for way, why in one.left_out.items())
-        lines.append(f"| {note}{reasons} |" + " |" * (len(columns) + 1))
-    return "\n".join(lines) + "\n"
+        reasons = "".join(f"; {way} left out: {why}" for way, why in found.left_out.items())
+        notes.append(f"- {note}{reasons}")
+    parts = (
+        "Published videos, not radiometric. The second band shows at p the first's p + d, [pixel].",
+        numbers.table(shifts),
+        "Correlation of the reflection's map with the authors', median of the frames.",
+        numbers.table(rows),
+        "\n".join(notes),
+    )
+    return "\n\n".join(parts) + "\n"
 
 
 def _file(files: Mapping[str, Path], name: str) -> Path:

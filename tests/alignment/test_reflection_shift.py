@@ -9,8 +9,8 @@ import xarray as xr
 
 from dbthermal import alignment, schema, simulation, store
 from reproduction import disturbances, twins
-from reproduction.experiments import capture_of
 from reproduction.experiments.pictures import Picture, smooth_shift
+from reproduction.experiments.twins import capture_of
 
 RIG = simulation.Rig()
 RESPONSE = RIG.response()

@@ -14,9 +14,9 @@ from attack.scenes import pick
 from dbthermal import calibration, correction, emissivity, limits, separation, simulation
 from dbthermal import response as responses
 from reproduction import metrics
-from reproduction.contact import contact_measurements
+from reproduction.experiments.bench import contact_measurements
 from reproduction.filters import condition_numbers, rank_filters
-from reproduction.reflection import reflected_change
+from reproduction.metrics import reflected_change
 
 
 @dataclass(frozen=True)

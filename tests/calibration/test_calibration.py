@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dbthermal import bands, calibration, response, schema
-from reproduction.contact import contact_measurements
+from reproduction.experiments.bench import contact_measurements
 
 Floats = NDArray[np.float64]
 Change = Callable[[xr.DataArray], xr.DataArray]

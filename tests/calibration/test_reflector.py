@@ -12,13 +12,13 @@ from captures import emissivity_of
 from dbthermal import calibration, response
 from dbthermal.calibration import Bias
 from dbthermal.simulation import Rig
-from reproduction.contact import contact_measurements
 from reproduction.experiments.bench import (
     OBJECTS,
     Bench,
     Sample,
     band_emissivity,
     bench_series,
+    contact_measurements,
     reflector_series,
 )
 from reproduction.experiments.procedures import compare_procedures, reflector_sensitivity

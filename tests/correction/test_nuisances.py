@@ -23,7 +23,8 @@ from dbthermal.correction import (
 )
 from dbthermal.schema import Status
 from dbthermal.simulation import Background
-from reproduction import disturbances, experiments
+from reproduction import disturbances
+from reproduction.experiments import cases
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +187,7 @@ def test_separation_stands_a_shutter_and_lost_frames(nuisance: str) -> None:
     else:
         spoilt = disturbances.lose_frames(capture, 0.05, rng)
     results = [separation.solve(one, RIG.response()) for one in (capture, mark_shutter(spoilt))]
-    plain, marked = (experiments.score(scene, one)["object_temperature_rmse"] for one in results)
+    plain, marked = (cases.score(scene, one)["object_temperature_rmse"] for one in results)
     assert float(marked) <= 1.2 * float(plain)
 
 

@@ -29,7 +29,7 @@ def correction(fill: float = 1.0, **attrs: object) -> xr.Dataset:
 
 def draw_maps(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw gain and offset."""
-    return drawings.gain_offset_maps(correction(fill, **attrs))
+    return drawings.calibration.gain_offset_maps(correction(fill, **attrs))
 
 
 def draw_response(**attrs: object) -> Figure:
@@ -39,7 +39,7 @@ def draw_response(**attrs: object) -> Figure:
     counts = xr.DataArray([115 * temperature, 11 * temperature], names)
     pair = {"linear_slope": ("band", [115.0, 11.0]), "linear_intercept": ("band", [0.0, 0.0])}
     parts = {"counts": counts, "residual": 0 * counts, "linear_residual": 0 * counts}
-    return drawings.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
+    return drawings.calibration.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
 
 
 def draw_frames(fill: float = 1.0, **attrs: object) -> Figure:
@@ -135,7 +135,7 @@ def test_celsius_on_the_axes() -> None:
 
 def test_bad_pixels_are_marked() -> None:
     """The bad pixel is blank, crossed at its column and row, and counted."""
-    axis = drawings.gain_offset_maps(correction()).axes[0]
+    axis = drawings.calibration.gain_offset_maps(correction()).axes[0]
     image = axis.images[0].get_array()
     assert image is not None
     assert np.argwhere(np.ma.getmaskarray(image)).tolist() == [[1, 2]]

@@ -16,7 +16,7 @@ from dbthermal import emissivity, limits, mixing, simulation
 from dbthermal import response as responses
 from dbthermal.limits._planner import SKY
 from dbthermal.simulation import Background, Rig
-from reproduction.closed_form import ratio_variance_bound, reflection_ratio
+from reproduction.experiments.cases import ratio_variance_bound, reflection_ratio
 
 RIG = Rig()
 THREE = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))

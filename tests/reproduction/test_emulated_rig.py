@@ -9,8 +9,8 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import simulation, store
 from dbthermal.instruments.emulated import World
-from reproduction.experiments import emulated_rig
-from reproduction.experiments.emulated_bench import Bench
+from reproduction.experiments import emulated
+from reproduction.experiments.emulated import Bench
 
 SHAPE = (12, 16)
 RIG = simulation.Rig(gain_std=0.0, offset_std=0.0, bad_fraction=0.0)
@@ -20,10 +20,10 @@ PLACES = {
 }
 
 
-def views(rig: simulation.Rig = RIG) -> emulated_rig.Views:
+def views(rig: simulation.Rig = RIG) -> emulated.Views:
     """Views of a small rig."""
     detector = simulation.pattern(rig, SHAPE, np.random.default_rng(1))
-    return emulated_rig.Views(rig, detector, seed=2)
+    return emulated.Views(rig, detector, seed=2)
 
 
 def expected(band: str, temperature: float) -> float:
@@ -70,11 +70,11 @@ def test_truth_at_the_times_of_a_capture() -> None:
     """Truth is interpolated to the recording's clock, and not extrapolated."""
     began = scene().assign_attrs(began=100.0)
     capture = xr.Dataset(coords={"time": [0.05, 0.15]}, attrs={"clock_origin": 100.2})
-    found = emulated_rig.shown(began, capture)
+    found = emulated.shown(began, capture)
     np.testing.assert_allclose(found["object_temperature"][:, 0, 0], [302.5, 303.5], atol=1e-9)
     np.testing.assert_allclose(found["time"], [0.05, 0.15])
     with pytest.raises(ValueError, match="Invalid times"):
-        emulated_rig.shown(began, capture.assign_attrs(clock_origin=99.0))
+        emulated.shown(began, capture.assign_attrs(clock_origin=99.0))
 
 
 def test_thermocouple_follows_what_it_touches() -> None:
@@ -96,12 +96,12 @@ def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
     """Truth is opened by name, and cleared with the emulated recordings; a folder with a recording
     of hardware or a foreign file is not cleared.
     """
-    emulated_rig.clear(tmp_path / "none")
+    emulated.clear(tmp_path / "none")
     for name in ("", "scene.zarr", "notes.txt"):
         folder = tmp_path / f"with {name}"
-        assert emulated_rig.truth(folder) == {}
-        emulated_rig.keep_truth(folder, {}, shown=scene(), response=RIG.response())
-        found = emulated_rig.truth(folder)
+        assert emulated.truth(folder) == {}
+        emulated.keep_truth(folder, {}, shown=scene(), response=RIG.response())
+        found = emulated.truth(folder)
         assert set(found) == {"shown", "response"}
         xr.testing.assert_equal(found["shown"], scene())
         if name == "scene.zarr":
@@ -110,8 +110,8 @@ def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
             (folder / name).write_text("mine", encoding="utf-8")
         if name:
             with pytest.raises(FileExistsError, match=name):
-                emulated_rig.clear(folder)
+                emulated.clear(folder)
             assert len(list(folder.iterdir())) == 3
         else:
-            emulated_rig.clear(folder)
+            emulated.clear(folder)
             assert not folder.exists()

@@ -14,13 +14,15 @@ from reproduction import figures
 def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw two maps of the reflection at two times."""
     movie = (fill * array("time y x", 2, 5, 6)).assign_attrs(attrs)
-    return figures.compared_reflections(movie, movie, array("time", 2) - 300.5)
+    return figures.comparison.compared_reflections(movie, movie, array("time", 2) - 300.5)
 
 
 def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw the condition number of a pair of bands, infinite on the diagonal."""
     matrix = fill * array("first second", 2, 2, **attrs)
-    return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
+    return figures.calibration.condition_matrix(
+        matrix.where(matrix["first"] != matrix["second"], np.inf), 9
+    )
 
 
 def draw_over_bound(**attrs: object) -> Figure:
@@ -32,7 +34,7 @@ def draw_over_bound(**attrs: object) -> Figure:
         parts[f"{name}_error"] = ("noise", 1.2 * bound[0])
         parts[f"{name}_bound"] = (("case", "noise"), bound.copy())
     parts["object_temperature_bound"][1][1, 0] = np.nan
-    return figures.error_over_bound(xr.Dataset(parts, over, attrs))
+    return figures.comparison.error_over_bound(xr.Dataset(parts, over, attrs))
 
 
 def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
@@ -41,7 +43,7 @@ def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
     panels = xr.DataArray(np.indices((5, 6))[1] // 3, dims=("y", "x"))
     labels = panels.copy()
     labels[0, 0] = -1
-    return figures.pooled_materials(ratio, ratio, labels, panels)
+    return figures.comparison.pooled_materials(ratio, ratio, labels, panels)
 
 
 def separated(fill: float = 1.0) -> xr.Dataset:
@@ -54,14 +56,16 @@ def separated(fill: float = 1.0) -> xr.Dataset:
 
 def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw the truth of a pixel beside its estimate."""
-    return figures.truth_and_estimate(separated().assign_attrs(attrs), separated(fill), (1, 2))
+    return figures.scenes.truth_and_estimate(
+        separated().assign_attrs(attrs), separated(fill), (1, 2)
+    )
 
 
 def test_film() -> None:
     """A frame a time, of even size, that says what the data are and changes only where it may."""
     movie = array("time y x", 2, 5, 6)
     apparent = array("band time y x", 2, 2, 5, 6, origin="simulated")
-    frames = list(figures.separated_film(apparent, movie, movie - 300, title="scene"))
+    frames = list(figures.scenes.separated_film(apparent, movie, movie - 300, title="scene"))
     assert len(frames) == 2
     assert all(frame.dtype == np.uint8 and frame.shape == frames[0].shape for frame in frames)
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
@@ -82,11 +86,11 @@ def test_temperatures_in_another_unit_are_refused() -> None:
     movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
     inputs = array("band time y x", 2, 2, 5, 6)
     with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-        next(figures.separated_film(inputs, movie, movie, title="scene"))
+        next(figures.scenes.separated_film(inputs, movie, movie, title="scene"))
     scene = separated()
     celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
     with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
-        figures.truth_and_estimate(scene, celsius, (1, 2))
+        figures.scenes.truth_and_estimate(scene, celsius, (1, 2))
 
 
 def test_nothing_but_nan() -> None:
@@ -123,10 +127,10 @@ def test_pictures_beside_the_truth() -> None:
     """Films and truth in one range of colour, then each less the truth; without it, films alone."""
     movie = array("time y x", 2, 5, 6, origin="simulated")
     films, times = {"camera": movie - 2.0, "dbthermal": movie}, [0.0, 1.0]
-    figure = figures.compared_pictures(films, movie, times, "plate")
+    figure = figures.scenes.compared_pictures(films, movie, times, "plate")
     pictures = [np.asarray(axis.images[0].get_array()) for axis in figure.axes if axis.images]
     assert len(pictures) == 2 * 5
     np.testing.assert_allclose(pictures[3], -2.0, rtol=0, atol=1e-9)  # K
     np.testing.assert_allclose(pictures[4], 0.0, rtol=0, atol=1e-9)
-    alone = figures.compared_pictures(films, None, times, "plate")
+    alone = figures.scenes.compared_pictures(films, None, times, "plate")
     assert len([axis for axis in alone.axes if axis.images]) == 2 * 2

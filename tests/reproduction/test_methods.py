@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dbthermal import bands, mixing, planck, schema, separation, simulation
 from dbthermal import response as responses
 from dbthermal.simulation import Background, Rig
-from reproduction import methods
+from reproduction import experiments, methods
 from reproduction.methods.bcp import BcpSettings
 from reproduction.methods.dbvt import DbvtSettings
 from reproduction.methods.naive import NaiveSettings
@@ -216,3 +216,20 @@ def test_bcp_refuses_a_room_beyond_the_response() -> None:
     """A reflected temperature outside the response's range raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid reflected_temperature 500\.0 K"):
         solve(half_black(), "bcp", BcpSettings(reflected_temperature=500.0))
+
+
+def test_medians_count_what_the_default_solves() -> None:
+    """Medians omit pixels that the default does not solve, and count others' failures as worst."""
+    rmse = [[0.1, 0.3, np.nan, 0.2], [1.0, np.nan, 90.0, 2.0]]
+    parts = {
+        "object_temperature_rmse": (("variant", "pixel"), rmse, {"units": "K"}),
+        "emissivity_error": (("variant", "band", "pixel"), np.full((2, 2, 4), 0.05)),
+        "status": (("variant", "pixel"), [[0, 0, 1, 0], [0, 4, 0, 0]]),
+    }
+    comparison = xr.Dataset(parts, {"variant": ["subspace", "other"]})
+    medians = experiments.comparison.medians(comparison)
+    expected = {"object_temperature_rmse": [0.2, 2.0], "solved": [0.75] * 2}
+    for name, values in (expected | {"wrong": [0.0, 0.0]}).items():
+        np.testing.assert_allclose(medians[name], values, rtol=0, atol=1e-12)
+    lost = experiments.comparison.medians(comparison.isel(pixel=[1, 2]))
+    assert np.isnan(lost["object_temperature_rmse"].sel(variant="other"))

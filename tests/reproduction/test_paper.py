@@ -9,13 +9,14 @@ import pytest
 from reproduction import paper, verify
 from reproduction.paper import Row
 
+STEM = "01_calibration"
 ROOT = Path(__file__).parents[2]
 REFERENCE = json.loads((ROOT / "tests" / "reference_numbers.json").read_text(encoding="utf-8"))
 
 
 def verdict(numbers: dict[str, float], names: tuple[str, ...], **rule: Any) -> str:
     """Verdict of a row of some names by a rule."""
-    return Row("Fig.", "error", "01_a", names, "simulated", **rule).verdict({"01_a": numbers})
+    return Row("Fig.", "error", STEM, names, **rule).verdict({STEM: numbers})
 
 
 @pytest.mark.parametrize(

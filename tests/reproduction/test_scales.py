@@ -1,4 +1,4 @@
-"""Pictures scaled anew in each frame, and their reflections: simulated, with known scales."""
+"""Pictures scaled anew in each frame, and their reflections: simulated, with known uncalibrated."""
 
 import re
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import xarray as xr
 from captures import polynomials
 from numpy.typing import NDArray
 
-from reproduction import scales
+from reproduction import uncalibrated
 
 Floats = NDArray[np.float64]
 FRAMES, HEIGHT, WIDTH = 200, 40, 60
@@ -59,7 +59,7 @@ def test_scale_is_undone(walkers: bool) -> None:
     """Each frame's gain is the true one within 2 %, with people before a third of the wall, too."""
     rng = np.random.default_rng(5)
     truth, _ = scene(rng, walkers=walkers)
-    undone = scales.unscaled(picture(truth, rng), still())
+    undone = uncalibrated.unscaled(picture(truth, rng), still())
     gain = 1 / np.ptp(truth, axis=(2, 3))
     gain /= gain.mean(axis=1, keepdims=True)
     error = undone["gain"].values / gain - 1
@@ -78,8 +78,8 @@ def test_reflection_of_a_scaled_picture() -> None:
     truth, reflection = scene(rng)
     shown = picture(truth, rng)
     with pytest.raises(ValueError, match="pixels have a correlation below"):
-        scales.uncalibrated_reflection(shown)  # for its scale moves all of them together
-    found = scales.uncalibrated_reflection(scales.unscaled(shown, still()))
+        uncalibrated.uncalibrated_reflection(shown)  # for its scale moves all of them together
+    found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, still()))
     functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
@@ -94,7 +94,7 @@ def test_constant_scale_is_left() -> None:
     """A scale that is the same in all frames explains nothing, and no value is changed."""
     rng = np.random.default_rng(7)
     shown = picture(scene(rng)[0], rng, between=False)
-    undone = scales.unscaled(shown, still())
+    undone = uncalibrated.unscaled(shown, still())
     assert undone.attrs["scale_undone"] == []
     assert max(undone.attrs["scale_explained"]) < 0.5
     np.testing.assert_array_equal(undone, shown)
@@ -107,13 +107,13 @@ def test_refusals() -> None:
     shown = picture(scene(rng)[0], rng)
     few, other = np.zeros((HEIGHT, WIDTH), bool), np.ones((HEIGHT, 5), bool)
     with pytest.raises(ValueError, match=r"Invalid still pixels: 0 of them. Must be at least 200"):
-        scales.unscaled(shown, xr.DataArray(few, dims=("y", "x")))
+        uncalibrated.unscaled(shown, xr.DataArray(few, dims=("y", "x")))
     with pytest.raises(ValueError, match="the still pixels"):
-        scales.unscaled(shown, xr.DataArray(other, dims=("y", "x")))
+        uncalibrated.unscaled(shown, xr.DataArray(other, dims=("y", "x")))
     for gain in (0.0, -1.0, np.nan):
         scaled = shown.assign_coords(gain=(("band", "time"), np.full((2, FRAMES), gain)))
         with pytest.raises(ValueError, match=r"Invalid gain .* of a frame. Must be finite and > 0"):
-            scales.uncalibrated_reflection(scaled)
+            uncalibrated.uncalibrated_reflection(scaled)
 
 
 def pulses() -> Floats:
@@ -154,14 +154,14 @@ def signal() -> xr.DataArray:
 @pytest.fixture(scope="module")
 def parts(signal: xr.DataArray) -> xr.Dataset:
     """Emission and reflection of the movie."""
-    return scales.uncalibrated_reflection(signal)
+    return uncalibrated.uncalibrated_reflection(signal)
 
 
 def test_ratio_and_noise(parts: xr.Dataset) -> None:
     """The ratio is recovered within 3 %, the ratio of the noises within 5 %, of scaled frames too;
     pixels with a reflection have its ratio without bias, the others have no correlation.
     """
-    for attrs in (parts.attrs, scales.uncalibrated_reflection(movie()).attrs):
+    for attrs in (parts.attrs, uncalibrated.uncalibrated_reflection(movie()).attrs):
         assert attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.03)
         assert attrs["noise_ratio"] == pytest.approx((NOISE[1] / NOISE[0]) ** 2, rel=0.05)
         assert attrs["correlated_pixels"] == HEIGHT * WIDTH // 2
@@ -206,4 +206,4 @@ def test_refused_signal(
 ) -> None:
     """Other dimensions, NaN, and movies of too few frames or pixels raise an error."""
     with pytest.raises(ValueError, match=re.escape(message)):
-        scales.uncalibrated_reflection(change(signal))
+        uncalibrated.uncalibrated_reflection(change(signal))

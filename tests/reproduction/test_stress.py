@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from dbthermal import schema
 from dbthermal.figures import REASONS, status
 from dbthermal.simulation import Background, independent_pixels
-from reproduction.experiments import stress
-from reproduction.figures import validity
+from reproduction.experiments import limits
+from reproduction.figures.errors import validity
 
 OBJECT = "object_temperature"
 
@@ -51,7 +51,7 @@ def test_normal_errors(scale: float, share: float) -> None:
     truth = scene(frames=40)
     copy, result = truth.copy(deep=True), normal(truth, scale)
     result[OBJECT][1::2] = np.nan  # every other sample is lost
-    judged = stress.judge(truth, result)
+    judged = limits.judge(truth, result)
     covered, width = judged["emissivity_coverage"].values, judged["width"].values
     np.testing.assert_allclose(judged["object_coverage"], share, rtol=0, atol=0.006)  # [1]
     np.testing.assert_allclose(covered, share, rtol=0, atol=0.03)  # [1]
@@ -70,7 +70,7 @@ def test_errors_in_flagged_pixels() -> None:
     off = 1.0 * (truth["x"] < 500)
     result[OBJECT] = result[OBJECT] + off  # K
     result["emissivity"] = result["emissivity"] + 0.1 * off
-    judged = stress.judge(truth, result)
+    judged = limits.judge(truth, result)
     for name in ("object_coverage", "emissivity_coverage"):
         among = judged[name]
         np.testing.assert_allclose(among.sel(among="unflagged"), 0.95, rtol=0, atol=0.02)
@@ -85,7 +85,7 @@ def test_bad_pixels_are_counted_by_kind() -> None:
     result[OBJECT][:, 0, :10] = truth[OBJECT][:, 0, :10] + 0.41  # K
     result["emissivity"][1, 0, 10:30] = truth["emissivity"][1, 0, 10:30] - 0.041
     both = {"constant_object": slice(6, 16), "saturated": slice(12, 20)}
-    judged = stress.judge(truth, flagged(result, both))
+    judged = limits.judge(truth, flagged(result, both))
     assert judged["bad_pixels"].sel(kind=["object", "any"]).values.tolist() == [10, 30]
     np.testing.assert_allclose(judged["bad_flagged"], [0.4, 14 / 30], rtol=0, atol=1e-12)
     assert np.flatnonzero(judged["bad"].sel(kind="any")).tolist() == list(range(30))
@@ -101,9 +101,9 @@ def test_ends_of_the_counts() -> None:
     result[OBJECT] = truth[OBJECT] + 0.399  # K
     result[OBJECT][0, 0, 0] += 0.2
     result["emissivity"] = truth["emissivity"] + 0.0399
-    assert stress.judge(truth, result)["bad"].values.tolist() == [[True] + [False] * 4] * 2
+    assert limits.judge(truth, result)["bad"].values.tolist() == [[True] + [False] * 4] * 2
     values = {name: result[name] * np.nan for name in result.data_vars if name != "status"}
-    judged = stress.judge(truth, flagged(result.assign(values), {"gray": slice(None)}))
+    judged = limits.judge(truth, flagged(result.assign(values), {"gray": slice(None)}))
     for name in ("object_coverage", "emissivity_coverage", "width", "bad_flagged"):
         assert bool(judged[name].isnull().all())
     assert judged["bad_pixels"].values.tolist() == [0, 0]
@@ -115,7 +115,7 @@ def case(flags: Mapping[str, slice]) -> xr.Dataset:
     truth = scene(pixels=200)
     result = normal(truth)
     result[OBJECT][:, 0, :10] += 1.0  # K
-    judged = stress.judge(truth, flagged(result, flags)).expand_dims(case=["a case"])
+    judged = limits.judge(truth, flagged(result, flags)).expand_dims(case=["a case"])
     return judged.assign_attrs(origin="simulated")
 
 

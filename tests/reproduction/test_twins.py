@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from dbthermal import response, schema, simulation
 from dbthermal.simulation import Rig
 from reproduction import twins
-from reproduction.twins import TWINS, Capture, Stage, solids, surfaces, vessels
-from reproduction.twins.props import Writing
+from reproduction.twins import TWINS, Capture, Stage, bodies, surfaces
+from reproduction.twins.people import Writing
 from reproduction.twins.rays import Camera, Caster
 from reproduction.twins.stage import AMBIENT, clock
 from reproduction.twins.surroundings import Actor, Pose
@@ -94,10 +94,10 @@ def test_a_scan_is_stood_on_the_table() -> None:
     """A rabbit scanned with y up, in millimetres, is 0.15 m high; its z faces the camera, which
     sees all of it, ears and feet included.
     """
-    upright = solids.rabbit()
-    assert inside(solids.bunny(SHORT, rng()))
+    upright = bodies.rabbit()
+    assert inside(bodies.bunny(SHORT, rng()))
     lying = surfaces.moved(upright, Rotation.from_euler("x", -90.0, degrees=True), scale=1e3)
-    stood = solids.bunny(SHORT, rng(), scan=lying).mesh
+    stood = bodies.bunny(SHORT, rng(), scan=lying).mesh
     np.testing.assert_allclose(stood.vertices[:, 2].min(), 0.0, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(np.ptp(stood.vertices[:, 2]), 0.15, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
@@ -227,7 +227,7 @@ def bead(name: str, size: int) -> Callable[[], object]:
 
 def probe(height: float, angle: float) -> Callable[[], object]:
     """A wineglass with a thermocouple at a height [m] and an angle [degree]."""
-    moved = replace(vessels.WINEGLASS, probe=(height, angle))
+    moved = replace(bodies.WINEGLASS, probe=(height, angle))
     return lambda: twins.twin("wineglass", SHORT, rng(), vessel=moved)
 
 

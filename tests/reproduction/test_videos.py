@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from hostile_files import coloured, video, wave
 
-from reproduction import parallax, scales
+from reproduction import uncalibrated
 from reproduction import videos as published
 
 Floats = npt.NDArray[np.float64]
@@ -89,12 +89,12 @@ def outline() -> xr.DataArray:
 def test_displacement_of_the_reflections(apart: tuple[float, float]) -> None:
     """It is right to 0.3 pixel, whatever the still edges say, and undone there is none."""
     scene, _ = stage(3, apart)
-    undone = scales.unscaled(labelled(shown(scene)), published.still(outline()))
-    found = parallax.reflections_shift(undone, outline())
+    undone = uncalibrated.unscaled(labelled(shown(scene)), published.still(outline()))
+    found = uncalibrated.reflections_shift(undone, outline())
     np.testing.assert_allclose(found, apart, rtol=0, atol=0.3)
-    np.testing.assert_allclose(parallax.edges_shift(undone), 0, rtol=0, atol=0.2)
-    both = parallax.moved(undone, found)
-    assert parallax.reflections_shift(both, outline()).values == pytest.approx(0, abs=0.3)
+    np.testing.assert_allclose(uncalibrated.edges_shift(undone), 0, rtol=0, atol=0.2)
+    both = uncalibrated.moved(undone, found)
+    assert uncalibrated.reflections_shift(both, outline()).values == pytest.approx(0, abs=0.3)
 
 
 def test_unknown_displacement() -> None:
@@ -102,11 +102,11 @@ def test_unknown_displacement() -> None:
     noise = np.random.default_rng(2).standard_normal((2, 40, 60, 90))
     noise[1] = np.roll(noise[0], -60, axis=2)
     everywhere = xr.DataArray(np.ones((60, 90), bool), dims=("y", "x"))
-    found = parallax.reflections_shift(labelled(noise), everywhere)
+    found = uncalibrated.reflections_shift(labelled(noise), everywhere)
     unknown = found * np.nan
     with pytest.raises(ValueError, match="Unknown displacement of the reflections"):
-        parallax.moved(labelled(noise), unknown)
-    assert parallax.shared_outline(everywhere, unknown).all()
+        uncalibrated.moved(labelled(noise), unknown)
+    assert uncalibrated.shared_outline(everywhere, unknown).all()
 
 
 def test_scene_of_fewer_results(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ import xarray as xr
 from captures import emissivity_of
 
 from dbthermal import schema, separation, simulation
+from reproduction.experiments.cases import INTERVAL
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
-from reproduction.experiments.scores import INTERVAL
 
 RIG: Final = simulation.Rig()
 TIME: Final = np.arange(300) / 10.0  # s

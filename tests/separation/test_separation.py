@@ -14,9 +14,10 @@ from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
-from reproduction import experiments, methods
+from reproduction import methods
+from reproduction.experiments import cases
 from reproduction.methods.dbvt import DbvtSettings
-from reproduction.reflection import reflected_change
+from reproduction.metrics import reflected_change
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0
@@ -27,7 +28,7 @@ Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 def share(flag: str, **changes: Any) -> float:
     """Share of the pixels of a case that carry a flag."""
-    _, result = experiments.run_case({**GLASS, **changes}, RIG, TIME, 400, seed=1)
+    _, result = cases.run_case({**GLASS, **changes}, RIG, TIME, 400, seed=1)
     return float((result["status"].values & Status.bits()[flag] != 0).mean())
 
 
@@ -50,8 +51,8 @@ def test_subspace_reaches_the_design(
     the object hold in 92 to 98 % of the samples.
     """
     case = {**GLASS, "emissivity": list(pair), "stop": stop, "noise_known": noise_known}
-    scene, result = experiments.run_case(case, RIG, TIME, 1600, seed=7)
-    score = experiments.score(scene, result)
+    scene, result = cases.run_case(case, RIG, TIME, 1600, seed=7)
+    score = cases.score(scene, result)
     to_45, to_60, *of_emissivity = PROTOTYPE[pair]
     rmse = float(score["object_temperature_rmse"])
     errors = score["emissivity_error"].values
@@ -76,7 +77,7 @@ def test_error_bars_are_true(pair: tuple[float, float], amplitude: float) -> Non
     prior on slow changes that are not there, at most 1.2.
     """
     case = {**GLASS, "emissivity": list(pair), "background": {"amplitude": amplitude}}
-    scene, capture, response = experiments.simulate(case, Rig(highest=370.0), TIME, 1000, seed=5)
+    scene, capture, response = cases.simulate(case, Rig(highest=370.0), TIME, 1000, seed=5)
     result = separation.solve(capture, response, settings=separation.SubspaceSettings(0.0))
     ratio = (1.0 - scene["emissivity"]) / (1.0 - scene["emissivity"][0])
     for name in (OBJECT, "reflection_ratio", "background_temperature", "emissivity"):
@@ -96,17 +97,17 @@ def test_error_bars_are_true(pair: tuple[float, float], amplitude: float) -> Non
 def test_constant_object_keeps_its_temperature() -> None:
     """With a constant object only the temperature is found; the rest is NaN and flagged."""
     case = {**GLASS, "start": 40, "stop": 40}
-    scene, result = experiments.run_case(case, RIG, TIME, 200, seed=1)
+    scene, result = cases.run_case(case, RIG, TIME, 200, seed=1)
     assert np.all(result["status"].values & Status.CONSTANT_OBJECT)
     assert np.all(np.isnan(result["emissivity"].values))
     assert np.all(np.isnan(result["background_temperature"].values))
-    assert float(experiments.score(scene, result)["object_temperature_rmse"]) <= 0.24  # [K]
+    assert float(cases.score(scene, result)["object_temperature_rmse"]) <= 0.24  # [K]
 
 
 def test_still_background_is_flagged() -> None:
     """A still background gives NaN and a flag in every pixel."""
     case = {**GLASS, "background": {"kind": "still"}}
-    _, result = experiments.run_case(case, RIG, TIME, 200, seed=2)
+    _, result = cases.run_case(case, RIG, TIME, 200, seed=2)
     flagged = result["status"].values & Status.NO_BACKGROUND_MOTION != 0
     assert flagged.mean() > 0.97
     assert np.all(np.isnan(result["object_temperature"].values[:, flagged]))
@@ -117,8 +118,8 @@ def test_linear_response_costs_kelvins() -> None:
     errors = []
     for kind in ("exact", "linear"):
         case = {**GLASS, "response_kind": kind}
-        scene, result = experiments.run_case(case, RIG, TIME, 100, seed=4)
-        errors.append(float(experiments.score(scene, result)["object_temperature_rmse"]))
+        scene, result = cases.run_case(case, RIG, TIME, 100, seed=4)
+        errors.append(float(cases.score(scene, result)["object_temperature_rmse"]))
     assert errors[0] < 0.35
     assert errors[1] > 1.0
 
@@ -187,7 +188,7 @@ def test_no_background_raises_a_false_alarm(
     pixel in 200 of synchronous bands is said to be apart, and fewer than one in 100 to jump.
     """
     case = {**GLASS, "stop": stop, "background": background, "noise_known": noise_known}
-    scene, result = experiments.run_case(case, Rig(highest=370.0), TIME, 1000, seed=1)
+    scene, result = cases.run_case(case, Rig(highest=370.0), TIME, 1000, seed=1)
     share = coverage(scene, result)
     bits = [Status.BANDS_APART, Status.OBJECT_JUMP]
     apart, jumping = (float((result["status"].values & bit != 0).mean()) for bit in bits)
@@ -213,7 +214,7 @@ def test_prior_widens_emissivity_and_background_alone() -> None:
     """A larger drift widens the emissivity's and background's deviations alone: of an object that
     warms by w a drift of up to d costs (1 - e) d / (w sqrt(3)).
     """
-    _, capture, response = experiments.simulate(GLASS, RIG, TIME, 100, seed=3)
+    _, capture, response = cases.simulate(GLASS, RIG, TIME, 100, seed=3)
     none, some, much = [
         separation.solve(capture, response, settings=separation.SubspaceSettings(drift))
         for drift in (0.0, 2.0, 20.0)
@@ -272,8 +273,8 @@ def test_jump_is_found_and_modelled() -> None:
     """Nine pixels in ten are as good before and after as nine in ten without a jump, within half
     and two thirds; they are flagged as jumping, and 95 % intervals hold at the jump itself.
     """
-    clean, plain = experiments.run_case(TO_50, RIG, TIME, 400, seed=1)
-    scene, result = experiments.run_case({**TO_50, "jump": SUDDEN}, RIG, TIME, 400, seed=1)
+    clean, plain = cases.run_case(TO_50, RIG, TIME, 400, seed=1)
+    scene, result = cases.run_case({**TO_50, "jump": SUDDEN}, RIG, TIME, 400, seed=1)
     step = (scene["object_temperature"] - clean["object_temperature"]).values[:, 0]
     number = np.argmax(np.abs(np.diff(step, axis=0)), axis=0) + np.array([[0], [1]])
     far = np.abs(TIME[:, np.newaxis] - TIME[number[1]]) > 1.0
@@ -294,7 +295,7 @@ def test_jump_is_found_and_modelled() -> None:
 
 def test_what_takes_a_second_is_no_jump() -> None:
     """An object that changes by 6 K in 1 s has true intervals, mostly without a flag."""
-    scene, result = experiments.run_case({**TO_50, "jump": SLOW}, RIG, TIME, 400, seed=1)
+    scene, result = cases.run_case({**TO_50, "jump": SLOW}, RIG, TIME, 400, seed=1)
     good = result["status"] == 0
     assert float(good.mean()) > 0.95
     assert 0.92 <= held(result, scene, where=good) <= 0.98
@@ -312,7 +313,7 @@ def test_a_jump_needs_no_least_length(frames: int, rate: float, seed: int) -> No
     jump = {"height": 6.0, "between": (0.3 * time[-1], 0.7 * time[-1])}
     quick = {"duration": (time[-1] / 20, time[-1] / 10)}
     case = {**TO_50, "jump": jump, "background": quick}
-    _, result = experiments.run_case(case, RIG, time, 12, seed)
+    _, result = cases.run_case(case, RIG, time, 12, seed)
     good = result["status"].values == 0
     assert np.all(np.isfinite(result["object_temperature"].values[:, good]))
 
@@ -320,7 +321,7 @@ def test_a_jump_needs_no_least_length(frames: int, rate: float, seed: int) -> No
 @pytest.mark.parametrize("height", [0, 30])
 def test_jump_beside_a_shutter_event(height: int) -> None:
     """A jump 0.3 s after a shutter event is flagged, and its values have calibrated uncertainty."""
-    scene, capture, response = experiments.simulate(TO_50, RIG, TIME, 100, seed=5)
+    scene, capture, response = cases.simulate(TO_50, RIG, TIME, 100, seed=5)
     step = 6.0 * (scene["time"] >= 20.3)
     moved = scene.assign(object_temperature=scene["object_temperature"] + step)
     capture = simulation.observe(moved, response, np.random.default_rng(6))
@@ -343,7 +344,7 @@ def bands_of(number: int, pixels: int, seed: int) -> Case:
     """Scene, capture and response of the first so many bands."""
     rig = Rig(bands=BANDS[:number], noise=NOISE[:number])
     glass: dict[str, Any] = {"emissivity": list(VALUES[:number]), "start": 20, "stop": 60}
-    return experiments.simulate(glass, rig, TIME, pixels, seed)
+    return cases.simulate(glass, rig, TIME, pixels, seed)
 
 
 def pooled(error: xr.DataArray) -> float:
@@ -458,7 +459,7 @@ def beside(*cases: Case) -> Case:
 
 def case(pixels: int, seed: int, **changes: Any) -> Case:
     """Scene, capture and response."""
-    return experiments.simulate({**GLASS, **changes}, RIG, TIME, pixels, seed)
+    return cases.simulate({**GLASS, **changes}, RIG, TIME, pixels, seed)
 
 
 def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
@@ -596,7 +597,7 @@ INVALID = Status.INVALID_SAMPLES
 @pytest.fixture(scope="module")
 def twenty() -> Case:
     """Scene, capture and response of 20 pixels of glass."""
-    return experiments.simulate(GLASS, RIG, TIME, PIXELS, seed=1)
+    return cases.simulate(GLASS, RIG, TIME, PIXELS, seed=1)
 
 
 def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:

@@ -3,10 +3,6 @@
 On the bench an object is heated in steps and reflects, like a mirror, a blackbody set to several
 temperatures; a thermocouple sits beside the reflection. By the reflector method the same heated
 object and a crumpled foil are recorded in the room. Both are simulated with their typical errors.
-
-The reflector method fails at low emissivity by one assumption, `Bench.mirrored_excess`: a smooth
-object reflects something warmer than the mean of the room, which the foil gives. In a room of one
-temperature the method is right within 0.01.
 """
 
 from dataclasses import dataclass
@@ -14,15 +10,12 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import calibration, mixing, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.emissivity import embedded_table
-from dbthermal.response import Curve, require_range
-
-Array = npt.NDArray[np.float64]
 
 _CAMERA_BAND: Final = "8-14"
 
@@ -46,6 +39,10 @@ OBJECTS: Final = (
 )
 """The five objects of the paper (its table of emissivities, doi:10.48550/arXiv.2509.11334), with
 its reference values for 8-14 um; the rest is this project's choice."""
+
+
+def _names(response: xr.Dataset) -> tuple[str, ...]:
+    return tuple(str(name) for name in response["band"].values)
 
 
 @cache
@@ -112,15 +109,8 @@ def bench_series(
 ) -> xr.Dataset:
     """One series of measurements on the paper's bench, with all its errors: the stage `contact`.
 
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`, that of one pixel and frame: it stands for the drift of the camera between
-        shutter events, which no mean over pixels removes.
-    sample, bench : Sample, Bench
-        The object; steps and errors, of which the common ones are drawn once.
-    rng : Generator
-        Source of the errors.
+    The noise of the response is that of one pixel and frame: it stands for the drift of the camera
+    between shutter events, which no mean over pixels removes. Common errors are drawn once.
 
     Examples
     --------
@@ -139,12 +129,11 @@ def bench_series(
         part.ravel()
         for part in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
     )
-    curves = _curves(response)
     stray = rng.uniform(0.0, sample.stray)
-    room = _blackbody(curves, np.full_like(cold, bench.air_temperature))
-    reflected = (1.0 - stray) * _blackbody(curves, cold) + stray * room
-    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
+    room = _blackbody(response, np.full_like(cold, bench.air_temperature))
+    reflected = (1.0 - stray) * _blackbody(response, cold) + stray * room
+    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
+    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
     shown = cold + rng.uniform(-1, 1) * bench.blackbody_tolerance
     read = {
         "object_temperature": _thermocouple(warm, bench, rng),
@@ -185,14 +174,13 @@ def reflector_series(
             f"{bench.least_excess} K above the air's {bench.air_temperature} K."
         )
     air = np.full_like(warm, bench.air_temperature)
-    curves = _curves(response)
     stray = rng.uniform(0.0, sample.stray)
-    mirrored = _blackbody(curves, air + rng.uniform(*bench.mirrored_excess))
-    reflected = (1.0 - stray) * mirrored + stray * _blackbody(curves, air)
-    share = band_emissivity(sample, tuple(curve.band for curve in curves)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
-    uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
-    emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
+    mirrored = _blackbody(response, air + rng.uniform(*bench.mirrored_excess))
+    reflected = (1.0 - stray) * mirrored + stray * _blackbody(response, air)
+    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
+    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
+    uneven = _blackbody(response, air + rng.normal(0, bench.foil_std, air.size))
+    emitted = _blackbody(response, air + bench.foil_warming * (warm - air))
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
     read = {
         "counts": _noisy(response, counts, rng),
@@ -202,21 +190,14 @@ def reflector_series(
     return _series(response, "reflector", read)
 
 
-def _curves(response: xr.Dataset) -> list[Curve]:
-    """Response curve of each band."""
-    return responses.curves(response, [str(name) for name in response["band"].values])
-
-
-def _blackbody(curves: list[Curve], temperature: Array) -> Array:
+def _blackbody(response: xr.Dataset, temperature: Array) -> Array:
     """Counts of a blackbody (band, measurement), the temperatures checked against the response."""
-    values = require_range(temperature, curves[0], "temperature")
-    return np.stack([curve.counts(values) for curve in curves])
+    return responses.counts(response, xr.DataArray(temperature, dims="measurement")).values
 
 
 def _noisy(response: xr.Dataset, counts: Array, rng: np.random.Generator) -> Array:
     """Counts (band, measurement) with the response's noise."""
-    names = [str(name) for name in response["band"].values]
-    noise = responses.noise(response, names)[:, np.newaxis]
+    noise = responses.noise(response, [*_names(response)])[:, np.newaxis]
     return np.asarray(counts + noise * rng.standard_normal(counts.shape))
 
 
@@ -234,3 +215,30 @@ def _series(response: xr.Dataset, stage: str, read: dict[str, Array]) -> xr.Data
     """Readings by name as a series of a stage."""
     variables = schema.variables(stage, read)
     return xr.Dataset(variables, {"band": response["band"].values}, {"origin": "simulated"})
+
+
+def contact_measurements(
+    response: xr.Dataset,
+    emissivity: xr.DataArray,
+    object_temperature: np.ndarray,
+    background_temperature: np.ndarray,
+    stds: tuple[float, float],
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Readings for the calibration of an emissivity (band) [1]: the stage `contact`.
+
+    Of true temperatures (measurement,) [K] and standard deviations of a reading of thermocouple and
+    blackbody [K]. ValueError if a temperature lies outside the response, or the emissivity lacks a
+    band.
+    """
+    places = schema.band_positions(emissivity, [*_names(response)], "the emissivity")
+    true = {
+        "object_temperature": object_temperature,
+        "background_temperature": background_temperature,
+    }
+    signals = (_blackbody(response, level) for level in true.values())
+    clean = mixing.leaving(emissivity.values[places][:, np.newaxis], *signals)
+    read = {"counts": _noisy(response, clean, rng)}
+    for (name, level), std in zip(true.items(), stds, strict=True):
+        read[name] = level + rng.normal(0, std, len(level))
+    return _series(response, "contact", read)

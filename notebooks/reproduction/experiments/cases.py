@@ -8,14 +8,16 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
+from scipy.special import ndtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
+from dbthermal._arrays import Array
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.simulation import Background, Rig
-from reproduction import closed_form, disturbances
-from reproduction.experiments.scores import held, rmse
+from reproduction import disturbances
+from reproduction.cache import gridded
 
-Array = npt.NDArray[np.float64]
 Case = Mapping[str, Any]
 
 STEPS: Final = 20
@@ -50,6 +52,13 @@ class Jump:
         if self.duration == 0:
             return np.where(elapsed >= 0, self.height, 0.0)
         return np.asarray(self.height * np.interp(elapsed / self.duration, [0.0, 1.0], [0.0, 1.0]))
+
+
+def scalars(**values: xr.DataArray | float) -> xr.Dataset:
+    """Numbers by name, in [1] but for an error of the object temperature [K]."""
+    units = {"object_temperature_rmse": "K"}
+    scores = {name: ((), float(it), {"units": units.get(name, "1")}) for name, it in values.items()}
+    return xr.Dataset(scores)
 
 
 def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
@@ -90,15 +99,15 @@ def efficiency(
 
     Robust standard deviation over the pixels of a scene of one material. The noise is that of the
     two bands' signals [K], the order the size of the smooth subspace of
-    `closed_form.ratio_variance_bound`.
+    `ratio_variance_bound`.
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
     functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
-    bound = np.sqrt(closed_form.ratio_variance_bound(pair, noise, background, functions))
-    ratio = closed_form.reflection_ratio(result["emissivity"].values.reshape(2, -1))
-    scaled = (ratio - closed_form.reflection_ratio(emissivity)) / bound
+    bound = np.sqrt(ratio_variance_bound(pair, noise, background, functions))
+    ratio = reflection_ratio(result["emissivity"].values.reshape(2, -1))
+    scaled = (ratio - reflection_ratio(emissivity)) / bound
     scaled = scaled[np.isfinite(scaled)]
     return float(np.diff(np.quantile(scaled, [0.1587, 0.8413]))[0] / 2)
 
@@ -121,78 +130,43 @@ def run_case(
 def simulate(
     case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    r"""Scene, capture and response of one case.
+    r"""Scene at the first band's exposures, capture without stamps, and response of one case.
 
-    Parameters
-    ----------
-    case : mapping
-        `emissivity` (one a band [1]), `start` and `stop` of the object [degree Celsius]; and
-        optionally: a name `case`; `background`, arguments of `simulation.Background`; `jump` of the
-        object, arguments of `Jump`; `following` [1], the c of a background that drifts along with
-        the object's own curve, :math:`y(t) + c (x(t) - x(t_0))`; `swapped` (default false): the
-        object then moves as the background would, and the other way round; `offset` of the other
-        bands [frame], a multiple of 1 / `STEPS`: they are exposed so much later; `frames`: only
-        the first of the times; `noise` of the bands [K], in place of the rig's.
-    rig, time, pixels, seed
-        See `run_case`. With an `offset` the times must be even.
-
-    Returns
-    -------
-    tuple of Dataset
-        The scene at the first band's exposures; the capture, without stamps; the response.
-
-    Raises
-    ------
-    ValueError
-        If the case has an unknown key, lacks one, or has a value other than described.
+    A case has `emissivity` (one a band [1]), `start` and `stop` of the object [degree Celsius]; and
+    optionally: a name `case`; `background`, arguments of `simulation.Background`; `jump` of the
+    object, arguments of `Jump`; `following` [1], the c of a background that drifts along with the
+    object's own curve, :math:`y(t) + c (x(t) - x(t_0))`; `swapped` (default false): the object then
+    moves as the background would, and the other way round; `offset` of the other bands [frame], a
+    multiple of 1 / `STEPS`: they are exposed so much later, and the times must be even; `frames`:
+    only the first of the times; `noise` of the bands [K], in place of the rig's. ValueError if the
+    case has an unknown key, lacks one, or has a value other than described.
     """
-    _check_keys(case)
+    if not case.keys() >= _NEEDED or not case.keys() <= _NEEDED | _OPTIONAL:
+        rule = f"Must have {sorted(_NEEDED)}, may have {sorted(_OPTIONAL)}"
+        raise ValueError(f"Invalid case with keys {sorted(case)}. {rule}.")
+    count, offset = int(case.get("frames", time.size)), case.get("offset", 0.0)
+    if not 2 <= count <= time.size:
+        raise ValueError(f"Invalid number of frames {count}. Must lie in [2, {time.size}].")
+    later = round(offset * STEPS)
+    if offset < 0 or abs(later - offset * STEPS) > 1e-9:
+        rule = f"Must be zero or positive, a multiple of 1/{STEPS}"
+        raise ValueError(f"Invalid offset {offset} frames. {rule}.")
     rng = np.random.default_rng(seed)
     noise = tuple(case.get("noise", rig.noise))
     response = replace(rig, noise=noise).response()
-    time = _first(time, int(case.get("frames", time.size)))
-    later = _steps(case.get("offset", 0.0))
-    clock = _finer(time, later) if later else time
+    clock = time = time[:count]
+    if later:  # on the finer clock until the last frame of the band that is exposed later
+        step = (time[-1] - time[0]) / (time.size - 1) / STEPS
+        if not np.allclose(np.diff(time), step * STEPS, rtol=0, atol=1e-6 * step):
+            raise ValueError("Invalid times of bands that are exposed apart. Must be even.")
+        clock = time[0] + step * np.arange((time.size - 1) * STEPS + later + 1)
     scene = _draw(case, rig.bands, clock, pixels, rng)
     if not later:
         return scene, simulation.observe(scene, response, rng), response
-    frames, starts = time.size, [0, *[later] * (len(rig.bands) - 1)]
-    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
-    first = scene.isel(time=slice(0, (frames - 1) * STEPS + 1, STEPS))
+    starts = [0, *[later] * (len(rig.bands) - 1)]
+    seen = disturbances.expose(scene, response, rng, every=STEPS, offsets=starts, frames=count)
+    first = scene.isel(time=slice(0, (count - 1) * STEPS + 1, STEPS))
     return first, seen.drop_vars("exposure_time"), response
-
-
-def _check_keys(case: Case) -> None:
-    if not case.keys() >= _NEEDED or not case.keys() <= _NEEDED | _OPTIONAL:
-        raise ValueError(
-            f"Invalid case with keys {sorted(case)}. Must have {sorted(_NEEDED)}, "
-            f"may have {sorted(_OPTIONAL)}."
-        )
-
-
-def _first(time: np.ndarray, frames: int) -> np.ndarray:
-    """The first of the times."""
-    if not 2 <= frames <= time.size:
-        raise ValueError(f"Invalid number of frames {frames}. Must lie in [2, {time.size}].")
-    return time[:frames]
-
-
-def _steps(offset: float) -> int:
-    """An offset [frame] in steps of the finer clock."""
-    steps = round(offset * STEPS)
-    if offset < 0 or abs(steps - offset * STEPS) > 1e-9:
-        raise ValueError(
-            f"Invalid offset {offset} frames. Must be zero or positive, a multiple of 1/{STEPS}."
-        )
-    return steps
-
-
-def _finer(time: np.ndarray, later: int) -> Array:
-    """Times [s] of the finer clock, on until the last frame of the band that is exposed later."""
-    step = (time[-1] - time[0]) / (time.size - 1) / STEPS
-    if not np.allclose(np.diff(time), step * STEPS, rtol=0, atol=1e-6 * step):
-        raise ValueError("Invalid times of bands that are exposed apart. Must be even.")
-    return np.asarray(time[0] + step * np.arange((time.size - 1) * STEPS + later + 1))
 
 
 def _draw(
@@ -209,14 +183,9 @@ def _draw(
     if "jump" in case:
         warm = warm + Jump(**case["jump"]).draw(time, pixels, rng)[:, np.newaxis]
     roles = (cold, warm) if case.get("swapped", False) else (warm, cold)
-    return scene.assign(
-        {
-            name: values.assign_attrs(scene[name].attrs)
-            for name, values in zip(
-                ("object_temperature", "background_temperature"), roles, strict=True
-            )
-        }
-    )
+    names = ("object_temperature", "background_temperature")
+    films = zip(names, roles, strict=True)
+    return scene.assign({name: film.assign_attrs(scene[name].attrs) for name, film in films})
 
 
 def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int) -> xr.Dataset:
@@ -228,5 +197,61 @@ def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: 
         scatter = efficiency(scene, result, (first, second), _ORDER)
         rows.append(score(scene, result).assign(efficiency=scatter))
         names.append(str(case["case"]))
-    together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
+    together = gridded(rows, {"case": names})
     return together.assign_attrs(origin="simulated", pixels=pixels, seed=seed)
+
+
+INTERVAL: Final = float(ndtri(0.975))  # half-width of a 95 % interval, in standard deviations [1]
+
+
+def rmse(error: xr.DataArray) -> xr.DataArray:
+    """Root mean square of an error (time, y, x) over time, median over the pixels with a value."""
+    return ((error**2).mean("time") ** 0.5).median()
+
+
+def held(error: xr.DataArray, std: xr.DataArray, width: float = INTERVAL) -> xr.DataArray:
+    """Share of the known errors that lie within so many standard deviations [1]."""
+    return (abs(error) < width * std).where(error.notnull()).mean()
+
+
+def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
+    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections, emissivities (2, ...) [1].
+
+    Examples
+    --------
+    >>> reflection_ratio([0.86, 0.72]).round(3).item()  # plate glass in 8-14 um and 9.5 um
+    2.0
+    """
+    first, second = np.asarray(emissivity, dtype=np.float64)
+    return np.asarray((1.0 - second) / (1.0 - first))
+
+
+def ratio_variance_bound(
+    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
+) -> Array:
+    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
+
+    .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
+              {\sum_t [(1 - e_1) P y(t)]^2}
+
+    with P the projection orthogonal to the smooth subspace, spanned by orthonormal functions (time,
+    order), in which the object may do anything; emissivities [1] and noise [K] of the two bands,
+    background temperature (time, ...) [K]. TypeError or ValueError for other than two numbers, in
+    [0, 1] and positive.
+
+    Examples
+    --------
+    Plate glass before a background that changes by 3 K every five seconds:
+
+    >>> background = 295.0 + 3.0 * (np.arange(200) // 50 % 2)  # K, 10 frames/s
+    >>> functions, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 200), 5))
+    >>> variance = ratio_variance_bound((0.86, 0.72), (0.03, 0.35), background, functions)
+    >>> np.sqrt(variance).round(2).item()
+    0.15
+    """
+    ratio = float(reflection_ratio(real_numbers("emissivity", emissivity, (0.0, 1.0), (2,))))
+    real_numbers("noise [K]", noise, POSITIVE, (2,))
+    background, functions = real_numbers("background", background), real_numbers("basis", functions)
+    rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
+    energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
+    return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)

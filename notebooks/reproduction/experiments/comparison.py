@@ -11,11 +11,9 @@ from dbthermal import separation, simulation
 from dbthermal.simulation import Rig
 from reproduction import methods
 
-MOVING: Final = 0.5
-"""Standard deviation of the background from which a pixel takes part [K]."""
+MOVING: Final = 0.5  # standard deviation of the background from which a pixel takes part [K]
 
-WRONG: Final = 0.1
-"""Error of an emissivity from which it is called wrong [1]."""
+WRONG: Final = 0.1  # error of an emissivity from which it is called wrong [1]
 
 EVERY: Final = 20
 """A method that looks at whole images, each by itself, gets the first of so many frames."""
@@ -72,7 +70,10 @@ def compare(
     rows = []
     for options, whole in zip(variants.values(), imaging, strict=True):
         truth_seen, seen = (frames, images) if whole else (truth, strip)
-        result = separation.solve(seen, response, seed=seed, **_known(truth_seen, options))
+        known = arguments(options)
+        if known["method"].knows_emissivity:
+            known["emissivity"] = truth_seen["emissivity"]
+        result = separation.solve(seen, response, seed=seed, **known)
         rows.append(judge(truth, _strip(result, chosen) if whole else result))
     label = xr.DataArray(list(variants), dims="variant", name="variant")
     together = xr.concat(rows, dim=label, coords="minimal", compat="override")
@@ -141,14 +142,6 @@ def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
     listed = dataset.isel(y=xr.DataArray(rows, dims="pixel"), x=xr.DataArray(columns, dims="pixel"))
     row = listed.drop_vars(["y", "x"]).rename(pixel="x").expand_dims(y=[0])
     return row.transpose(..., "y", "x").assign_coords(x=np.arange(chosen.size))
-
-
-def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
-    """Arguments of `solve`, with the true emissivities for a method that must know them."""
-    known = arguments(options)
-    if methods.get_method(options["method"]).knows_emissivity:
-        known["emissivity"] = scene["emissivity"]
-    return known
 
 
 def arguments(variant: Options) -> dict[str, Any]:

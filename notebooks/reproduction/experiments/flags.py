@@ -10,17 +10,16 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 
 from dbthermal import correction, separation, simulation
+from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status
-from reproduction import disturbances
-from reproduction.experiments import cases, stress
+from reproduction import disturbances, numbers
+from reproduction.experiments import cases, limits
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-Change = Callable[[npt.NDArray[Any], Mask, np.random.Generator], None]
+Film = npt.NDArray[Any]
+Change = Callable[[Film, Mask, np.random.Generator], None]
 
-FAR: Final = 5.0
-"""Standard deviations of error from which a value is wrong [1]."""
+FAR: Final = 5.0  # standard deviations of error from which a value is wrong [1]
 
 PICTURED: Final = frozenset({"bad", "lost", "shift", "still"})
 """Keys of scenes that are pictures: shift of the reflections, at its middle and varying by [pixel];
@@ -29,11 +28,9 @@ share at rest; share of the samples lost in every second column; and of bad pixe
 _SHARES: Final = ("without_it", "without_any", "wrong")
 _COUNTED: Final = ("pixels", *_SHARES)
 # Shares of the samples that are no numbers, and that lie beyond the detector's limit [1].
-_INVALID: Final = 0.6
-_CLIPPED: Final = 0.1
+_INVALID, _CLIPPED = 0.6, 0.1
 # Share of the frames that repeat the one before, in runs of so many frames.
-_FROZEN: Final = 0.3
-_RUN: Final = 10
+_FROZEN, _RUN = 0.3, 10
 _HIGHEST: Final = 313.15  # of a response that was calibrated too little [K]
 _FLICKER: Final = 2.0  # of an object, standard deviation [K]
 _SHAPE: Final = (36, 48)  # of a picture
@@ -53,30 +50,16 @@ def rates(
 ) -> xr.Dataset:
     """Rates of each flag: of false alarms where nothing is wrong, of misses where it should come.
 
-    Parameters
-    ----------
-    expected : mapping
-        Flag, in lower case, to the scenes in which it should come: what differs from the `base`,
-        see `cases.simulate`, or a picture's (`PICTURED`). Where it should come in some pixels
-        alone, the others count as false alarms; damaged samples (`FAULTS`) are in every second one.
-    clean : mapping
-        Scenes by name in which none should come.
-    base : mapping
-        The body that warms, of all scenes.
-    pixels : int
-        Number of pixels of a scene.
-    clock : sequence of float
-        Number of frames, and their rate [Hz].
-    seed : int
-        Seed of all scenes.
+    The flag, in lower case, is `expected` in scenes: what differs from the `base`, the body that
+    warms, see `cases.simulate`, or a picture's (`PICTURED`). Where it should come in some pixels
+    alone, the others count as false alarms; damaged samples (`FAULTS`) are in every second one. In
+    `clean` scenes, by name, none should come. The clock is the number of frames and their rate
+    [Hz].
 
-    Returns
-    -------
-    Dataset
-        Over `flag`: `pixels` and `clean_pixels`, in which it should come, and in which none should;
-        shares [1]: `false_alarms` of the latter, and of the former `without_it`, `without_any` flag
-        and, without any, `wrong`: an object temperature or emissivity beyond `FAR` deviations. The
-        flag "any" has the false alarms of all together. NaN where there is no pixel.
+    Over `flag`: `pixels` and `clean_pixels`, in which it should come, and in which none should;
+    shares [1]: `false_alarms` of the latter, and of the former `without_it`, `without_any` flag
+    and, without any, `wrong`: an object temperature or emissivity beyond `FAR` deviations. The flag
+    "any" has the false alarms of all together. NaN where there is no pixel.
     """
     names = [*Status.bits(), "any"]
     counts = xr.Dataset(
@@ -99,15 +82,14 @@ def rates(
 def table(rates: xr.Dataset) -> str:
     """Table in Markdown of the `rates` [%] of the flags that should have come somewhere."""
     heads = ("false alarms", "not flagged by it", "by no flag", "by no flag, and wrong")
-    columns = ("false_alarms", *_SHARES)
-    lines = [f"| flag | pixels | {' | '.join(heads)} |", f"| --- |{' --: |' * (len(heads) + 1)}"]
+    rows: list[tuple[str, ...]] = [("flag", "pixels", *heads)]
     for name in rates["flag"].values:
         row = rates.sel(flag=name)
         if row["pixels"] > 0 or name == "any":
-            shown = [100.0 * float(row[column]) for column in columns]
-            cells = ["" if np.isnan(one) else f"{one:.2f} %" for one in shown]
-            lines.append(f"| `{name}` | {int(row['pixels'])} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+            shown = [100.0 * float(row[column]) for column in ("false_alarms", *_SHARES)]
+            cells = ["" if np.isnan(share) else f"{share:.2f} %" for share in shown]
+            rows.append((f"`{name}`", str(int(row["pixels"])), *cells))
+    return numbers.table(rows) + "\n"
 
 
 def _solved(
@@ -191,32 +173,32 @@ def _unpaired(shift: Array) -> Mask:
     return np.asarray(((place < -0.5) | (place > size - 0.5)).any(axis=0))
 
 
-def _invalid(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
+def _invalid(counts: Film, pixels: Mask, rng: np.random.Generator) -> None:
     """Most samples of a band no numbers."""
     counts[0][(rng.random(counts.shape[1:]) < _INVALID) & pixels] = np.nan
 
 
-def _constant(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
+def _constant(counts: Film, pixels: Mask, rng: np.random.Generator) -> None:
     """The signal of a band, drawn for each pixel, the same in all frames."""
     stuck = _in_one_band(counts, pixels, rng)
     counts[...] = np.where(stuck, counts[:, :1], counts)
 
 
-def _saturated(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
+def _saturated(counts: Film, pixels: Mask, rng: np.random.Generator) -> None:
     """The highest samples of a band, drawn for each pixel, at one level."""
     limit = np.quantile(counts, 1.0 - _CLIPPED, axis=1, keepdims=True)
     clipped = _in_one_band(counts, pixels, rng)
     counts[...] = np.where(clipped, np.minimum(counts, limit), counts)
 
 
-def _in_one_band(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> Mask:
+def _in_one_band(counts: Film, pixels: Mask, rng: np.random.Generator) -> Mask:
     """Samples (band, 1, y, x) of one band, drawn for each of the pixels."""
     chosen = rng.integers(0, len(counts), pixels.shape)
     bands = np.arange(len(counts))[:, np.newaxis, np.newaxis]
     return np.asarray((chosen == bands) & pixels)[:, np.newaxis]
 
 
-def _frozen(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
+def _frozen(counts: Film, pixels: Mask, rng: np.random.Generator) -> None:
     """Runs of frames in which all bands repeat the frame before."""
     frames = counts.shape[1]
     for start in rng.choice(frames // _RUN, int(_FROZEN * frames / _RUN), replace=False) * _RUN:
@@ -250,12 +232,7 @@ def _count_misses(
     counts["alarms"].values[place] += np.count_nonzero(apart)
     counts["clean_pixels"].values[place] += np.count_nonzero(~holds)
     none = holds & (status == 0)
-    wrong = stress.wrong(truth, result, FAR).values
-    parts = {
-        "pixels": holds,
-        "without_it": holds & ((status & Status.bits()[flag]) == 0),
-        "without_any": none,
-        "wrong": none & wrong,
-    }
-    for name, mask in parts.items():
+    wrong = none & limits.wrong(truth, result, FAR).values
+    missed = holds & ((status & Status.bits()[flag]) == 0)
+    for name, mask in zip(_COUNTED, (holds, missed, none, wrong), strict=True):
         counts[name].values[place] += np.count_nonzero(mask)

@@ -1,17 +1,21 @@
-"""Distance of the separation from its statistical limit: noise, bands, pooled pixels."""
+"""Distance of the separation from its limit, and calibration of its error bars and flags.
+
+Two promises are judged on simulated pixels. An error bar: 95 % intervals hold the truth in 95 of
+100 cases. A status of 0: the pixel is right; a pixel whose error is far beyond its error bar should
+have a flag.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt
 
 from dbthermal import alignment, limits, separation
 from dbthermal.simulation import Rig
-from reproduction import closed_form
-from reproduction.experiments import cases, stress
+from reproduction.cache import gridded
+from reproduction.experiments import cases
 
 KNOWING: Final = ("nothing", "slope", "rest")
 """What a bound is told of the background: nothing; the slope of the response there, as if it were
@@ -23,10 +27,19 @@ BEFOREHAND: Final = 0.29
 BORDER: Final = 2.0
 """Distance from a border of two materials within which no label is judged [pixel]."""
 
-_BOUNDED: Final = {
-    "reflection_ratio": "reflection_ratio_std",
-    "object_temperature": "object_temperature_std",
-}
+FAR: Final = 4.0
+"""Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""
+
+AMONG: Final = ("unflagged", "all")
+"""Pixels whose intervals are counted: those with status 0, or all that have a value."""
+
+KINDS: Final = ("object", "any")
+"""Quantities by which a pixel is bad: its object temperature; or that, or an emissivity."""
+
+_PIXELS: Final = ("y", "x")
+_INNER: Final = (0.1587, 0.8413)
+
+_BOUNDED: Final = ("reflection_ratio", "object_temperature")
 _UNITS: Final = {"object_temperature": "K"}
 
 
@@ -48,7 +61,7 @@ def near_bound(
     - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
       At low noise it is loose, for the data tell the emissivities, and with them the level of
       the background and the ratio of the bands' slopes there, which this bound does not know;
-    - "slope": the closed form `closed_form.ratio_variance_bound`, one free number a frame, but the
+    - "slope": the closed form `cases.ratio_variance_bound`, one free number a frame, but the
       slopes are known: of the three the one that fits the reflection ratio. It says nothing of the
       object;
     - "rest": `limits.bounds` that know in which frames the background rests, which the method does
@@ -58,27 +71,22 @@ def near_bound(
     and must be the quietest; `ends` are the first and last temperature of the object [degree
     Celsius], `clock` the number of frames and their rate [Hz].
 
-    Returns
-    -------
-    Dataset
-        `reflection_ratio_error` (pixel) [1], signed, of the second band, and
-        `reflection_ratio_bound` (knowing, pixel); `object_temperature_error` (pixel) [K], root mean
-        square over time, and `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN
-        in pixels without an object temperature. `status` (pixel).
+    `reflection_ratio_error` (pixel) [1], signed, of the second band, and `reflection_ratio_bound`
+    (knowing, pixel); `object_temperature_error` (pixel) [K], root mean square over time, and
+    `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN in pixels without an object
+    temperature. `status` (pixel).
     """
     rig = Rig(bands=tuple(bands), noise=tuple(noise))
     case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
-    truth, result = cases.run_case(case, rig, _times(clock), pixels, seed)
+    truth, result = cases.run_case(case, rig, np.arange(int(clock[0])) / clock[1], pixels, seed)
     known = result["object_temperature"].notnull().all("time")
     response = rig.response()
     free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
     slope = limits.bounds(
         truth, _as_line(response, rig), resting=False, response_kind="linear"
     ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
-    told = xr.concat(
-        [part[list(_BOUNDED.values())] for part in (free, slope, limits.bounds(truth, response))],
-        xr.DataArray(list(KNOWING), dims="knowing", name="knowing"),
-    )
+    names, kinds = [f"{it}_std" for it in _BOUNDED], (free, slope, limits.bounds(truth, response))
+    told = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     measured = {
@@ -130,29 +138,27 @@ def pooled(
     pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
     share. Other parameters as for `near_bound`, of the default `Rig`.
 
-    Returns
-    -------
-    Dataset
-        `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
-        groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
-        `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
-        separation's own standard deviation of the ratio, root mean square.
+    `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
+    groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
+    `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
+    separation's own standard deviation of the ratio, root mean square.
     """
     uneven = [size for size in sizes if size < 1 or pixels % size]
     if uneven:
         raise ValueError(f"Invalid size {uneven[0]} of a group. Must divide the {pixels} pixels.")
     rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
-    truth, capture, response = cases.simulate(case, rig, _times(clock), pixels, seed)
+    time = np.arange(int(clock[0])) / clock[1]
+    truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
     linear = _as_line(response, rig)
     bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
-    ratio, parts = closed_form.reflection_ratio(list(emissivity)).item(), []
+    ratio, parts = cases.reflection_ratio(list(emissivity)).item(), []
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
         parts.append(_of_groups(size, truth, result, ratio))
         parts[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
-    groups = xr.concat(parts, xr.DataArray(list(sizes), dims="size", name="size"))
+    groups = gridded(parts, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
 
@@ -182,19 +188,19 @@ def stressed(
     seed: int,
     aligned: bool = False,
 ) -> xr.Dataset:
-    """Error bars and flags (`stress.judge`) of one case of `cases.simulate`.
+    """Error bars and flags (`judge`) of one case of `cases.simulate`.
 
     Aligned, the bands are first brought onto one clock by `alignment.align`; `frames_lost` [1] is
     the number of frames that this leaves empty in a band.
     """
-    rig, time = Rig(), _times(clock)
+    rig, time = Rig(), np.arange(int(clock[0])) / clock[1]
     if not aligned:
-        judged = stress.judge(*cases.run_case(case, rig, time, pixels, seed))
+        judged = judge(*cases.run_case(case, rig, time, pixels, seed))
         return judged.assign(frames_lost=((), 0, {"units": "1"}))
     truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
     together = alignment.align(capture)
     result = separation.solve(together, response)
-    judged = stress.judge(on_clock(truth, result["time"]), result)
+    judged = judge(on_clock(truth, result["time"]), result)
     lost = max(together.attrs["frames_lost"])
     return judged.assign(frames_lost=((), lost, {"units": "1"}))
 
@@ -224,18 +230,7 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
     sides = [set(np.unique(part[part >= 0])) for part in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
-    units = {"units": "1"}
-    return xr.Dataset(
-        {
-            "right": ((), right / sum(part.size for part in inner), units),
-            "bleeding": ((), bleeding, units),
-        }
-    )
-
-
-def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:
-    """Times [s] of a clock: number of frames, and their rate [Hz]."""
-    return np.arange(int(clock[0])) / clock[1]
+    return cases.scalars(right=right / sum(part.size for part in inner), bleeding=bleeding)
 
 
 def _as_line(response: xr.Dataset, rig: Rig) -> xr.Dataset:
@@ -254,3 +249,99 @@ def _row(image: xr.DataArray, name: str) -> xr.DataArray:
 def _rms(part: xr.DataArray) -> xr.DataArray:
     """Root mean square over the pixels that have a value."""
     return ((part**2).mean("pixel") ** 0.5).assign_attrs(part.attrs)
+
+
+def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    r"""Error bars and flags of one separation against the truth.
+
+    A pixel is **bad** in its `object` where
+
+    .. math:: \sqrt{\overline{(\hat x - x)^2}} > 4 \sqrt{\overline{s_x^2}}
+
+    over the frames, and bad in `any` where that is so or the error of an emissivity exceeds four
+    of its standard deviations. A pixel without a value is not bad.
+
+    Returns
+    -------
+    Dataset
+        Over all pixels, in [1] but for the error in [K]; NaN where there is nothing to count:
+
+        - `object_coverage` (among): share of samples whose 95 % interval holds the truth;
+          `emissivity_coverage` (among, band): share of pixels;
+        - `width` (band): stated standard deviation of the emissivity over the robust standard
+          deviation of its error, both of all pixels with a value; 1 for a calibrated uncertainty;
+        - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
+        - `flagged`: share of pixels with any flag;
+        - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
+        - `status` (pixel), and `bad` (kind, pixel), true where bad.
+    """
+    statistics = _coverage(truth, result)
+    # Pixels (kind, pixel) with an error beyond four standard deviations.
+    of_object, of_emissivity = _beyond(truth, result, FAR)
+    beyond = [_flat(of_object), _flat(of_object | of_emissivity)]
+    bad = xr.concat(beyond, xr.DataArray(list(KINDS), dims="kind", name="kind"))
+    flagged = _flat(result["status"] != 0)
+    statistics |= {
+        "flagged": flagged.mean(),
+        "width": _width(truth, result),
+        "bad_pixels": bad.sum("pixel"),
+        "bad_flagged": _share(flagged, bad, ("pixel",)),
+        "status": _flat(result["status"]),
+        "bad": bad,
+    }
+    units = {name: value.assign_attrs(units="1") for name, value in statistics.items()}
+    errors = cases.score(truth, result)[["object_temperature_rmse", "emissivity_error"]]
+    return xr.Dataset(units).merge(errors).assign_attrs(origin="simulated")
+
+
+def _share(holds: xr.DataArray, counted: xr.DataArray, over: tuple[str, ...]) -> xr.DataArray:
+    """Share of the counted samples for which a condition holds; NaN where none is counted."""
+    number = counted.sum(over)
+    return (holds & counted).sum(over) / number.where(number > 0)
+
+
+def _flat(image: xr.DataArray) -> xr.DataArray:
+    """Pixels of an image in a row."""
+    return image.stack(pixel=_PIXELS).drop_vars(["pixel", *_PIXELS])
+
+
+def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Share of 95 % intervals that hold the truth, among the unflagged and among all."""
+    label = xr.DataArray(list(AMONG), dims="among", coords={"among": list(AMONG)})
+    chosen = (result["status"] == 0) | (label == "all")
+    statistics = {}
+    for name, over in (("object", ("time", *_PIXELS)), ("emissivity", _PIXELS)):
+        full = "object_temperature" if name == "object" else name
+        error, std = abs(result[full] - truth[full]), result[f"{full}_std"]
+        counted = error.notnull() & chosen
+        statistics[f"{name}_coverage"] = _share(error < cases.INTERVAL * std, counted, over)
+    return statistics
+
+
+def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
+    """Median stated deviation of the emissivities over the robust one of their errors."""
+    error = result["emissivity"] - truth["emissivity"]
+    known = error.notnull().all("band")
+    shape = (error.sizes["band"], -1)
+    errors = error.where(known).values.reshape(shape)[:, known.values.ravel()]
+    stds = result["emissivity_std"].values.reshape(shape)[:, known.values.ravel()]
+    width = np.full(shape[0], np.nan)
+    if errors.size:
+        lower, upper = np.quantile(errors, _INNER, axis=1)
+        np.divide(2.0 * np.median(stds, axis=1), upper - lower, out=width, where=upper > lower)
+    return xr.DataArray(width, dims="band", coords={"band": error["band"]})
+
+
+def wrong(truth: xr.Dataset, result: xr.Dataset, far: float = FAR) -> xr.DataArray:
+    """Pixels (y, x) whose object temperature or an emissivity is off by more than `far` [1]."""
+    of_object, of_emissivity = _beyond(truth, result, far)
+    return of_object | of_emissivity
+
+
+def _beyond(truth: xr.Dataset, result: xr.Dataset, far: float) -> tuple[xr.DataArray, xr.DataArray]:
+    """Pixels (y, x) with an object, and with an emissivity, beyond so many deviations."""
+    squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
+    allowed = (result["object_temperature_std"] ** 2).where(squared.notnull())
+    of_object = squared.mean("time") > far**2 * allowed.mean("time")
+    apart = abs(result["emissivity"] - truth["emissivity"])
+    return of_object, (apart > far * result["emissivity_std"]).any("band")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -11,9 +12,9 @@ from dbthermal import alignment, separation, simulation
 from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
 from reproduction import disturbances
-from reproduction.experiments.cases import STEPS
+from reproduction.cache import gridded
+from reproduction.experiments.cases import STEPS, held, rmse, scalars
 from reproduction.experiments.limits import on_clock
-from reproduction.experiments.scores import held, rmse
 
 TREATMENTS: Final = ("as recorded", "undone", "without")
 """A capture with the nuisance as it is; with the nuisance undone; and one that never had it."""
@@ -24,8 +25,7 @@ VIEWS: Final = ("registered", "registered by the truth", "one view")
 NUISANCES: Final = ("lost frames", "shutter", "lost frames and shutter")
 """What `disturbed` puts into a capture."""
 
-GLASS: Final = (0.86, 0.72)
-"""Emissivities of plate glass in the two bands of the default `Rig` [1]."""
+GLASS: Final = (0.86, 0.72)  # emissivities of plate glass in the two bands of the default `Rig` [1]
 
 COLUMNS: Final = 4
 """Columns of the scene in a pixel of `parallax`, over which its sides see the mean."""
@@ -73,17 +73,11 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
     kind, later = Pixels(**pixels), round(delay * STEPS)
     rng, response = np.random.default_rng(seed), Rig().response()
     scene = kind.scene(rng, later=later, steps=STEPS)
-    captures = [
-        disturbances.expose(
-            scene,
-            response,
-            np.random.default_rng(seed + 1),
-            every=STEPS,
-            offsets=offsets,
-            frames=int(kind.clock[0]),
-        ).drop_vars("exposure_time")
-        for offsets in ((0, later), (later, later))
-    ]
+    options, captures = {"every": STEPS, "frames": int(kind.clock[0])}, []
+    for offsets in ((0, later), (later, later)):
+        rng = np.random.default_rng(seed + 1)
+        seen = disturbances.expose(scene, response, rng, offsets=offsets, **options)
+        captures.append(seen.drop_vars("exposure_time"))
     offset = alignment.time_offset(captures[0])
     aligned = alignment.align(captures[0], offset=offset)
     result = _compare(scene, (captures[0], aligned, captures[1]), response, TREATMENTS)
@@ -140,18 +134,25 @@ def parallax(
             f"Invalid shift {list(shift)} and parallax {distance} pixels. Must be multiples of "
             f"1/{COLUMNS} along x and of 1 along y, within {_MARGIN} together."
         )
-    wide, known = _plate(shape, clock, np.random.default_rng(seed)), Rig().response()
-    capture, single = (
-        _two_views(wide, moved, more, known, np.random.default_rng(seed + 1))
-        for moved, more in ((shift, distance), ((0.0, 0.0), 0.0))
-    )
+    # People walking by: a margin around the view, and several columns a pixel.
+    value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
+    time, known = np.arange(int(clock[0])) / clock[1], Rig().response()
+    height, width = (size + 2 * _MARGIN for size in shape)
+    rng = np.random.default_rng(seed)
+    wide = simulation.walkers(time, (height, width * COLUMNS), value, rng)
+    first, captures = _view(wide, (0.0, 0.0)), []
+    for right, down, more in ((*shift, distance), (0.0, 0.0, 0.0)):
+        mirrored = _view(wide, (right + more, down))["background_temperature"]
+        second = _view(wide, (right, down)).assign(background_temperature=mirrored)
+        rng = np.random.default_rng(seed + 1)
+        captures.append(disturbances.by_cameras((first, second), known, rng))
+    capture, single = captures
     estimate = alignment.register(capture, model="translation")
     true = estimate.copy(data=np.stack([np.eye(3), np.eye(3)]))
     true[1, :2, 2] = -np.array(shift)
-    captures = [
-        alignment.align(capture, offset=0.0, transform=matrix) for matrix in (estimate, true)
-    ]
-    result = _compare(_view(wide, (0.0, 0.0)), (*captures, single), known, VIEWS)
+    align = partial(alignment.align, capture, offset=0.0)
+    captures = [align(transform=estimate), align(transform=true), single]
+    result = _compare(first, captures, known, VIEWS)
     away = float(np.hypot(*(estimate - true).values[1, :2, 2]))
     return result.assign(misregistered=((), away, {"units": "pixel"}))
 
@@ -166,13 +167,10 @@ def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     # Errors of all pixels with a value; intervals of those without a flag.
     error = result["object_temperature"] - truth["object_temperature"]
     solved, good = error.notnull().any("time"), result["status"] == 0
-    values = {
-        "object_temperature_rmse": (rmse(error), "K"),
-        "flagged": ((~good).where(solved).mean(), "1"),
-        "covered": (held(error.where(good), result["object_temperature_std"]), "1"),
-    }
-    return xr.Dataset(
-        {name: ((), float(it), {"units": unit}) for name, (it, unit) in values.items()}
+    return scalars(
+        object_temperature_rmse=rmse(error),
+        flagged=(~good).where(solved).mean(),
+        covered=held(error.where(good), result["object_temperature_std"]),
     )
 
 
@@ -182,16 +180,7 @@ def _compare(
     """Cost of the separation of each capture of a scene."""
     results = [separation.solve(capture, response) for capture in captures]
     rows = [cost(on_clock(scene, result["time"]), result) for result in results]
-    label = xr.DataArray(list(names), dims="treatment", name="treatment")
-    return xr.concat(rows, label).assign_attrs(origin="simulated")
-
-
-def _plate(shape: Sequence[int], clock: Sequence[float], rng: np.random.Generator) -> xr.Dataset:
-    """People walking by a plate of glass: a margin around the view, and several columns a pixel."""
-    value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
-    time = np.arange(int(clock[0])) / clock[1]
-    height, width = (size + 2 * _MARGIN for size in shape)
-    return simulation.walkers(time, (height, width * COLUMNS), value, rng)
+    return gridded(rows, {"treatment": names}).assign_attrs(origin="simulated")
 
 
 def _view(wide: xr.Dataset, shift: Sequence[float]) -> xr.Dataset:
@@ -204,20 +193,3 @@ def _view(wide: xr.Dataset, shift: Sequence[float]) -> xr.Dataset:
     mean = seen.coarsen(x=COLUMNS).mean()
     places = {dim: np.arange(mean.sizes[dim]) for dim in ("x", "y")}
     return mean.assign_coords(places).assign_attrs(wide.attrs)
-
-
-def _two_views(
-    wide: xr.Dataset,
-    shift: Sequence[float],
-    parallax: float,
-    response: xr.Dataset,
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """Capture of a scene in the first band, and of a shifted one in the second."""
-    other = _view(wide, shift)
-    moved = _view(wide, (shift[0] + parallax, shift[1]))["background_temperature"]
-    views = (_view(wide, (0.0, 0.0)), other.assign(background_temperature=moved))
-    parts = [
-        simulation.observe(view, response.isel(band=[band]), rng) for band, view in enumerate(views)
-    ]
-    return xr.concat(parts, "band", combine_attrs="override")

@@ -21,8 +21,7 @@ from dbthermal.separation._tiles import Array, Tile
 from reproduction.methods import dbvt_objective as objective
 from reproduction.methods.dbvt import DbvtSettings, Search
 
-INTERVAL: Final = 0.1
-"""Interval of the frames [s]."""
+INTERVAL: Final = 0.1  # interval of the frames [s]
 
 SETTINGS: Final = DbvtSettings(bend_updates=0)
 """Settings of the method "dbvt" for a linear response."""

@@ -9,15 +9,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import simulation
+from dbthermal._arrays import Array
 
-Array = npt.NDArray[np.float64]
-
-ROOM: Final = 295.15
-"""Temperature of the room [K]."""
+ROOM: Final = 295.15  # temperature of the room [K]
 _RISE: Final = 2.0 * np.log(9.0)  # logistic steps from 10 to 90 % take so many of their scales
 
 

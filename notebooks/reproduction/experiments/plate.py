@@ -1,19 +1,24 @@
-"""Heated plate of two materials, simulated or recorded by notebook 00, and how it is judged."""
+"""Heated plate of two materials, simulated or recorded by notebook 00; and a trial with sliders."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, Final
 
+import ipywidgets
 import numpy as np
 import pandas as pd
 import xarray as xr
+from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
 from dbthermal import alignment, correction, emissivity, schema, separation, simulation
+from dbthermal import response as responses
 from dbthermal.instruments.recording import open_capture
 from reproduction import paths
-from reproduction.experiments import emulated_rig
-from reproduction.experiments.scores import held, rmse
+from reproduction.experiments import emulated
+from reproduction.experiments.cases import held, rmse
+from reproduction.figures.scenes import truth_and_estimate
 from reproduction.run import Run
 
 _WIDTH = 1.96  # half-width of the 95 % intervals, in standard deviations [1]
@@ -92,18 +97,15 @@ def recorded(
     corrected = alignment.align(corrected, offset=offset, transform=transform)
     shift = alignment.reflection_shift(corrected, response) if taken["apart"] else None
     # The truth at the times of the frames, of emulated cameras.
-    scene = emulated_rig.truth(path.parent).get("scene")  # none of hardware
-    truth = None if scene is None else emulated_rig.shown(scene, corrected)
+    scene = emulated.truth(path.parent).get("scene")  # none of hardware
+    truth = None if scene is None else emulated.shown(scene, corrected)
     return Plate(corrected, response, truth, shift)
 
 
 def _calibration(run: Run) -> tuple[xr.Dataset, xr.Dataset]:
     """Correction and response of notebook 01, in the bands of the rig."""
-    bands = list(simulation.Rig().bands)
-    stem = "01_calibration"
-    return run.open(stem, "_correction").sel(band=bands), run.open(stem, "_response").sel(
-        band=bands
-    )
+    stem, bands = "01_calibration", {"band": list(simulation.Rig().bands)}
+    return run.open(stem, "_correction").sel(bands), run.open(stem, "_response").sel(bands)
 
 
 def disagreement(apparent: xr.DataArray, status: xr.DataArray) -> tuple[int, int]:
@@ -178,3 +180,39 @@ def scores(
         values[f"twin_emissivity_error_{band}"] = off.sel(band=band).median()
         values[f"twin_emissivity_coverage_{band}"] = within.sel(band=band)
     return {name: float(value) for name, value in values.items()}
+
+
+DIFFERENCE: Final = 0.14  # emissivity of 8-14 um less that of 9.5 um, as of plate glass [1]
+
+NOISE: Final = (0.03, 0.35)  # noise of the two bands at the slider's middle [K]
+
+_PIXELS, _FRAMES, _RATE, _SEED = 12, 350, 10.0, 3
+
+
+@lru_cache
+def trial(emissivity: float, noise: float) -> Figure:
+    """Truth, estimate and reading of a pixel of an emissivity [1], with so many times the noise."""
+    rig = simulation.Rig(noise=(NOISE[0] * noise, NOISE[1] * noise))
+    share = xr.DataArray([emissivity, emissivity - DIFFERENCE], {"band": list(rig.bands)}, "band")
+    # Simulate, observe and separate a few pixels, of which one is shown.
+    time, rng = np.arange(_FRAMES) / _RATE, np.random.default_rng(_SEED)
+    pixels, background = simulation.independent_pixels, simulation.Background()
+    scene = pixels(time, share, background, _PIXELS, rng, start=293.15, stop=333.15)  # [K]
+    capture = simulation.observe(scene, rig.response(), rng)
+    result = separation.solve(capture, rig.response(), workers=1)
+    figure = truth_and_estimate(scene, result, (0, 0))
+    reading = responses.apparent_temperature(rig.response(), capture["counts"])[0, :, 0, 0]
+    figure.axes[0].plot(time, reading - zero_Celsius, color="0.6", linewidth=0.6, zorder=0)
+    first = result.isel(y=0, x=0)
+    flags = [bit.label for bit in schema.Status if int(first["status"]) & bit]
+    found = f"{float(first['emissivity'][0]):.3f} +- {float(first['emissivity_std'][0]):.3f}"
+    text = f"emissivity {emissivity:.2f}, estimated {found}; flags: {', '.join(flags) or 'none'}"
+    figure.axes[0].set_title(text, fontsize=8)
+    return figure
+
+
+def sliders() -> ipywidgets.Widget:
+    """Sliders of the emissivity and of the noise over a `trial`."""
+    emissivity = ipywidgets.FloatSlider(0.86, min=0.2, max=0.96, step=0.02, continuous_update=False)
+    noise = ipywidgets.FloatSlider(1.0, min=0.2, max=5.0, step=0.2, continuous_update=False)
+    return ipywidgets.interactive(trial, emissivity=emissivity, noise=noise)

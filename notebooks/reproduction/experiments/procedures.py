@@ -68,15 +68,13 @@ def reflector_sensitivity(
     """
     true = _true(response, repeats)
     benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]
-    mean = [
-        [
-            np.mean([_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)], axis=0)
-            for bench in benches
-        ]
+    runs = [
+        [[_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)] for bench in benches]
         for it in OBJECTS
     ]
+    mean = np.mean(runs, axis=2)
     return xr.Dataset(
-        {"true": true, "mean": (("object", "excess", "band"), np.array(mean), {"units": "1"})},
+        {"true": true, "mean": (("object", "excess", "band"), mean, {"units": "1"})},
         coords={"excess": ("excess", [float(excess) for excess in excesses], {"units": "K"})},
         attrs={"origin": "simulated twin", "repeats": repeats},
     )
@@ -85,9 +83,8 @@ def reflector_sensitivity(
 def _true(response: xr.Dataset, repeats: int) -> xr.DataArray:
     """True emissivity (object, band) of the objects."""
     if repeats < 2:
-        raise ValueError(
-            f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. Must be twice or more."
-        )
+        rule = "Must be twice or more"
+        raise ValueError(f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. {rule}.")
     names = tuple(str(name) for name in response["band"].values)
     return xr.DataArray(
         [band_emissivity(sample, names).values for sample in OBJECTS],

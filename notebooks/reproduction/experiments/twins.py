@@ -12,13 +12,12 @@ from dbthermal import response as responses
 from dbthermal.schema import COMPLETED
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
+from reproduction.experiments.cases import held, rmse, scalars
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
-from reproduction.experiments.scores import held, rmse
 from reproduction.metrics import relative_error_celsius
-from reproduction.twins.views import Registration
+from reproduction.twins.stage import Registration
 
-BEAD: Final = 3
-"""Pixels along a side of the square that a thermocouple's bead covers."""
+BEAD: Final = 3  # pixels along a side of the square that a thermocouple's bead covers
 
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
@@ -26,11 +25,9 @@ SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 PIXELWISE: Final = ("apparent", "calibrated", "dbvt", "naive")
 """Methods that get the surroundings of a bead only, which they treat pixel by pixel."""
 
-REACH: Final = 5
-"""Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
+REACH: Final = 5  # pixels around a bead that it gets: of some shifts, by which it pairs the pixels
 
-RESTING: Final = 0.1
-"""Standard deviation over time [K] below which an object counts as at rest."""
+RESTING: Final = 0.1  # standard deviation over time [K] below which an object counts as at rest
 
 _STRAY: Final = 0.01
 
@@ -53,18 +50,13 @@ def judge_twin(
     one's place. Of the variants (see `at_thermocouple`), "calibrated" gets the emissivities that
     the bench finds for a piece of the same material, with their deviations.
 
-    Returns
-    -------
-    Dataset
-        Over `cameras`, the registrations (with a baseline) and "one place": variables of
-        `at_thermocouple`; over the `way`, "alone" by `solve`, and if it is judged as a `whole`,
-        with a baseline, "pooled" and "completed" by `separate`, those of `over_the_image`, else
-        NaN; `resting` [1], the share of the pixels whose object changes by less than `RESTING`,
-        where two bands leave the emissivity open; `emissivity_difference` (band) [1], mean
-        magnitude of the default method's emissivity less the calibrated one over the pixels
-        without a flag.
-    Dataset or None
-        As of `separate_twin`, of the first registration; if it is to be shown.
+    The first dataset has, over `cameras`, the registrations (with a baseline) and "one place":
+    variables of `at_thermocouple`; over the `way`, "alone" by `solve`, and if it is judged as a
+    `whole`, with a baseline, "pooled" and "completed" by `separate`, those of `over_the_image`,
+    else NaN; `resting` [1], the share of the pixels whose object changes by less than `RESTING`,
+    where two bands leave the emissivity open; `emissivity_difference` (band) [1], mean magnitude of
+    the default method's emissivity less the calibrated one over the pixels without a flag. The
+    second, if it is to be `shown`, is as of `separate_twin`, of the first registration.
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng)
@@ -95,7 +87,10 @@ def judge_twin(
                 picture = _with_truth(result, scene, corrected, response)
         image = xr.concat(ways.values(), xr.DataArray(list(ways), dims="way", name="way"))
         image = image.reindex(way=["alone", "pooled", "completed"])
-        both = {**image.data_vars, "resting": _resting(scene), "emissivity_difference": away}
+        # Share of the pixels with a moving background whose object rests.
+        moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
+        resting = ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
+        both = {**image.data_vars, "resting": resting, "emissivity_difference": away}
         parts.append(read.assign_coords(way=image["way"]).assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
     return xr.concat(parts, label, join="outer", combine_attrs="override"), picture
@@ -148,12 +143,6 @@ def _moving(scene: xr.Dataset) -> xr.DataArray:
     return (scene["background_temperature"].std("time") > MOVING) & scene["on_object"]
 
 
-def _resting(scene: xr.Dataset) -> xr.DataArray:
-    """Share of the pixels with a moving background whose object rests [1]."""
-    moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
-    return ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
-
-
 def over_the_image(
     scene: xr.Dataset, separated: xr.Dataset, *, completed: bool = False
 ) -> xr.Dataset:
@@ -166,12 +155,11 @@ def over_the_image(
     moving, status = _moving(scene), separated["status"]
     good = moving & ((status & int(COMPLETED)) != 0 if completed else status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
-    values = {
-        "good": (good.sum() / moving.sum(), "1"),
-        "object_temperature_rmse": (rmse(error), "K"),
-        "covered": (held(error, separated["object_temperature_std"]), "1"),
-    }
-    return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
+    return scalars(
+        good=good.sum() / moving.sum(),
+        object_temperature_rmse=rmse(error),
+        covered=held(error, separated["object_temperature_std"]),
+    )
 
 
 def on_bench(response: xr.Dataset, material: str, rng: np.random.Generator) -> xr.Dataset:
@@ -203,16 +191,15 @@ def at_thermocouple(
     where it takes one; the default method without arguments is what has been separated. A method
     that looks at whole images, each by itself, gets the first of `EVERY` frames.
 
-    Returns
-    -------
-    Dataset
-        `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes,
-        NaN where a pixel of the bead has no value in some frame;
-        `temperature` (variant, time) and `reading` (time) of the last probe [K], NaN in frames that
-        a method does not get;
-        `highest_reading` [degree Celsius], median over the probes.
+    `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes, NaN
+    where a pixel of the bead has no value in some frame; `temperature` (variant, time) and
+    `reading` (time) of the last probe [K], NaN in frames that a method does not get;
+    `highest_reading` [degree Celsius], median over the probes.
     """
-    square = _square(scene)
+    # Rows and columns that the first bead covers.
+    reach = BEAD // 2
+    centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
+    square = {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
     readings = [
         twins.thermocouple_readings(scene, rng, bead=BEAD).isel(thermocouple=0)
         for _ in range(probes)
@@ -226,7 +213,11 @@ def at_thermocouple(
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
-    errors = [_relative_error(estimate, readings) for estimate in estimates]
+    errors = []  # mean over the frames and the probes' readings (time)
+    for estimate in estimates:
+        times = {"time": estimate["time"]}
+        off = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
+        errors.append(xr.concat(off, "probe").mean(("probe", "time"), skipna=False))
     highest = np.median([float(reading.max()) for reading in readings]) - zero_Celsius
     return xr.Dataset(
         {
@@ -237,20 +228,6 @@ def at_thermocouple(
         },
         attrs={"origin": "simulated twin", "twin": scene.attrs["twin"]},
     )
-
-
-def _relative_error(estimate: xr.DataArray, readings: Sequence[xr.DataArray]) -> xr.DataArray:
-    """Error of a temperature (time), mean over its frames and the probes' readings (time)."""
-    times = {"time": estimate["time"]}
-    errors = [relative_error_celsius(estimate, reading.sel(times)) for reading in readings]
-    return xr.concat(errors, "probe").mean(("probe", "time"), skipna=False)
-
-
-def _square(scene: xr.Dataset) -> dict[str, slice]:
-    """Rows and columns that the first bead covers."""
-    reach = BEAD // 2
-    centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
-    return {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
 
 
 def _mean(

@@ -13,9 +13,9 @@ from dbthermal.calibration import fit_response
 from dbthermal.response import EXACT
 from dbthermal.simulation import Rig
 from reproduction import disturbances
+from reproduction.experiments.cases import held, rmse
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
-from reproduction.experiments.scores import held, rmse
 
 # Heating that differs from place to place, by so much [1], over so many pixels: the detail.
 _UNEVEN, _DETAIL = 0.05, 3.0
@@ -71,17 +71,15 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     ).drop_vars("exposure_time")
     # The first view begins at the first whole pixel that the second has, too.
     top, left = max(-down, 0), max(-right, 0)
-    views = [
-        seen.isel(band=[band], y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
-        for band, (y, x) in enumerate([(top, left), (top + down, left + right)])
-    ]
-    views = [one.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1])) for one in views]
+
+    def part(wide: xr.Dataset, y: int, x: int) -> xr.Dataset:
+        inner = wide.isel(y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
+        return inner.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
+
+    first, second = (seen.isel(band=[band]) for band in (0, 1))
+    views = part(first, top, left), part(second, top + down, left + right)
     seen = xr.concat(views, "band", combine_attrs="override")
-    truth = scene.isel(
-        time=slice(0, _STEPS * count, _STEPS),
-        y=slice(top, top + shape[0]),
-        x=slice(left, left + shape[1]),
-    ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
+    truth = part(scene.isel(time=slice(0, _STEPS * count, _STEPS)), top, left)
     seen = disturbances.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
     seen = disturbances.fire_shutter(seen, last * np.array(shutter), rng)

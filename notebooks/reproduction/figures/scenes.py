@@ -1,6 +1,7 @@
-"""Figures of a scene beside its truth, and film of a separated scene."""
+"""Figures of scenes: beside their truth, as twins, under a sky, as a film."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,14 @@ from scipy.constants import zero_Celsius
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import FilmPanel, drawing, film
-from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
+from dbthermal.figures.drawing import (
+    COLORS,
+    band_label,
+    canvas,
+    draw_image,
+    limits_of,
+    provenance_note,
+)
 
 _CELSIUS: Final = "[\N{DEGREE SIGN}C]"
 
@@ -83,18 +91,10 @@ def compared_pictures(
 
 
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
-    """Truth against estimate over time at one pixel, with two standard deviations.
+    """Truth against estimate over time at a pixel (row, column), with two standard deviations.
 
-    Object above, background below.
-
-    Parameters
-    ----------
-    truth : Dataset
-        Scene with `object_temperature`, `background_temperature` (time, y, x) [K].
-    result : Dataset
-        From `separation.solve`.
-    pixel : tuple of int
-        Row and column.
+    Object above, background below, of a scene with `object_temperature` and
+    `background_temperature` (time, y, x) [K] and a result from `separation.solve`.
     """
     names = ("object_temperature", "background_temperature")
     for dataset, label in ((truth, "the truth"), (result, "the result")):
@@ -119,17 +119,9 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
 def separated_film(
     apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
+    """Frames, as of `film`, of the inputs, the emission and the mean-subtracted reflection.
 
-    Parameters
-    ----------
-    apparent, emission, change, title
-        As for `dbthermal.figures.separated_temperatures` [K]; pixels without a value are gray.
-
-    Yields
-    ------
-    ndarray of uint8, shape (rows, columns, 3)
-        As from `dbthermal.figures.film`.
+    All as for `dbthermal.figures.separated_temperatures` [K]; pixels without a value are gray.
     """
     labels = ("the inputs", "the emission", "the reflection")
     for temperature, label in zip((apparent, emission, change), labels, strict=True):
@@ -144,3 +136,97 @@ def separated_film(
     panels.append(FilmPanel(emission - zero_Celsius, "emission"))
     panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
     yield from film(panels, title=title + drawing.provenance_note(apparent))
+
+
+def thermocouples(scores: xr.Dataset) -> Figure:
+    """Reading of the thermocouple and estimates of all methods there, a panel a scene.
+
+    `reading` (scene, time) and `temperature` (scene, variant, time) [K], `relative_error`
+    (scene, variant) [percent of degrees Celsius].
+    """
+    count = scores.sizes["scene"]
+    figure, axes = canvas(1, count, (5.6 * count, 4.0))
+    for axis, name in zip(axes[0], scores["scene"].values, strict=True):
+        here = scores.sel(scene=name)
+        for index, variant in enumerate(here["variant"].values):
+            part = here.sel(variant=variant)
+            error = float(part["relative_error"])
+            known = part["temperature"].dropna("time")
+            axis.plot(
+                known["time"],
+                known - zero_Celsius,
+                color=COLORS[index % len(COLORS)],
+                linewidth=1,
+                linestyle="-" if index < len(COLORS) else "--",
+                label=f"{variant}, {error:.2g} %" if isfinite(error) else f"{variant}, no value",
+            )
+        reading = here["reading"] - zero_Celsius
+        axis.plot(reading["time"], reading, color="black", linewidth=1.5, label="thermocouple")
+        axis.set(xlabel="time [s]", title=str(name).replace("_", " "))
+        axis.legend(frameon=False, fontsize=8)
+    axes[0, 0].set_ylabel("object temperature [\N{DEGREE SIGN}C]")
+    figure.suptitle("At the thermocouple" + provenance_note(scores))
+    return figure
+
+
+def error_maps(picture: xr.DataArray, errors: Mapping[str, xr.DataArray]) -> Figure:
+    """Maps of the error (y, x) [K] of each method, beside the apparent temperature (y, x) [K].
+
+    Pixels without a value are gray; each map has its own scale.
+    """
+    count = 1 + len(errors)
+    aspect = picture.sizes["y"] / picture.sizes["x"]
+    figure, axes = canvas(1, count, (4.2 * count, 3.3 * aspect + 1.0))
+    shown = picture - zero_Celsius
+    unit = "apparent [\N{DEGREE SIGN}C]"
+    draw_image(figure, axes[0, 0], shown, "input", unit, limits=limits_of(shown))
+    for axis, (name, error) in zip(axes[0, 1:], errors.items(), strict=True):
+        scale = (0.0, limits_of(error)[1])
+        draw_image(figure, axis, error, name, "mean error [K]", cmap="magma_r", limits=scale)
+    data = next(iter(errors.values()))
+    figure.suptitle("Error of the object temperature, mean over frames" + provenance_note(data))
+    return figure
+
+
+def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]) -> Figure:
+    """Readings of two bands over a day, above them the flags of the separated stretches.
+
+    Temperatures (band, time) [K], time [s] from midnight; the middle of each stretch [h], and its
+    flags, by commas.
+    """
+    figure, ((axis,),) = canvas(1, 1, (8.0, 3.6))
+    celsius, time = readings - zero_Celsius, readings["time"] / 3600.0
+    for name in readings["band"].values:
+        axis.plot(time, celsius.sel(band=name), lw=0.7, label=str(name))
+    low, high = float(celsius.min()), float(celsius.max())
+    for hour, words in zip(middles, flags, strict=True):
+        text = words.replace(", ", "\n") or "no flag"
+        axis.text(
+            hour, high + 0.1 * (high - low), text, ha="center", va="bottom", rotation=90, fontsize=6
+        )
+    axis.set(ylim=(low - 1.0, high + 0.9 * (high - low)), xlim=(0.0, 24.0))
+    axis.set_xlabel("universal time [h]")
+    axis.set_ylabel("reading [°C]")
+    axis.legend(loc="lower right", fontsize=7)
+    axis.set_title("Grass, Oklahoma, 1 June 2019" + drawing.provenance_note(readings))
+    return figure
+
+
+def sky_changes(sky: xr.DataArray, gains: xr.DataArray) -> Figure:
+    """Changes of a sky (band, time) [K] in each band over those in the first, with their ratio."""
+    names = [str(name) for name in sky["band"].values]
+    figure, (axes,) = canvas(1, len(names) - 1, (2.4 * (len(names) - 1), 2.7))
+    changes = sky.diff("time")
+    reach = 1.1 * float(np.abs(changes).max())
+    for axis, name in zip(axes, names[1:], strict=True):
+        axis.plot(changes[0], changes.sel(band=name), "k.", ms=3)
+        line = np.array([-reach, reach])
+        axis.plot(line, line, "0.7", lw=1)
+        axis.plot(line, float(gains.sel(band=name)) * line, "C3", lw=1)
+        axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        axis.set_xlabel(f"change, {band_label(names[0])} [K]")
+        axis.set_ylabel(f"change, {band_label(name)} [K]")
+        axis.set_title(f"{float(gains.sel(band=name)):.2f} times")
+    note = drawing.provenance_note(sky)
+    figure.suptitle(f"The sky overhead from spectrum to spectrum; gray line: a gray sky{note}")
+    return figure

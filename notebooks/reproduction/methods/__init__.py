@@ -13,8 +13,7 @@ from reproduction.methods import bcp, dbvt, naive, ratio
 OUTSIDE: Final = {module.METHOD.name: module.METHOD for module in (dbvt, naive, ratio, bcp)}
 """Records of the methods here, by name."""
 
-METHODS: Final = (*separation.METHODS, *OUTSIDE)
-"""Names of all methods."""
+METHODS: Final = (*separation.METHODS, *OUTSIDE)  # names of all methods
 
 
 def get_method(name: str) -> Method:

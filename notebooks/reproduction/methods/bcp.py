@@ -35,31 +35,17 @@ from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
 class BcpSettings:
     """Options of the blackbody channel prior; none is published.
 
-    Attributes
-    ----------
-    patch : int
-        Side of the patch that is searched for the brightest pixel [pixel], odd. In a patch the
-        object's temperature should not change: on a plate with a hot middle, 240 pixels wide, 5 is
-        better than 15, and 31 worse.
-    window : int
-        Side of the guided filter's window [pixel], odd.
-    regularisation : float
-        The guided filter's epsilon: variance below which the guide counts as flat, relative to the
-        square of the frame's span [1].
-    percentile : float
-        The reflected signal is this percentile of the frame [%], without a reflected temperature.
-    reflected_temperature : float or None
-        Reflected apparent temperature [K], if known.
-    least_transmission : float
-        t0, below which the emissivity is not divided by [1].
+    In a patch the object's temperature should not change: on a plate with a hot middle, 240 pixels
+    wide, a patch of 5 is better than 15, and 31 worse. The guided filter's epsilon is the variance
+    below which the guide counts as flat, relative to the square of the frame's span [1].
     """
 
-    patch: int = 15
-    window: int = 31
-    regularisation: float = 1e-3
-    percentile: float = 1.0
-    reflected_temperature: float | None = None
-    least_transmission: float = 0.1
+    patch: int = 15  # side of what is searched for the brightest pixel [pixel], odd
+    window: int = 31  # side of the guided filter's window [pixel], odd
+    regularisation: float = 1e-3  # the guided filter's epsilon
+    percentile: float = 1.0  # of the frame, that is the reflected signal without a temperature [%]
+    reflected_temperature: float | None = None  # reflected apparent temperature [K], if known
+    least_transmission: float = 0.1  # t0, below which the emissivity is not divided by [1]
 
     def __post_init__(self) -> None:
         """Refuse windows without a centre, and numbers outside their range."""

@@ -40,76 +40,48 @@ _CHOICES: Final = {
 class DbvtSettings:
     r"""Options of the paper's optimiser: losses, starts, homotopy, Newton's steps.
 
-    None is published. A weight of 0 leaves a loss out.
-
-    Attributes
-    ----------
-    smoothness, huber, reconstruction, noise, noise_mean : float
-        Weights :math:`\gamma_1` to :math:`\gamma_5` [1] of the losses in `dbvt_objective`: of the
-        curvature, of the Huber loss over its threshold, of the reconstruction error, of the noise
-        (with 0 it is held at zero), and of its mean.
-    curvature : float
-        Second derivative of a smooth signal that costs 1 [K/s^2].
-    huber_threshold, deviation_floor : float
-        Where the Huber loss turns linear, and the least deviation by which a signal is divided, in
-        units of each band's noise [1].
-    stages, stage_steps, first_share : int, int, float
-        Homotopy: stages, steps in each but the last, and the weight of the normalised error of the
-        reconstruction in the first over `reconstruction` [1]; the last counts it in units of the
-        noise. One stage has all of it from the start.
-    steps, tolerance, patience : int, float, int
-        Most steps in the last stage; it ends when `patience` steps in a row lower the objective by
-        less than this fraction [1].
-    largest_step, margin : float
-        Largest change of an emissivity in a step, and its least distance from 0 and 1 [1].
-    start : {"random", "subspace"}
-        Emissivities uniform in (0, 1), as published; or emissivities and object of the subspace
-        separator, and at random where it has none.
-    starts : int
-        Starts, of which the lowest objective is kept; 1 as published. All but the first are random.
-    smooth_from_zero : bool
-        A random start's smooth signal is zero, as published, and not the signal itself.
-    bend_updates : int
-        Number of times that the nonlinearity of an exact response is taken out; 0 for the paper's
-        linear identities.
-    temperatures_from : {"corrected", "measured"}
-        Signals without their estimated noise, or as measured.
-    batch : int
-        Pixels in a tile.
+    None is published. A weight of 0 leaves a loss out, of the noise it is then held at zero. One
+    stage of the homotopy has all of the reconstruction from the start. A start takes emissivities
+    uniform in (0, 1), as published, or emissivities and object of the subspace separator, and at
+    random where it has none; all but the first are random.
     """
 
+    # Weights gamma_1 to gamma_5 of the losses in `dbvt_objective` [1]: of the curvature, the Huber
+    # loss over its threshold, the reconstruction error, the noise, and its mean.
     smoothness: float = 1.0
     huber: float = 0.5
     reconstruction: float = 10.0
     noise: float = 1.0
     noise_mean: float = 1.0
-    curvature: float = 0.5
+    curvature: float = 0.5  # second derivative of a smooth signal that costs 1 [K/s^2]
+    # Where the Huber loss turns linear, and the least deviation by which a signal is divided, in
+    # units of each band's noise [1].
     huber_threshold: float = 1.0
     deviation_floor: float = 1.0
-    stages: int = 9
-    stage_steps: int = 9
+    stages: int = 9  # of the homotopy
+    stage_steps: int = 9  # in each stage but the last
+    # Weight of the reconstruction's normalised error in the first stage over `reconstruction` [1];
+    # the last counts it in units of the noise.
     first_share: float = 1e-6
-    steps: int = 80
-    tolerance: float = 1e-5
-    patience: int = 8
-    largest_step: float = 0.2
-    margin: float = 0.01
-    start: str = "random"
-    starts: int = 1
-    smooth_from_zero: bool = False
-    bend_updates: int = 1
-    temperatures_from: str = "corrected"
-    batch: int = 512
+    steps: int = 80  # most in the last stage, which ends when
+    patience: int = 8  # so many in a row lower the objective by less than
+    tolerance: float = 1e-5  # this fraction [1]
+    largest_step: float = 0.2  # change of an emissivity in a step [1]
+    margin: float = 0.01  # least distance of an emissivity from 0 and 1 [1]
+    start: str = "random"  # or "subspace"
+    starts: int = 1  # of which the lowest objective is kept; 1 as published
+    smooth_from_zero: bool = False  # a random start's smooth signal, as published
+    bend_updates: int = 1  # times the response's nonlinearity is taken out; 0 as published
+    temperatures_from: str = "corrected"  # for the estimated noise, or "measured"
+    batch: int = 512  # pixels in a tile
 
     def __post_init__(self) -> None:
         """Refuse unknown choices and numbers outside their range."""
         check_fields(self, "dbvt")
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"Unknown {name} '{getattr(self, name)}' of method 'dbvt'. "
-                    f"Must be one of {allowed}."
-                )
+                message = f"Unknown {name} '{getattr(self, name)}' of method 'dbvt'"
+                raise ValueError(f"{message}. Must be one of {allowed}.")
         weights = ("smoothness", "huber", "reconstruction", "noise", "noise_mean", "bend_updates")
         counts = ("stages", "stage_steps", "steps", "patience", "starts", "batch")
         for least, names in enumerate((weights, counts)):
@@ -127,22 +99,12 @@ def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         search = Search(tile, settings)
         loss, converged = search.run()
-        kept = _least(loss, tile.signals.shape[-1])
+        # Start of least objective, for each pixel.
+        pixels = tile.signals.shape[-1]
+        finite = np.where(np.isfinite(loss), loss, np.inf).reshape(-1, pixels)
+        kept = finite.argmin(axis=0) * pixels + np.arange(pixels)
         lost = ~np.isfinite(loss[kept])
         return _report(tile, search, kept, lost, lost | ~converged[kept])
-
-
-def _even(time: Array) -> float:
-    """Interval of an even clock [s]."""
-    steps = np.diff(time)
-    interval = float(np.median(steps))
-    worst = int(np.argmax(np.abs(steps - interval)))
-    if abs(steps[worst] - interval) > _UNEVEN * interval:
-        raise ValueError(
-            f"Invalid interval {steps[worst]:.3g} s of 'time' after {time[worst]:.6g} s for method "
-            f"'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
-        )
-    return interval
 
 
 def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
@@ -181,7 +143,16 @@ class Search:
         self.films = np.zeros((columns, 3, frames))
         self.films[:, 0] = smooth.T
         values = {name: float(getattr(settings, name)) for name in objective.Weights._fields}
-        values["curvature"] *= _even(tile.time) ** 2
+        steps = np.diff(tile.time)
+        interval = float(np.median(steps))
+        worst = int(np.argmax(np.abs(steps - interval)))
+        if abs(steps[worst] - interval) > _UNEVEN * interval:
+            raise ValueError(
+                f"Invalid interval {steps[worst]:.3g} s of 'time' after {tile.time[worst]:.6g} s "
+                f"for method 'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is "
+                "of even frames."
+            )
+        values["curvature"] *= interval**2
         self.weights = objective.Weights(**values)
 
     def run(self) -> tuple[Array, Mask]:
@@ -243,12 +214,6 @@ class Search:
             )
             departures.append(tile.blackbody(1, temperature) - signal)
         return np.where(in_range[:, np.newaxis], mixing.mixed(e2, *departures), 0.0)
-
-
-def _least(loss: Array, pixels: int) -> npt.NDArray[np.intp]:
-    """Column of the start of least objective, for each pixel."""
-    finite = np.where(np.isfinite(loss), loss, np.inf).reshape(-1, pixels)
-    return np.asarray(finite.argmin(axis=0) * pixels + np.arange(pixels))
 
 
 def _report(

@@ -31,8 +31,7 @@ from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Pixe
 _FIRST_DAMPING: Final = 1e-2
 _DAMPING: Final = (1e-8, 1e12)
 # Factors of the damping after a step that lowers the objective, and one that does not.
-_EASIER: Final = 0.2
-_HARDER: Final = 8.0
+_EASIER, _HARDER = 0.2, 8.0
 # A step that changes a logit by more is not taken: it would end where the logit's slope is nil.
 _LONGEST: Final = 3.0
 
@@ -41,23 +40,15 @@ _LONGEST: Final = 3.0
 class NaiveSettings:
     """Options of the naive baseline.
 
-    Attributes
-    ----------
-    starts : int
-        Random starts: emissivities uniform in (0, 1); object and background each at the image's
-        apparent temperature in the quieter band, shifted for all of time by a random amount.
-    shift_std : float
-        Standard deviation of that shift [K].
-    iterations : int
-        Most steps from each start.
-    tolerance : float
-        A start is done when its objective, a sample's mean squared residual in units of the noise's
-        variance, is below this, or a step lowers it by less than this fraction [1].
+    A random start has emissivities uniform in (0, 1), object and background each at the image's
+    apparent temperature in the quieter band, shifted for all of time by a random amount. It is done
+    when its objective, a sample's mean squared residual in units of the noise's variance, is below
+    the tolerance [1], or a step lowers it by less than this fraction.
     """
 
     starts: int = 5
-    shift_std: float = 2.0
-    iterations: int = 100
+    shift_std: float = 2.0  # standard deviation of the shift [K]
+    iterations: int = 100  # most steps from each start
     tolerance: float = 1e-6
 
     def __post_init__(self) -> None:

@@ -37,29 +37,23 @@ _KNOTS: Final = 256
 class RatioSettings:
     r"""Options of dual-wavelength pyrometry.
 
-    Attributes
-    ----------
-    kind : {"wide", "narrow"}
-        Radiance in the whole band, or spectral radiance at the band's centre; both by Planck's law.
-        Both are exact for a blackbody; for a gray body "wide" is, and "narrow" only as far as a
-        band is narrow. Wien's law, with which the method is usually written,
-        :math:`1/T = [\ln R - 5 \ln(\lambda_2/\lambda_1)] / [c_2 (1/\lambda_2 - 1/\lambda_1)]`,
-        is 3 K off at 9.5 and 11 um near room temperature.
-    order : int or None
-        Number of polynomials of time that both radiances are smoothed with, by least squares,
-        before their ratio is taken; None for no smoothing.
+    The radiance is that in the whole band ("wide"), or the spectral radiance at the band's centre;
+    both by Planck's law, and exact for a blackbody; for a gray body "wide" is, and "narrow" only as
+    far as a band is narrow. Wien's law, with which the method is usually written,
+    :math:`1/T = [\ln R - 5 \ln(\lambda_2/\lambda_1)] / [c_2 (1/\lambda_2 - 1/\lambda_1)]`, is 3 K
+    off at 9.5 and 11 um near room temperature.
     """
 
     kind: str = "wide"
+    # Polynomials of time that both radiances are smoothed with, by least squares; None for none.
     order: int | None = 5
 
     def __post_init__(self) -> None:
         """Refuse unknown kinds and orders without a function."""
         check_fields(self, "ratio")
         if self.kind not in KINDS:
-            raise ValueError(
-                f"Unknown kind '{self.kind}' of method 'ratio'. Must be one of {KINDS}."
-            )
+            rule = f"Must be one of {KINDS}"
+            raise ValueError(f"Unknown kind '{self.kind}' of method 'ratio'. {rule}.")
         require(self, "ratio", "order", self.order is None or self.order >= 1, "be at least 1")
 
 
@@ -71,7 +65,12 @@ def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     """
     first, second = tile.curves
     inverse = _inverse((first, second), settings.kind)
-    radiances = _radiances(tile, settings)
+    temperatures = (tile.temperature(band, signal) for band, signal in enumerate(tile.signals))
+    pairs = zip(tile.curves, temperatures, strict=True)
+    radiances = np.stack([_radiance(curve, settings.kind, part) for curve, part in pairs])
+    if settings.order is not None:
+        functions = smooth.polynomial_basis(tile.time, settings.order)
+        radiances = functions @ (functions.T @ radiances)
     with np.errstate(invalid="ignore", divide="ignore"):
         temperature = inverse(np.log(radiances[0] / radiances[1]))
     # e = L_1 / B_1(T)
@@ -87,17 +86,6 @@ def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     return Estimate.without_std(tile, temperature, status, np.stack([mean, mean])).check_range(
         first, not_estimated=WITHOUT_BACKGROUND
     )
-
-
-def _radiances(tile: Tile, settings: RatioSettings) -> Array:
-    """Radiance (2, time, pixel) of the bands, smoothed; NaN where the response has none."""
-    temperatures = (tile.temperature(band, signal) for band, signal in enumerate(tile.signals))
-    pairs = zip(tile.curves, temperatures, strict=True)
-    radiances = np.stack([_radiance(curve, settings.kind, part) for curve, part in pairs])
-    if settings.order is None:
-        return radiances
-    functions = smooth.polynomial_basis(tile.time, settings.order)
-    return np.asarray(functions @ (functions.T @ radiances))
 
 
 def _radiance(curve: Curve, kind: str, temperature: Array) -> Array:

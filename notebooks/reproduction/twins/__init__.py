@@ -6,17 +6,23 @@ project's own; known of the originals are their names and two thermocouple readi
 """
 
 from collections.abc import Callable
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
+from reproduction.twins.bodies import COFFEE_POT, WINEGLASS, bunny, filled
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
-from reproduction.twins.solids import bunny
-from reproduction.twins.stage import Capture, Stage, take, thermocouple_readings
-from reproduction.twins.vessels import coffee_pot, wineglass
-from reproduction.twins.views import observe, registered
+from reproduction.twins.stage import (
+    Capture,
+    Stage,
+    observe,
+    registered,
+    take,
+    thermocouple_readings,
+)
 
 __all__ = [
     "TWINS",
@@ -31,8 +37,8 @@ __all__ = [
 
 TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
     {
-        "wineglass": wineglass,
-        "coffee_pot": coffee_pot,
+        "wineglass": partial(filled, vessel=WINEGLASS),
+        "coffee_pot": partial(filled, vessel=COFFEE_POT),
         "glass_plate": glass_plate,
         "fingers": fingers,
         "fingerprint": fingerprint,

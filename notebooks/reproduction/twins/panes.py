@@ -7,11 +7,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from reproduction import heat
 from reproduction.twins import surfaces
-from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
-from reproduction.twins.props import Writing, board
-from reproduction.twins.rays import Array, Camera
+from reproduction.twins.people import FINGERS, Writing, board, hand, imprint, pacing, person
+from reproduction.twins.rays import Camera
 from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, since
 from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 
@@ -42,7 +42,7 @@ class Pane:
         self, start: float, mesh: trimesh.Trimesh, time: Array, *sources: heat.Exchange
     ) -> Array:
         """Temperature (time, vertex) [K] with both sides to the room and sources from a start."""
-        side = [heat.Convection(self.air, AMBIENT), heat.Radiation(self.emissivity, AMBIENT)]
+        side = (heat.Convection(self.air, AMBIENT), heat.Radiation(self.emissivity, AMBIENT))
         return since(start, mesh, (self.thickness, heat.GLASS), time, [*side, *side, *sources])
 
 
@@ -74,18 +74,14 @@ class Gun:
 
 _BEFORE: Final = 6.0
 """The gun starts to be brought near this many of its rise times before its start [1]."""
-BOARD_SIZE: Final = (0.34, 0.20)
-"""Width and height of the board [m]."""
-BOARD_DISTANCE: Final = 0.55
-"""How far the board is from the plate's middle [m]."""
-BOARD_SPACING: Final = 0.004
-"""Distance of the board's vertices [m]."""
+BOARD_SIZE: Final = (0.34, 0.20)  # width and height of the board [m]
+BOARD_DISTANCE: Final = 0.55  # how far the board is from the plate's middle [m]
+BOARD_SPACING: Final = 0.004  # distance of the board's vertices [m]
 SLANT: Final = Rotation.from_euler("yx", (0.9, -0.6))
 """Orientation of a hand that writes: slanted, so that its index is foremost, and tilted forward."""
 AWAY: Final = (0.0, -0.5)
 """Where the hand comes from and goes to, from the stroke: x and z on the board [m]."""
-WITHDRAWAL: Final = 1.0
-"""Time in which it comes, and goes [s]."""
+WITHDRAWAL: Final = 1.0  # time in which it comes, and goes [s]
 
 
 def glass_plate(
@@ -141,8 +137,7 @@ def pointing(writing: Writing, time: float) -> Pose:
     return Pose(SLANT, np.array([-x, -index.radius, z]) - tip)
 
 
-NEAR: Final = 0.15
-"""How far a hand is in front of the plate [m]."""
+NEAR: Final = 0.15  # how far a hand is in front of the plate [m]
 
 
 def fingers(capture: Capture, rng: np.random.Generator) -> Stage:

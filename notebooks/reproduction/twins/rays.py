@@ -15,14 +15,12 @@ import numpy.typing as npt
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from dbthermal._arrays import Array, Mask
 from dbthermal._compiled import kept
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Point = tuple[float, float, float]
 
-MISSED: Final = -1
-"""Face number of a ray that meets nothing."""
+MISSED: Final = -1  # face number of a ray that meets nothing
 
 _UP: Final = (0.0, 0.0, 1.0)
 # A reflected ray starts this far off the surface, in units of the mesh's size: well above the
@@ -47,17 +45,14 @@ class Camera:
     def __post_init__(self) -> None:
         """Check field of view, shape and direction."""
         if not 0 < self.field_of_view < 180:
-            raise ValueError(
-                f"Invalid field_of_view {self.field_of_view} degrees. Must lie in (0, 180)."
-            )
+            rule = "Must lie in (0, 180)"
+            raise ValueError(f"Invalid field_of_view {self.field_of_view} degrees. {rule}.")
         if min(self.shape) < 1:
             raise ValueError(f"Invalid shape {self.shape} of the camera. Must be positive.")
         right = np.cross(np.subtract(self.target, self.position), _UP)
         if not np.linalg.norm(right) > 0:
-            raise ValueError(
-                f"Invalid target {self.target} of the camera at {self.position}. "
-                "Must not be straight above or below."
-            )
+            message = f"Invalid target {self.target} of the camera at {self.position}"
+            raise ValueError(f"{message}. Must not be straight above or below.")
 
     @cached_property
     def axes(self) -> Array:

@@ -1,8 +1,8 @@
-"""Stage of a twin (object, camera, surroundings), the scene of it, and its thermocouples."""
+"""Stage of a twin, its scene and thermocouples, and what two cameras record of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -10,18 +10,17 @@ import trimesh
 import xarray as xr
 from scipy.special import ndtr
 
-from dbthermal import schema, simulation
+from dbthermal import alignment, schema, simulation
+from dbthermal._arrays import Array
 from reproduction import heat
+from reproduction.disturbances import by_cameras
 from reproduction.twins.people import pacing, person
-from reproduction.twins.rays import Array, Camera, Caster, unit
+from reproduction.twins.rays import Camera, Caster, unit
 from reproduction.twins.surroundings import Actor, incident, painted
 
-AMBIENT: Final = 295.15
-"""Temperature of the room, of its air, and of all that is not heated [K]."""
-TABLE: Final = 0.75
-"""Height of the table that the objects stand on [m]."""
-STEP: Final = 0.1
-"""Longest step of the heat transport [s]."""
+AMBIENT: Final = 295.15  # temperature of the room, of its air, and of all that is not heated [K]
+TABLE: Final = 0.75  # height of the table that the objects stand on [m]
+STEP: Final = 0.1  # longest step of the heat transport [s]
 
 _WHOLE: Final = 0.99  # share of a pixel's light from which it shows nothing but the object [1]
 _TAIL: Final = 4.0  # standard deviations of the blur beyond which a lens sends no light
@@ -60,9 +59,8 @@ class Capture:
             names = [str(name) for name in self.emissivity["band"].values]
             raise ValueError(f"Invalid bands {names} for a baseline. Must be two.")
         if not (self.blur > 0 and self.rays >= 1):
-            raise ValueError(
-                f"Invalid blur {self.blur} or rays {self.rays} of a pixel. Must be positive."
-            )
+            rule = "Must be positive"
+            raise ValueError(f"Invalid blur {self.blur} or rays {self.rays} of a pixel. {rule}.")
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,20 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
         ):
             scene[name] = (("axis", "y", "x"), part, {"units": "pixel"})
         scene = scene.assign_coords(axis=["y", "x"])
-    scene = _with_thermocouples(scene, stage, caster)
+    # Pixels of the thermocouples.
+    points = np.reshape(stage.thermocouples, (-1, 3)).astype(np.float64)
+    rows, columns = np.rint(stage.camera.project(points)).astype(np.int64).T
+    seen = caster.visible(points, stage.camera.position)
+    for row, column, visible in zip(rows, columns, seen, strict=True):
+        label = f"Invalid thermocouple at row {row}, column {column}"
+        if not (row in scene["y"] and column in scene["x"] and scene["on_object"][row, column]):
+            rule = f"Must be on the object, in an image of {stage.camera.shape}"
+            raise ValueError(f"{label}. {rule}.")
+        if not visible:
+            rule = "Must be seen by the camera"
+            raise ValueError(f"{label}, behind another part of the object. {rule}.")
+    for name, places in (("thermocouple_y", rows), ("thermocouple_x", columns)):
+        scene[name] = ("thermocouple", places, {"units": "1", "long_name": name})
     return scene.assign_attrs(twin=stage.name, baseline=capture.baseline)
 
 
@@ -219,27 +230,6 @@ def _reflecting(caster: Caster, camera: Camera, start: Array, bodies: Array) -> 
     return np.where(length < _CONVERGED, place, np.nan)
 
 
-def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.Dataset:
-    """The scene with the pixels of the thermocouples."""
-    points = np.reshape(stage.thermocouples, (-1, 3)).astype(np.float64)
-    rows, columns = np.rint(stage.camera.project(points)).astype(np.int64).T
-    seen = caster.visible(points, stage.camera.position)
-    for row, column, visible in zip(rows, columns, seen, strict=True):
-        if not (row in scene["y"] and column in scene["x"] and scene["on_object"][row, column]):
-            raise ValueError(
-                f"Invalid thermocouple at row {row}, column {column}. Must be on the object, in "
-                f"an image of {stage.camera.shape}."
-            )
-        if not visible:
-            raise ValueError(
-                f"Invalid thermocouple at row {row}, column {column}, behind another part of the "
-                "object. Must be seen by the camera."
-            )
-    for name, places in (("thermocouple_y", rows), ("thermocouple_x", columns)):
-        scene[name] = ("thermocouple", places, {"units": "1", "long_name": name})
-    return scene
-
-
 def thermocouple_readings(
     scene: xr.Dataset,
     rng: np.random.Generator,
@@ -256,10 +246,18 @@ def thermocouple_readings(
     """
     if bead < 1 or bead % 2 == 0:
         raise ValueError(f"Invalid bead {bead} pixels. Must be odd and positive.")
-    readings = [
-        _bead_mean(scene, int(row), int(column), bead // 2)
-        for row, column in zip(scene["thermocouple_y"], scene["thermocouple_x"], strict=True)
-    ]
+    readings, reach = [], bead // 2
+    for row, column in zip(
+        scene["thermocouple_y"].values, scene["thermocouple_x"].values, strict=True
+    ):
+        square = scene.isel(
+            y=slice(row - reach, row + reach + 1), x=slice(column - reach, column + reach + 1)
+        )
+        on = square["on_object"]
+        if min(row, column) < reach or on.size < (2 * reach + 1) ** 2 or not on.all():
+            label = f"Invalid thermocouple at row {row}, column {column}"
+            raise ValueError(f"{label}: its bead reaches beyond the object. Must lie on it.")
+        readings.append(square["object_temperature"].mean(("y", "x")).values)
     size = (len(readings), scene.sizes["time"])
     error = rng.normal(0.0, offset_std, (len(readings), 1)) + rng.normal(0.0, std, size)
     return xr.DataArray(
@@ -269,21 +267,6 @@ def thermocouple_readings(
         attrs=schema.STAGES["separated"]["object_temperature"].attrs,
         name="thermocouple_temperature",
     )
-
-
-def _bead_mean(scene: xr.Dataset, row: int, column: int, reach: int) -> Array:
-    """Mean object temperature (time,) [K] over a square of pixels."""
-    square = {
-        "y": slice(row - reach, row + reach + 1),
-        "x": slice(column - reach, column + reach + 1),
-    }
-    on = scene["on_object"].isel(square)
-    if min(row, column) < reach or on.size < (2 * reach + 1) ** 2 or not on.all():
-        raise ValueError(
-            f"Invalid thermocouple at row {row}, column {column}: its bead reaches beyond the "
-            "object. Must lie on it."
-        )
-    return np.asarray(scene["object_temperature"].isel(square).mean(("y", "x")).values)
 
 
 def table(height: float = 0.0) -> Actor:
@@ -321,3 +304,35 @@ def since(
     before = np.array([start]) if start < time[0] else np.empty(0)
     times = np.concatenate([before, time])
     return heat.simulate(shell, times, AMBIENT, exchanges, step=STEP)[before.size :]
+
+
+Registration = Literal["perfect", "found"]
+
+
+def observe(scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
+    """Capture of a twin, as `simulation.observe`: each band at the pixels of its own camera."""
+    if not scene.attrs["baseline"]:
+        return simulation.observe(scene, response, rng)
+    names = ("object_temperature", "background_temperature")
+    second = scene.assign({name: scene[f"second_{name}"] for name in names})
+    return by_cameras((scene, second), response, rng)
+
+
+def registered(
+    scene: xr.Dataset, corrected: xr.Dataset, registration: Registration = "perfect"
+) -> xr.Dataset:
+    """Capture with all views on the first camera's grid, by `alignment.align`.
+
+    A registration is "perfect", by the surface's geometry: each pixel shows the same point of the
+    surface in both bands, NaN where the second camera does not see it, and beside the object; or
+    "found" from the pictures, by `alignment.register`. The views of one place stay as they are.
+    """
+    if not scene.attrs["baseline"]:
+        return corrected
+    if registration == "found":
+        return alignment.align(corrected, offset=0.0, transform=alignment.register(corrected))
+    # Rows and columns (band, axis, y, x) [pixel] of the surface's points in each view.
+    second = scene["place_in_second"]
+    first = xr.zeros_like(second).copy(data=np.indices(scene["on_object"].shape))
+    places = xr.concat([first, second], scene["band"])
+    return alignment.align(corrected, offset=0.0, transform=places)

@@ -14,8 +14,9 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
-from reproduction.twins.rays import Array, unit
+from reproduction.twins.rays import unit
 
 Profile = tuple[tuple[float, float], ...]
 
@@ -25,7 +26,7 @@ WINEGLASS_PROFILE: Final[Profile] = (
     *((0.0420, 0.1450), (0.0400, 0.1700), (0.0355, 0.1950), (0.0330, 0.2100)),
 )
 """Radius and height of the outer wall of a wineglass, foot to rim, drawn for this project after
-glasses of some 0.4 l [m]."""
+glasses of some 0.4 l: 0.21 m high on a foot 74 mm wide, with a stem of 8 mm [m]."""
 
 COFFEE_POT_PROFILE: Final[Profile] = (
     *((0.0480, 0.0000), (0.0560, 0.0040), (0.0630, 0.0150), (0.0680, 0.0400), (0.0680, 0.0600)),
@@ -34,12 +35,9 @@ COFFEE_POT_PROFILE: Final[Profile] = (
 """Radius and height of the outer wall of a glass coffee pot, bottom to rim, drawn for this
 project after pots of some 1.2 l [m]."""
 
-_ROW: Final = np.sqrt(0.75)
-"""Distance of the rows of equilateral triangles, in their sides [1]."""
-_CORNER: Final = np.deg2rad(30.0)
-"""Angle of a profile's corners, which the mesh keeps [rad]."""
-_SAMPLES: Final = 400
-"""Points along a smooth profile before it is cut into rows."""
+_ROW: Final = np.sqrt(0.75)  # distance of the rows of equilateral triangles, in their sides [1]
+_CORNER: Final = np.deg2rad(30.0)  # angle of a profile's corners, which the mesh keeps [rad]
+_SAMPLES: Final = 400  # points along a smooth profile before it is cut into rows
 
 
 def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
@@ -156,16 +154,6 @@ def _band(first: int, lower: Array, upper: Array) -> npt.NDArray[np.int64]:
     standing = np.stack([first + j, first + (j + 1) % below, start + tip], axis=1)
     hanging = np.stack([start + k, first + foot, start + (k + 1) % above], axis=1)
     return np.concatenate([standing[: below * (below > 1)], hanging[: above * (above > 1)]])
-
-
-def wineglass(spacing: float = 0.003) -> trimesh.Trimesh:
-    """Outer wall of a wineglass, 0.21 m high on a foot 74 mm wide, with a stem of 8 mm."""
-    return vessel(WINEGLASS_PROFILE, spacing)
-
-
-def coffee_pot(spacing: float = 0.004) -> trimesh.Trimesh:
-    """Outer wall of a glass coffee pot, 0.165 m high and 0.136 m wide."""
-    return vessel(COFFEE_POT_PROFILE, spacing)
 
 
 def moved(

@@ -14,8 +14,9 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal._compiled import kept
-from reproduction.twins.rays import Array, Caster, Hits
+from reproduction.twins.rays import Caster, Hits
 
 Rays = tuple[Array, Array]
 
@@ -93,12 +94,8 @@ def _approaching(rays: Rays, sphere: tuple[Array, float], pose: Rays, box: Rays)
     Rays are origins and directions (ray, 3); of the sphere the middle and the radius; of the box
     its rotation and place in the world, and its lowest and highest corners in its own frame.
     """
-    (origins, directions), (middle, radius), (rotation, place), (low, high) = (
-        rays,
-        sphere,
-        pose,
-        box,
-    )
+    (origins, directions), (middle, radius) = rays, sphere
+    (rotation, place), (low, high) = pose, box
     numbers, inwards = np.empty(len(origins), np.int64), np.empty((2, len(origins), 3))
     count = 0
     for ray in range(len(origins)):

@@ -1,22 +1,165 @@
-"""Readers of videos drawn in a palette.
+"""Videos drawn in a palette, as positions in the palette.
 
 Such a video is what its authors show: 8 bit, compressed, each frame scaled between its own
-extremes. Its values are positions in a palette, not radiometric, and its attributes say so.
+extremes. Its values are not radiometric, and its attributes say so.
+
+FFmpeg reads many things that are no file: addresses, playlists, patterns of names, files in files.
+So the bytes are read here, and their container is decided here, from a short list. Nothing else is
+opened. Most codecs, H.264 among them, carry no checksum: damage to their compressed numbers often
+decodes without complaint. Only the checksum of the file excludes it.
 """
 
+import hashlib
+import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
+import av
 import numpy as np
 import xarray as xr
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from reproduction.palettes._decoding import MEMORY, Film, decode
+from dbthermal.planck import require_positive
+
+MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
+PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
+
+_CONTAINERS: Final = {
+    "mp4": (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free")),
+    "matroska": (0, (b"\x1a\x45\xdf\xa3",)),
+    "avi": (8, (b"AVI ",)),
+}
+"""FFmpeg's name of a container -> where its mark stands in the file [byte], and the marks."""
+
+
+Film = tuple[NDArray[np.uint32], Array]
+"""Frames of a video as packed colours (time, y, x), red highest, and their times (time,) [s]."""
+
+
+def _decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
+    """Decode a video left of `width` [pixel]; see `palette_video`."""
+    require_positive("memory", memory)
+    content = texts.regular_file(path, int(memory)).read_bytes()
+    kinds = _CONTAINERS.items()
+    form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)
+    found = hashlib.sha256(content).hexdigest()
+    if sha256 is not None and found != sha256:
+        raise ValueError(f"Wrong SHA-256 {found} of '{path.name}'. Must be {sha256}.")
+    if form is None:
+        raise ValueError(f"Invalid video '{path.name}'. Must be MP4, MOV, Matroska, WebM or AVI.")
+    # The largest frame that may be decoded, and checks where a codec has checksums.
+    options = {"max_pixels": str(int(memory / PIXEL)), "err_detect": "crccheck"}
+    try:
+        with av.open(
+            io.BytesIO(content),
+            format=form,
+            options=options,
+            metadata_errors="replace",
+            io_open=_refuse_to_open,
+        ) as container:
+            return _frames(container, options, width, memory, path)
+    except av.FFmpegError as error:
+        message = f"Damaged video '{path.name}': '{error}'. Must decode to its end."
+        raise ValueError(message) from error
+
+
+def _refuse_to_open(url: str, *_: Any) -> NoReturn:
+    raise PermissionError(f"Refused to open '{url}', which a video names. Must be one file.")
+
+
+def _frames(
+    container: Any, options: dict[str, str], width: int | None, memory: float, path: Path
+) -> Film:
+    """Decode all packets, once their number and the frames' size are known and allowed."""
+    if len(streams := container.streams.video) != 1 or streams[0].codec_context is None:
+        rule = "Must be a known one"
+        raise ValueError(f"Invalid {len(streams)} video streams in '{path.name}'. {rule}.")
+    stream = streams[0]
+    packets = [*container.demux(stream)]  # the last is empty: it asks for the frames still held
+    number = sum(packet.size > 0 for packet in packets)
+    height, columns = stream.codec_context.height, stream.codec_context.width
+    if number != (stream.frames or number):
+        _refuse_truncated(path, f"{number} frames present, {stream.frames} declared")
+    if (needed := number * height * columns * PIXEL) > memory:
+        raise ValueError(
+            f"Invalid size of '{path.name}': {number} frames of {height} x {columns} pixels "
+            f"take {needed:.3g} bytes. Must be at most memory={memory:.3g}."
+        )
+    if width is not None and not 0 < width <= columns:
+        rule = f"Must be from 1 to {columns} pixels"
+        raise ValueError(f"Invalid width {width} for '{path.name}'. {rule}.")
+    codes = np.empty((number, height, width or columns), dtype=np.uint32)
+    times: list[float | None] = []
+    stream.codec_context.options = options
+    stream.codec_context.thread_count = 1  # others lose marks of damage
+    for frame in _undamaged(packets, path):
+        if len(times) == number or (frame.height, frame.width) != (height, columns):
+            raise ValueError(
+                f"Damaged video '{path.name}': frame {len(times)} of {frame.height} x "
+                f"{frame.width} pixels. Must be {number} of {height} x {columns}."
+            )
+        rgb = frame.to_ndarray(format="rgb24")[:, :width]
+        codes[len(times)] = rgb @ np.array([2**16, 2**8, 1], dtype=np.uint32)
+        times.append(frame.time)
+    if not times or len(times) != number:
+        _refuse_truncated(path, f"{len(times)} frames decoded, {number} present")
+    seconds = np.array(times, dtype=np.float64)  # None becomes NaN
+    if not np.all(np.diff(seconds, prepend=seconds[0] - 1) > 0):
+        raise ValueError(f"Unordered timestamps in '{path.name}'. Must increase strictly.")
+    _check_duration(container, seconds, path)
+    _check_segment(path)
+    return codes, seconds - seconds[0]
+
+
+def _undamaged(packets: Sequence[Any], path: Path) -> Iterator[Any]:
+    """Yield the frames of packets; ValueError at the first that the decoder marks as damaged."""
+    count = 0
+    for packet in packets:
+        frames = packet.decode()
+        if packet.is_corrupt or any(frame.is_corrupt for frame in frames):
+            what = f"frame {count} or a later one is marked corrupt"
+            raise ValueError(f"Damaged video '{path.name}': {what}. Must decode without damage.")
+        yield from frames
+        count += len(frames)
+
+
+def _check_duration(container: Any, seconds: NDArray[Any], path: Path) -> None:
+    """Compare the length of the play with the declared one, to half a frame."""
+    stream = container.streams.video[0]
+    lengths = (stream.duration, stream.time_base), (container.duration, 1e-6)
+    declared = [float(length * unit) for length, unit in lengths if length is not None]
+    if not declared and not stream.frames:
+        raise ValueError(f"Unknown length of '{path.name}'. Must declare its frames or its time.")
+    rate = stream.guessed_rate or np.inf  # [Hz]; without it, any declared time is wrong
+    interval = np.median(np.diff(seconds)) if len(seconds) > 1 else 1 / rate
+    length = seconds[-1] - seconds[0] + interval
+    for value in declared:
+        if abs(value - length) > interval / 2:
+            _refuse_truncated(path, f"{length:g} s of frames, {value:g} s declared")
+
+
+def _check_segment(path: Path) -> None:
+    """Compare a Matroska file's size with its segment's, which a cut leaves too large."""
+    with path.open("rb") as stream:
+        head = stream.read(300)
+    if (place := head.find(b"\x18\x53\x80\x67", 0, 200) + 4) > 4:  # RFC 8794, section 4: sizes
+        width = 9 - head[place].bit_length()
+        size, unknown = int.from_bytes(head[place : place + width]), 1 << 7 * width
+        end = place + width + size - unknown
+        if size + 1 < 2 * unknown and end > path.stat().st_size:
+            _refuse_truncated(path, f"{path.stat().st_size} bytes, {end} declared")
+
+
+def _refuse_truncated(path: Path, lengths: str) -> NoReturn:
+    raise ValueError(f"Truncated video '{path.name}': {lengths}. Must be equal.")
+
 
 # Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
 # if it is nearer by a step of 8 bit.
@@ -100,7 +243,7 @@ def palette_video(
     """
     path = texts.as_path(path)
     colours = _palette(palette)
-    video = _distinct(decode(path, None, memory, sha256))
+    video = _distinct(*_decode(path, None, memory, sha256))
     position, _, distance = _nearest(video.colours, colours)
     residual = float(np.sqrt(np.average(distance**2, weights=video.share)))
     attrs = _attrs(path, palette, residual, video.colours, video.share)
@@ -115,60 +258,27 @@ def masked_palette_video(
     memory: float = MEMORY,
     sha256: str | None = None,
 ) -> xr.Dataset:
-    """Video whose object is drawn in a palette while the rest is gray.
+    """Video whose object is drawn in a palette while the rest is gray; see `palette_video`.
 
-    A pixel is valid where its colour is nearer to the palette than to gray, in the measure of
-    `palette_video`. Compression pulls single pixels between strong colours over that line, so the
-    object's outline is best taken from the share of frames in which a pixel is valid.
+    A pixel is valid where its colour is nearer to the palette than to gray, in the same measure.
+    Compression pulls single pixels between strong colours over that line, so the object's outline
+    is best taken from the share of frames in which a pixel is valid. Columns to keep are those left
+    of a printed colour bar [pixel].
 
-    Parameters
-    ----------
-    path : str or Path
-        File as for `palette_video`.
-    palette : str
-        Name of a continuous colour map of matplotlib.
-    width : int, optional
-        Columns to keep [pixel], left of a printed colour bar.
-    memory, sha256 : optional
-        As for `palette_video`.
-
-    Returns
-    -------
-    Dataset
-        `value` (time, y, x), float32 in [0, 1], a position also where it is not valid; `valid`
-        (time, y, x), bool. Attributes of `value` as in `palette_video`, but ``palette_residual`` is
-        the median over the coloured pixels.
-
-    Raises
-    ------
-    FileNotFoundError, TypeError, ValueError
-        As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
-
-    Examples
-    --------
-    The left half of the video is drawn in turbo, the right half is gray.
-
-    >>> import numpy as np
-    >>> from tempfile import TemporaryDirectory
-    >>> from matplotlib import colormaps
-    >>> from dbthermal import store
-    >>> frames = np.full((3, 48, 64, 3), 90, dtype=np.uint8)
-    >>> frames[:, :, :32] = colormaps["turbo"](np.linspace(0.2, 0.8, 32), bytes=True)[:, :3]
-    >>> with TemporaryDirectory() as folder:
-    ...     store.save_video(frames, f"{folder}/half.mp4", {}, rate=10.0)
-    ...     masked_palette_video(f"{folder}/half.mp4").valid[0, 24, [10, 50]].values.tolist()
-    [True, False]
+    The dataset has `value` (time, y, x), float32 in [0, 1], a position also where it is not valid,
+    whose ``palette_residual`` is the median over the coloured pixels, and `valid` (time, y, x),
+    bool. ValueError, too, if the video is narrower than `width`, or has no coloured pixel.
     """
     path = texts.as_path(path)
     colours = _palette(palette)
-    video = _distinct(decode(path, width, memory, sha256))
+    video = _distinct(*_decode(path, width, memory, sha256))
     position, from_palette, distance = _nearest(video.colours, colours)
     coloured = np.ptp(video.colours, axis=1) > _COLOURED
     if not coloured.any():
         raise ValueError(f"No coloured pixel in '{path.name}'. Must show an object in a palette.")
     share = video.share[coloured]
     residual = np.quantile(distance[coloured], 0.5, weights=share, method="inverted_cdf")
-    valid = from_palette < np.linalg.norm(_ycc(video.colours)[:, 1:], axis=1)
+    valid = from_palette < np.linalg.norm((video.colours @ _YCC.T)[:, 1:], axis=1)
     attrs = _attrs(path, palette, float(residual), video.colours[coloured], share)
     dims = tuple(video.coords)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
@@ -191,9 +301,8 @@ class _Video:
     coords: dict[str, Any]
 
 
-def _distinct(film: Film) -> _Video:
+def _distinct(codes: NDArray[np.uint32], times: Array) -> _Video:
     """Replace each code, in place, by its place among the distinct ones."""
-    codes = film.codes
     present = np.zeros(2**24, dtype=bool)
     for frame in codes:
         present[frame] = True
@@ -205,7 +314,7 @@ def _distinct(film: Film) -> _Video:
         frame[...] = place[frame]
         count += np.bincount(frame.ravel(), minlength=distinct.size)
     colours = (distinct[:, np.newaxis] >> np.array([16, 8, 0]) & 255).astype(np.float64)
-    coords = {"time": ("time", film.times, schema.COORDINATES["time"].attrs)} | {
+    coords = {"time": ("time", times, schema.COORDINATES["time"].attrs)} | {
         dim: (dim, np.arange(size), {"units": "1", "long_name": "pixel"})
         for dim, size in zip("yx", codes.shape[1:], strict=True)
     }
@@ -214,22 +323,15 @@ def _distinct(film: Film) -> _Video:
 
 def _palette(name: str) -> Array:
     """Colours (256, 3) [0-255] of a palette."""
-    from matplotlib import colormaps  # noqa: PLC0415  (drawing is not needed to read a spectrum)
-
     if name not in colormaps or colormaps[name].N != 256:
         raise ValueError(f"Unknown palette '{name}'. Must be a colour map of matplotlib with 256.")
     return np.asarray(colormaps[name](np.arange(256))[:, :3] * 255.0)
 
 
-def _ycc(colours: Array) -> Array:
-    ycc: Array = colours @ _YCC.T
-    return ycc
-
-
 def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
     place, distance = np.empty((2, len(colours)))
-    _project(_ycc(colours), _ycc(palette), place, distance)
+    _project(colours @ _YCC.T, palette @ _YCC.T, place, distance)
     first = np.minimum(place.astype(np.intp), len(palette) - 2)
     nearest = palette[first] + (place - first)[:, np.newaxis] * np.diff(palette, axis=0)[first]
     position = (place / (len(palette) - 1)).astype(np.float32)

@@ -1,29 +1,28 @@
-"""Figures of accuracy: errors and error bars case by case, and pixels to trust under stress."""
+"""Figures of errors: accuracy and error bars, pixels to trust, limits, disturbances, flags."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dbthermal.figures import REASONS
-from dbthermal.figures._status import first_reason
-from dbthermal.figures.drawing import COLORS, band_label, canvas, percent, provenance_note
+from dbthermal.figures._maps import first_reason
+from dbthermal.figures.drawing import (
+    COLORS,
+    band_label,
+    canvas,
+    marked_line,
+    percent,
+    plain_decades,
+    provenance_note,
+)
 
-_RIGHT: Final = "#a8d5b0"
-
-_WRONG: Final = "#e3000f"
-
-# What a 95 % interval should hold, and where the axis of the coverage begins [%].
-_SPAN: Final = (92.0, 98.0)
-
-_LOWEST: Final = 50.0
-
-_ARROW: Final = 48.5
-
+_RIGHT, _WRONG = "#a8d5b0", "#e3000f"
+# What a 95 % interval should hold, where the axis of the coverage begins, and its arrow lies [%].
+_SPAN, _LOWEST, _ARROW = (92.0, 98.0), 50.0, 48.5
 _DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
 
 
@@ -122,17 +121,13 @@ def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
         share = 100 * mask.mean(axis=1)
         if share.any() or color in {_RIGHT, _WRONG}:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
-        if color == _WRONG:
-            _count(axis, share)
+        for row in (
+            np.flatnonzero(share).tolist() if color == _WRONG else ()
+        ):  # some are too small to see
+            text = f"{percent(share[row] / 100)} wrong"
+            axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
         reached += share
     axis.set(xlim=(0, 100), xlabel="share of the pixels [%]")
-
-
-def _count(axis: Axes, share: npt.NDArray[np.float64]) -> None:
-    """Shares of wrong pixels [%] as numbers at the end of the bars; some are too small to see."""
-    for row in np.flatnonzero(share).tolist():
-        text = f"{percent(share[row] / 100)} wrong"
-        axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
 
 
 def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
@@ -154,3 +149,91 @@ def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
     axis.set_title(f"arrow: below {_LOWEST:.0f} %", loc="left", fontsize=8, color="0.4")
     axis.grid(visible=True, axis="y", color="0.93")
     axis.set_axisbelow(True)
+
+
+_RMSE: Final = "object_temperature_rmse"
+_RMSE_LABEL: Final = "RMSE of the object temperature [K]"
+
+
+def offsets(measured: xr.Dataset) -> Figure:
+    """Bands exposed apart: error of the estimated offset; error and flags of the object.
+
+    Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
+    `object_temperature_rmse` [K] and `flagged` [1].
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
+    left.axhline(0.0, color="black", linewidth=0.6)
+    left.plot(measured["delay"], measured["found"] - measured["delay"], "o", color=COLORS[0])
+    left.set(ylabel="error of the offset [frame]", ylim=(-0.1, 0.1))
+    _lines(middle, measured[_RMSE], "delay")
+    _lines(right, 100 * measured["flagged"], "delay")
+    _kelvin(middle)
+    right.set(ylabel="flagged [%]", ylim=(-3, 103))
+    _over((left, middle, right), "offset of the second band [frame]")
+    middle.legend(frameon=False, fontsize=8)
+    figure.suptitle("Bands exposed apart" + provenance_note(measured))
+    return figure
+
+
+def disturbances(measured: xr.Dataset) -> Figure:
+    """Error with each nuisance as recorded, corrected, and without: bars, and the share flagged.
+
+    Over `nuisance` and `treatment`: `object_temperature_rmse` [K] and `flagged` [1].
+    """
+    figure, ((axis,),) = canvas(1, 1, (8.0, 3.8))
+    names, treatments = measured["nuisance"].values, measured["treatment"].values
+    width = 0.8 / treatments.size
+    for index, treatment in enumerate(treatments):
+        here = measured.sel(treatment=treatment)
+        place = np.arange(names.size) + width * (index - (treatments.size - 1) / 2)
+        axis.bar(place, here[_RMSE], width, color=COLORS[index % len(COLORS)], label=treatment)
+        for at, value, share in zip(place, here[_RMSE].values, here["flagged"].values, strict=True):
+            text = f"{value:.2f} K\n{100 * share:.0f} % flagged"
+            axis.text(at, value, text, ha="center", va="bottom", fontsize=7)
+    axis.set_xticks(np.arange(names.size), names)
+    _kelvin(axis)
+    axis.margins(y=0.2)
+    axis.legend(frameon=False, fontsize=8)
+    axis.set_title("Lost frames and a closed shutter" + provenance_note(measured))
+    return figure
+
+
+def parallax(measured: xr.Dataset) -> Figure:
+    """Cost of the parallax of the reflection in two registered views: error, flags, coverage.
+
+    Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and `covered`
+    [1].
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
+    _lines(left, measured[_RMSE], "parallax")
+    _lines(middle, 100 * measured["flagged"], "parallax")
+    _lines(right, 100 * measured["covered"], "parallax")
+    _kelvin(left)
+    middle.set(ylabel="flagged [%]", ylim=(-3, 103))
+    right.axhspan(92, 98, color=COLORS[2], alpha=0.3, linewidth=0)
+    right.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
+    _over((left, middle, right), "parallax of the reflection [pixel]")
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("Two cameras side by side" + provenance_note(measured))
+    return figure
+
+
+def _lines(axis: Axes, values: xr.DataArray, over: str) -> None:
+    """A line a treatment, thinner than those before: where they coincide, all are seen."""
+    for index, treatment in enumerate(values["treatment"].values):
+        line, thin = values.sel(treatment=treatment), max(0, 2 - index)
+        style = marked_line(index) | {"linewidth": 1.2 + 1.6 * thin, "markersize": 4.0 + 2.5 * thin}
+        axis.plot(values[over], line, label=treatment, **style)
+
+
+def _over(axes: Iterable[Axes], label: str) -> None:
+    """Label and grid of axes over one quantity."""
+    for axis in axes:
+        axis.set(xlabel=label)
+        axis.grid(visible=True, color="0.9")
+
+
+def _kelvin(axis: Axes) -> None:
+    """A logarithmic axis of errors, with plain numbers."""
+    axis.set(yscale="log", ylabel=_RMSE_LABEL)
+    plain_decades(axis)

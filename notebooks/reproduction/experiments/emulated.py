@@ -1,15 +1,14 @@
-"""Frames of the emulated rig's cameras, from the simulation and with its truth.
+"""Emulated rig and bench: frames of the cameras, from the simulation and with its truth.
 
 The frames of `Views` are mixed, with noise, fixed pattern and 16 bits, one by one when a
-camera takes them, from the temperatures that the emulated world has at that moment. Everything
-here is simulated.
+camera takes them, from the temperatures that the emulated world has at that moment. The
+thermometers of `Bench` err, its samples are heated. Everything here is simulated.
 """
 
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +16,13 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.instruments.emulated import World
+from dbthermal.instruments.session import Session
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
 from reproduction.twins.rays import Camera
 
-Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]
 Picture = Callable[[float], Counts]
 Look = Callable[[float], Array]
@@ -31,7 +31,6 @@ Places = Mapping[str, tuple[slice, slice]]
 _TRUTH: Final = "truth_"
 
 
-@dataclass(frozen=True)
 class Views:
     """Views of the cameras of a simulated rig.
 
@@ -39,21 +38,13 @@ class Views:
     recording has its own: that of a calibration would else cancel against the scene's.
     """
 
-    rig: Rig
-    detector: xr.Dataset
-    seed: int
-    response: xr.Dataset = field(init=False)
-    _noise: np.random.SeedSequence = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Compute the rig's response, once."""
-        object.__setattr__(self, "response", self.rig.response())
-        object.__setattr__(self, "_noise", np.random.SeedSequence(self.seed))
+    def __init__(self, rig: Rig, detector: xr.Dataset, seed: int) -> None:
+        self.rig, self.detector, self.response = rig, detector, rig.response()
+        self._noise = np.random.SeedSequence(seed)
 
     def blackbody(self, world: World) -> dict[str, Picture]:
         """Frames, by band, of the world's blackbody, which fills the view."""
-        curves = self._curves().items()
-        return self._pictures({name: _bench(world, it, {}, {}, self._shape) for name, it in curves})
+        return self.samples(world, xr.DataArray(), {})
 
     def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
         """
@@ -62,10 +53,10 @@ class Views:
         The world has a temperature for each material; emissivity is (material, band) [1]; `places`
         are the rows and columns of each material, elsewhere is the blackbody itself.
         """
-        looks = {}
+        looks, shape = {}, (self.detector.sizes["y"], self.detector.sizes["x"])
         for band, curve in self._curves().items():
             values = {name: float(emissivity.sel(material=name, band=band)) for name in places}
-            looks[band] = _bench(world, curve, values, places, self._shape)
+            looks[band] = _bench(world, curve, values, places, shape)
         return self._pictures(looks)
 
     def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
@@ -73,10 +64,6 @@ class Views:
         curves = self._curves()
         names = [str(name) for name in scene["band"].values]
         return self._pictures({name: _shown(scene, curves[name], name) for name in names})
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.detector.sizes["y"], self.detector.sizes["x"]
 
     def _curves(self) -> dict[str, Curve]:
         return {band: responses.curve(self.response, band) for band in self.rig.bands}
@@ -148,9 +135,8 @@ def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
         place = time * rate
         number = int(place)
         if not 0 <= place <= len(movie) - 1:
-            raise ValueError(
-                f"Invalid time {time} s of a scene. Must lie in [0, {(len(movie) - 1) / rate}] s."
-            )
+            rule = f"Must lie in [0, {(len(movie) - 1) / rate}] s"
+            raise ValueError(f"Invalid time {time} s of a scene. {rule}.")
         after = movie[min(number + 1, len(movie) - 1)]
         return np.asarray(movie[number] + (place - number) * (after - movie[number]))
 
@@ -195,12 +181,66 @@ def clear(folder: Path) -> None:
     simulated.
     """
     for path in sorted(folder.glob("*")):
-        if path.suffix != ".zarr" or not _simulated(path):
+        attrs = store.open_dataset(path).attrs if path.suffix == ".zarr" else {"is_simulated": 0}
+        if not attrs.get("is_simulated", path.name.startswith(_TRUTH)):
             raise FileExistsError(f"Invalid folder '{folder}' with '{path.name}', not emulated.")
     if folder.exists():
         shutil.rmtree(folder)
 
 
-def _simulated(path: Path) -> bool:
-    attrs = store.open_dataset(path).attrs
-    return bool(attrs.get("is_simulated", path.name.startswith(_TRUTH)))
+class Bench(World):
+    """An emulated bench whose thermometers have errors, and whose samples are heated.
+
+    By name: standard deviations of one reading [K], 0 for others; lowest and highest temperature to
+    which a sample is heated [K]; temperature (time) [K], over the scene's time [s], of other
+    objects that a thermocouple touches. The rest as for `World`.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        reading_std: Mapping[str, float],
+        samples: Mapping[str, tuple[float, float]] | None = None,
+        touched: Mapping[str, xr.DataArray] | None = None,
+        **world: Any,
+    ) -> None:
+        super().__init__(scene=self._warmth, **world)
+        self._rng, self._std, self._samples = rng, dict(reading_std), dict(samples or {})
+        self._touched = dict(touched or {})
+        self._temperatures = {name: low for name, (low, _) in self._samples.items()}
+
+    @classmethod
+    def of(
+        cls, session: Session, rng: np.random.Generator, errors: Mapping[str, float], **objects: Any
+    ) -> Self:
+        """
+        Bench of an emulated session with its cameras, filters and thermocouples; waits for `begin`.
+
+        The errors are standard deviations of one reading of the ``blackbody`` and of any other
+        ``thermocouple`` [K]; objects are the samples and what is touched, as for `Bench`.
+        """
+        std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
+        std["blackbody"] = errors["blackbody"]
+        bench = cls(rng, std, filters=session.filters, waits=True, **objects)
+        bench.furnish(session)
+        return bench
+
+    def step(self, temperature: float) -> None:
+        """Set the blackbody [K], and heat every sample to a temperature of its own."""
+        self.blackbody_temperature = temperature
+        self._temperatures = {
+            name: float(self._rng.uniform(*ends)) for name, ends in self._samples.items()
+        }
+
+    def thermocouple_temperature(self, channel: int) -> float:
+        """Temperature of one thermocouple's tip with the error of one reading [K]; NaN if open."""
+        std = self._std.get(self.thermocouples.get(channel, "open"), 0.0)
+        with self.lock:
+            return super().thermocouple_temperature(channel) + std * float(self._rng.normal())
+
+    def _warmth(self, time: float) -> Mapping[str, float]:
+        touched = {
+            name: float(np.interp(time, course["time"], course))
+            for name, course in self._touched.items()
+        }
+        return {**self._temperatures, **touched}

@@ -1,33 +1,33 @@
-"""Pictures that are scaled anew in each frame, as the published videos are.
+"""Published videos without a calibration: scale of each frame, reflections, their displacement.
 
-Their scale is undone, and reflections are separated without a calibration.
+A picture is scaled anew in each frame; the scale is undone. The videos have no radiometry, and
+their noise is the codec's: neither white nor known. So one displacement is found for a whole scene,
+from the bands' correlation alone, where `alignment.reflection_shift` needs the noise of each band.
 """
 
+import contextlib
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.fft import next_fast_len
+from scipy.ndimage import shift
 
 from dbthermal import _smooth as smooth
-from dbthermal import schema
+from dbthermal import alignment, schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
-CORRELATED: Final = 0.5
-"""Correlation of the bands from which a pixel enters the pooled ratio [1]."""
+CORRELATED: Final = 0.5  # correlation of the bands from which a pixel enters the pooled ratio [1]
 
 _FEWEST_STILL: Final = 200  # still pixels
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
-_UNCORRELATED: Final = 0.1
-_FEWEST: Final = 100
+_UNCORRELATED, _FEWEST = 0.1, 100
 _ORDER: Final = 9  # smooth functions of time
 # Share of the variance of still surroundings over time that their scale must explain.
 _EXPLAINED: Final = 0.9
-_ROUNDS: Final = 20
-_TINY: Final = np.finfo(np.float64).tiny
+_ROUNDS, _TINY = 20, np.finfo(np.float64).tiny
 
 
 def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
@@ -38,24 +38,12 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     each pixel's residual over time. A band where they explain less than 90 % of the weighted
     variance over time stays as it is.
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own.
-    still : DataArray of bool
-        Pixels (y, x) off the object; a third of them may change after all.
-
-    Returns
-    -------
-    DataArray
-        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
-        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
-        that are, and `scale_explained`, each band's explained share.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+    The signal (band, time, y, x) has two bands in units of their own; the still pixels (y, x) are
+    off the object, and a third of them may change after all. The result is in units of its mean
+    over time, with the coordinate `gain` (band, time) [1], by which the noise was divided, 1 in a
+    band that is not undone. Attributes `scale_undone`, the bands that are, and `scale_explained`,
+    each band's explained share. ValueError if dims or bands are wrong, a value is not finite, or
+    fewer than 200 pixels are still.
 
     References
     ----------
@@ -78,9 +66,8 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     aligned = laid_on(still, signal, "the still pixels", "the signal")
     chosen = aligned.values.astype(bool).ravel()
     if chosen.sum() < _FEWEST_STILL:
-        raise ValueError(
-            f"Invalid still pixels: {chosen.sum()} of them. Must be at least {_FEWEST_STILL}."
-        )
+        rule = f"Must be at least {_FEWEST_STILL}"
+        raise ValueError(f"Invalid still pixels: {chosen.sum()} of them. {rule}.")
     result = signal.astype(np.promote_types(signal.dtype, np.float32))
     gains, shares, bands = np.ones(signal.shape[:2]), [], []
     for place, picture in enumerate(signal.values):
@@ -108,24 +95,14 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own, `time` [s]; the coordinate `gain`
-        (band, time) [1], if it has one, is what the noise of each frame was divided by.
+    The signal (band, time, y, x) has two bands in units of their own and `time` [s]; its coordinate
+    `gain` (band, time) [1], if it has one, is what the noise of each frame was divided by.
 
-    Returns
-    -------
-    Dataset
-        `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission` (time, y, x),
-        the first band less the reflection, in the first band's unit; attributes `pooled_ratio`,
-        `noise_ratio`, `correlated_pixels`, `order`, and those of the signal.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 100 pixels are uncorrelated
-        (correlation below 0.1) or correlated (above 0.5).
+    The result has `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission`
+    (time, y, x), the first band less the reflection, in the first band's unit; attributes
+    `pooled_ratio`, `noise_ratio`, `correlated_pixels`, `order`, and those of the signal. ValueError
+    if dims or bands are wrong, a value is not finite, or fewer than 100 pixels are uncorrelated
+    (correlation below 0.1) or correlated (above 0.5).
 
     References
     ----------
@@ -150,9 +127,7 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
-    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
-    rapid = weight * values
-    rapid -= [functions @ (functions.T @ part) for part in rapid]
+    rapid = _rapid(signal, weight, values)
     # Subtract each frame's offset and gain error, as the uncorrelated pixels show it.
     quiet = np.abs(_correlation(rapid)) < _UNCORRELATED
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
@@ -220,13 +195,9 @@ def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:
 
 def _check_signal(signal: xr.DataArray) -> None:
     if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
-        raise ValueError(
-            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
-        )
-    if not np.all(schema.measured(signal.values)):
-        raise ValueError(
-            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-        )
+        rule = "Must be (band, time, y, x) of two bands"
+        raise ValueError(f"Invalid signal {dict(signal.sizes)}. {rule}.")
+    schema.require_measured(signal.values, "signal")
 
 
 def _frame_weight(signal: xr.DataArray) -> Array:
@@ -242,9 +213,8 @@ def _frame_weight(signal: xr.DataArray) -> Array:
 
 def _require(pixels: Mask, rule: str) -> None:
     if pixels.sum() < _FEWEST:
-        raise ValueError(
-            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
-        )
+        message = f"Invalid signal: {pixels.sum()} pixels have a {rule}"
+        raise ValueError(f"{message}. Must be at least {_FEWEST}.")
 
 
 def _correlation(rapid: Array) -> Array:
@@ -252,3 +222,102 @@ def _correlation(rapid: Array) -> Array:
     cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
     size = np.sqrt(np.prod(np.einsum("btp,btp->bp", rapid, rapid), axis=0))
     return np.asarray(np.divide(cross, size, out=np.zeros_like(cross), where=size > 0))
+
+
+Movie = npt.NDArray[np.float32]
+
+REACH: Final = (6, 48)  # largest displacement that is searched for, rows and columns [pixel]
+
+_SHARED: Final = 0.4  # share of the object's pixels that still show it when they are displaced
+_PARTS: Final = 5  # of a capture, in which the still edges are registered
+
+
+def edges_shift(movie: xr.DataArray) -> xr.DataArray:
+    """Displacement (axis) [pixel] of the still edges: the second band shows at p the first's p + d.
+
+    Median of those of five parts of the capture, from `alignment.register` of their mean pictures.
+    Parts without edges, as before anything is warm, are left out; NaN if all are.
+    """
+    parts: list[Array] = []
+    for frames in np.array_split(np.arange(movie.sizes["time"]), _PARTS):
+        # Register the part as if its values were counts.
+        counts = movie.isel(time=frames).drop_vars("gain", errors="ignore").rename("counts")
+        capture = counts.astype("float32").assign_attrs(units="count").to_dataset()
+        with contextlib.suppress(ValueError):
+            found = alignment.register(capture, model="translation").isel(band=1)
+            parts.append(-found.values[[1, 0], 2])
+    return _displacement(np.median(parts or [np.full(2, np.nan)], axis=0))
+
+
+def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArray:
+    """Displacement (axis) [pixel] of the reflections: the second band shows at p the first's p + d.
+
+    That of the largest correlation of the bands' rapid changes over the object, between whole
+    pixels by a parabola. Attributes: `correlation` there, and `correlation_at_0`. NaN if it lies at
+    the end of the search, `REACH`.
+    """
+    # Correlate the rapid changes at every whole displacement.
+    values = movie.values[..., outline.values].astype(np.float64)
+    rapid = np.zeros(movie.shape, dtype=np.float32)
+    rapid[..., outline.values] = _rapid(movie, _frame_weight(movie), values)
+    scores = _correlations(rapid[0], rapid[1], outline.values)
+    place = np.array(np.unravel_index(np.argmax(scores), scores.shape))
+    largest = {"correlation": scores.max(), "correlation_at_0": scores[REACH]}
+    attrs = {name: float(value) for name, value in largest.items()}
+    # Between whole pixels by a parabola, unless the largest lies at the end of the search.
+    if np.any(place == 0) or np.any(place == np.array(scores.shape) - 1):
+        return _displacement(np.full(2, np.nan)).assign_attrs(attrs)
+    peak = (place - REACH).astype(np.float64)
+    for axis, step in enumerate(np.eye(2, dtype=int)):
+        below, here, above = (scores[tuple(place + k * step)] for k in (-1, 0, 1))
+        peak[axis] += 0.5 * (below - above) / (below - 2 * here + above)
+    return _displacement(peak).assign_attrs(attrs)
+
+
+def _displacement(value: Array) -> xr.DataArray:
+    return xr.DataArray(value, {"axis": ["y", "x"]}, "axis", attrs={"units": "pixel"})
+
+
+def _rapid(signal: xr.DataArray, weight: Array, values: Array) -> Array:
+    """Weighted changes (band, time, pixel) of a signal's values that smooth functions leave."""
+    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
+    rapid = weight * values
+    return np.asarray(rapid - [functions @ (functions.T @ part) for part in rapid])
+
+
+def _correlations(first: Movie, second: Movie, inside: Mask) -> Array:
+    """Correlation of second(p) with first(p + d) over the object, by d within `REACH`."""
+    size = [next_fast_len(n + r, real=True) for n, r in zip(inside.shape, REACH, strict=True)]
+
+    def lagged(there: npt.NDArray[np.floating], here: npt.NDArray[np.floating]) -> Array:
+        """Sum over p of there(p + d) here(p)."""
+        both = np.conj(np.fft.rfft2(here, size)) * np.fft.rfft2(there, size)
+        rows, columns = (np.arange(-reach, reach + 1) for reach in REACH)
+        return np.asarray(np.fft.irfft2(both, size)[np.ix_(rows, columns)])
+
+    cross = sum(lagged(a, b) for a, b in zip(first, second, strict=True))
+    mask = inside.astype(np.float64)
+    shared = lagged(mask, mask)
+    energy = lagged(np.sum(first**2, axis=0), mask) * lagged(mask, np.sum(second**2, axis=0))
+    found = (shared >= _SHARED * mask.sum()) & (energy > 0)
+    return np.where(found, cross / np.sqrt(np.where(found, energy, 1.0)), -1.0)
+
+
+def moved(movie: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
+    """Movie with the first band taken at p + d, so that both show a reflection at one pixel.
+
+    Raises a ValueError if the displacement is not known.
+    """
+    if not np.all(np.isfinite(displacement)):
+        raise ValueError("Unknown displacement of the reflections. Must be within the search.")
+    result, back = movie.copy(), -displacement.values
+    for frame in result.values[0]:
+        frame[...] = shift(frame, back, order=3, mode="nearest")
+    return result
+
+
+def shared_outline(outline: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
+    """Pixels (y, x) that show the object in both bands, the first displaced if that is known."""
+    back = -np.nan_to_num(displacement.values)
+    there = shift(outline.values.astype(float), back, order=1)
+    return outline.copy(data=outline.values & (there > 0.99))
