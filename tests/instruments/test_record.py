@@ -148,6 +148,22 @@ def test_last_source_lost_ends_it(tmp_path: Path) -> None:
         open_capture(tmp_path / "b.zarr")
 
 
+def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
+    """Readings are noted with their time; a failure is NaN, and the recording goes on."""
+    answers = iter([300.0, 301.0])
+
+    def read() -> float:
+        if (value := next(answers, None)) is None:
+            raise TimeoutError("No answer.")
+        return value
+
+    readings = {"plate": Reading(read)}
+    record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=SMALL)
+    entries = [note[1:] for note in notes(tmp_path / "a.zarr")]
+    assert entries[:2] == [("reading", "plate", 300.0), ("reading", "plate", 301.0)]
+    assert {kind for kind, _, _ in entries[2:]} == {"reading_failed"}
+
+
 def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
     """An error in a reading or a preview is raised after the frames are stored."""
     sources = bench()
