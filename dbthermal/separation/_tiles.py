@@ -5,7 +5,7 @@ fits in the processor's cache. A tile's bands are in the order of their noise, t
 the regression for the emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any, Final, Self
@@ -29,6 +29,7 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
+Loader = Callable[[], tuple[xr.Dataset, list[Grain]]]
 
 KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 """Attributes of a capture that its result has, too."""
@@ -76,14 +77,6 @@ class Pixels:
                 value.replace_pixels(selected, values)
             elif value is not None:
                 value[..., selected] = values
-
-    def join(self, records: Sequence[Self]) -> Self:
-        """Return the record with the pixels of others after its own."""
-        joined: dict[str, Any] = {}
-        for field in fields(self):
-            values = [getattr(record, field.name) for record in (self, *records)]
-            joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
-        return replace(self, **joined)
 
 
 @dataclass(frozen=True)
@@ -354,36 +347,17 @@ def cut(
     Of all pixels, or of those of the image that are `wanted` (pixel).
     """
     displacement, method = inputs.displacement, inputs.method
-    source = rows if displacement is None else displacement.source(rows)
-    block = inputs.capture.isel(y=source)
-    width = block.sizes["x"]
-    most = largest(method, inputs.settings, block)
-    size = most if displacement is None else max(width, _TOGETHER // block.sizes["time"])
-    size = block.sizes["y"] * width if method.whole_image else size
-    time = block["time"].values.astype(np.float64)
-    segment = block["segment"].values.astype(np.intp) if "segment" in block else None
-    slopes = np.array([curve.reference_slope for curve in inputs.curves])
-
-    @cache  # and never read where all that is wanted of it is kept
-    def load() -> tuple[xr.Dataset, list[Grain]]:
-        loaded = block.load()
-        return loaded, quality.grains(loaded, inputs.noise * slopes)
-
+    load, source = _loader(inputs, rows)
+    width, time = inputs.capture.sizes["x"], inputs.capture["time"].values.astype(np.float64)
+    most = largest(method, inputs.settings, inputs.capture)
+    size = most if displacement is None else max(width, _TOGETHER // time.size)
+    size = (source.stop - source.start) * width if method.whole_image else size
+    segment = None
+    if "segment" in inputs.capture:
+        segment = inputs.capture["segment"].values.astype(np.intp)
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
-        gain = np.ones((2, places.size))
-        if displacement is None:
-            loaded, grains = load()
-            local = slice(window[0].start - rows.start, window[0].stop - rows.start)
-            view = loaded.isel(y=local, x=window[1])
-            if not isinstance(selected, slice):
-                view = _picked(view, selected)
-            counts, valid, status = quality.read(view, method.minimum_frames, grains)
-            counts, usable = quality.bridge(counts, valid, time)
-        else:
-            counts, usable, valid, status, gain = displaced.paired(
-                load, displacement, window[0], source, selected, method.minimum_frames
-            )
+        counts, usable, valid, status, gain = _sampled(inputs, load, source, window, selected)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
@@ -416,31 +390,44 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     In the frames that most pixels have; and these (time), the pixels that have them all, and the
     noise (band, pixel) over that of a sample.
     """
-    counts, usable, status, gain = _counts(inputs, rows)
+    window = rows, slice(0, inputs.capture.sizes["x"])
+    load, source = _loader(inputs, rows)
+    counts, usable, _, status, gain = _sampled(inputs, load, source, window, slice(None))
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
-    window, time = (rows, slice(0, inputs.capture.sizes["x"])), inputs.capture["time"].values
+    time = inputs.capture["time"].values
     signals = _tile(inputs, counts, time, window, None, slice(None)).signals
     signals = signals if frames.all() else signals[:, frames]  # no copy: a row may be large
     return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
 
-def _counts(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Bits, Array]:
-    """Counts (band, time, pixel) of some rows, those valid or bridged, the status, the gain."""
-    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
-    source = rows if displacement is None else displacement.source(rows)
-    block = inputs.capture.isel(y=source).load()
+def _loader(inputs: Inputs, rows: slice) -> tuple[Loader, slice]:
+    """Loader of the rows that show some rows, with the grains of their bands; and those rows."""
+    source = rows if inputs.displacement is None else inputs.displacement.source(rows)
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
-    grains = quality.grains(block, inputs.noise * slopes)
-    if displacement is None:
-        counts, valid, status = quality.read(block, fewest, grains)
-        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-        gain = np.ones((2, status.size))
-    else:
-        counts, usable, _, status, gain = displaced.paired(
-            lambda: (block, grains), displacement, rows, source, slice(None), fewest
-        )
-    return counts, usable, status, gain
+
+    @cache  # and never read where all that is wanted of it is kept
+    def load() -> tuple[xr.Dataset, list[Grain]]:
+        block = inputs.capture.isel(y=source).load()
+        return block, quality.grains(block, inputs.noise * slopes)
+
+    return load, source
+
+
+def _sampled(
+    inputs: Inputs, load: Loader, source: slice, window: Window, selected: slice | Whole
+) -> displaced.Paired:
+    """Samples of some pixels of a window of the source, as `displaced.paired`."""
+    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
+    if displacement is not None:
+        return displaced.paired(load, displacement, window[0], source, selected, fewest)
+    block, grains = load()
+    rows = slice(window[0].start - source.start, window[0].stop - source.start)
+    view = block.isel(y=rows, x=window[1])
+    view = view if isinstance(selected, slice) else _picked(view, selected)
+    counts, valid, status = quality.read(view, fewest, grains)
+    counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
+    return counts, usable, valid, status, np.ones((2, status.size))
 
 
 def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:

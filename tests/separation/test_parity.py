@@ -47,7 +47,9 @@ def divided_on_tensors(
         on_tensors(tile.select_pixels(places), pieces, settings)
         for places, pieces in zip(groups, every, strict=True)
     ]
-    return per_pixel[0].join(per_pixel[1:]).select_pixels(np.argsort(np.concatenate(groups)))
+    order = np.argsort(np.concatenate(groups))
+    fields = zip(*(vars(solution).values() for solution in per_pixel), strict=True)
+    return Solution(*(np.concatenate(arrays, axis=-1)[..., order] for arrays in fields))
 
 
 @pytest.mark.parametrize("case", CASES)

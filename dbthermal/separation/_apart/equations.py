@@ -222,14 +222,12 @@ def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats
     return np.asarray(1.0 - ratio * (1.0 - first)), sharp & np.isfinite(material.ratio[-1])
 
 
-def measured(film: Floats) -> tuple[Mask, Mask]:
-    """Pixels of a film (frame, pixel) with a number in some frame, and in every one."""
-    sometimes, always = np.zeros(film.shape[1], dtype=bool), np.ones(film.shape[1], dtype=bool)
+def measured(film: Floats) -> Mask:
+    """Pixels of a film (frame, pixel) with a number in some frame."""
+    result = np.zeros(film.shape[1], dtype=bool)
     for frames in parts(film):
-        finite = np.isfinite(film[frames])
-        sometimes |= finite.any(axis=0)
-        always &= finite.all(axis=0)
-    return sometimes, always
+        result |= np.isfinite(film[frames]).any(axis=0)
+    return result
 
 
 def bridge(film: Floats, solved: Mask) -> Floats:

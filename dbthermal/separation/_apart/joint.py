@@ -267,7 +267,7 @@ def _solvable(
 ) -> tuple[Floats, Mask]:
     """Emissivities (band, pixel) [1] of the equations, and the pixels that have one."""
     film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-    raw, solved = system.first_emissivity(inputs, result), system.measured(film)[0]
+    raw, solved = system.first_emissivity(inputs, result), system.measured(film)
     if maps is not None and material is not None:
         raw, sharp = system.of_material(inputs, raw, material)
         solved |= sharp & maps.usable.ravel()
