@@ -114,6 +114,7 @@ reproduce: export MALLOC_MMAP_MAX_ := 0
 reproduce: export MALLOC_TRIM_THRESHOLD_ := 17179869184
 reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full
 	@$(python) -m reproduction.integrity full rig
+	@$(python) -m reproduction.methods
 	$(parallel) full
 
 full: $(foreach one,$(early),$(filter results/$(one).ipynb,$(full) $(rig))) $(full) $(rig)
