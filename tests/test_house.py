@@ -21,12 +21,12 @@ BUDGET = {
     "instruments": (5696, 20),
     "limits": (750, 4),
     "readers": (2745, 12),
-    "reporting": (430, 3),
-    "separation": (12954, 54),
+    "reporting": (439, 3),
+    "separation": (12957, 54),
     "simulation": (630, 3),
     "store": (1484, 6),
 }
-INSTALLED = 37_601  # lines of all rooms
+INSTALLED = 37_613  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

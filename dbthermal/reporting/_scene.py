@@ -111,15 +111,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
     result = view.data
     shot = result if view.capture is None else view.capture
-    for name, region in regions.items():
-        if not isinstance(region, Region):
-            raise TypeError(
-                f"Invalid region {name!r}, {region!r}. Must be an explorer.Region, such as "
-                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
-            )
-    chosen = dict(regions) or {
-        "measured pixels of the whole image": Region("rectangle", ((0, 0), view.shape))
-    }
+    chosen = _chosen(view, regions)
     # Curves of every region in every pane.
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
@@ -146,9 +138,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         doubts += against_response(view.capture, view.response)
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     emissivities = _emissivities(numbers, named=bool(regions))
-    picture = b"" if logo is None else texts.regular_file(logo, _LOGO).read_bytes()
-    if logo is not None and not picture.startswith(PNG):
-        raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
     # The page, which asks for nothing else.
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
@@ -160,7 +149,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
             sentence.replace("+-", "\N{PLUS-MINUS SIGN}").replace("degC", "\N{DEGREE SIGN}C")
             for sentence in sentences
         ],
-        logo=base64_text(picture),
+        logo="" if logo is None else base64_text(_picture(logo)),
         numbers=numbers,
         scene=sentence,
         film=video(view, title, codec, celsius=celsius),
@@ -187,6 +176,26 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     if Path(path).suffix != ".html":
         raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
     store.save_text(text, path, made_by)
+
+
+def _chosen(view: View, regions: Mapping[str, Region]) -> dict[str, Region]:
+    """Regions that are stated, or the whole image."""
+    for name, region in regions.items():
+        if not isinstance(region, Region):
+            raise TypeError(
+                f"Invalid region {name!r}, {region!r}. Must be an explorer.Region, such as "
+                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
+            )
+    whole = Region("rectangle", ((0, 0), view.shape))
+    return dict(regions) or {"measured pixels of the whole image": whole}
+
+
+def _picture(logo: str | Path) -> bytes:
+    """Bytes of a logo, a PNG."""
+    picture = texts.regular_file(logo, _LOGO).read_bytes()
+    if not picture.startswith(PNG):
+        raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
+    return picture
 
 
 def _svg(figure: Figure) -> str:
