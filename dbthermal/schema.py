@@ -501,8 +501,8 @@ def band_values(
 
 def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Variables of a Dataset of a stage, with the dims and attributes of their definitions."""
-    known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
-    return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
+    stated = {**STAGES[stage], **OPTIONAL.get(stage, {})}
+    return {name: (stated[name].dims, value, stated[name].attrs) for name, value in values.items()}
 
 
 def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
