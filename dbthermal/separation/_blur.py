@@ -9,7 +9,7 @@ pixels. The band that is sharper is blurred, and c is sought again until nothing
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,13 @@ from scipy.ndimage import (
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, empty, quotient, release
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import object_weights, reflected, smooth_functions
+from dbthermal.separation._misfit import (
+    Misfit,
+    Reading,
+    object_weights,
+    reflected,
+    smooth_functions,
+)
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
@@ -39,7 +45,6 @@ _BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
 _GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 _FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
-_NUMBER: Final = 60  # frames of noise that tell what a blur makes of it
 _MOVING: Final = 1.0  # variance of the changes over that of noise
 # Deviations and size [pixel^2] of a difference that counts, and deviations in some rows from which
 # it is sought in all: 0 to 2 in plain scenes, 8 to 25 for 0.5 and 1.3 pixels.
@@ -47,6 +52,9 @@ _SURE, _LEAST, _HINT = 6.0, 0.1, 3.0
 _MOST: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
 _BLOCKS: Final = 8  # of rows that tell it
 _LEADING: Final = 64  # functions of time that hold most of the rapid changes of some rows
+
+Sums: TypeAlias = tuple[float, float, float]
+"""Of the normal equation of c: its force, its form, and the variance of the force."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +80,16 @@ class Equalised:
         )
 
 
-def equalise(corrected: xr.Dataset, inputs: Inputs, result: xr.Dataset) -> Equalised | None:
+def equalise(
+    corrected: xr.Dataset, inputs: Inputs, result: xr.Dataset, misfit: Misfit
+) -> Equalised | None:
     """Blur the sharper bands as much as the others, if they differ; None if not."""
     sound = result["status"].values == 0
     excess = np.zeros(len(inputs.bands))
-    for place in range(1, excess.size):
-        excess[inputs.bands[place]] = _difference(inputs, result, place)
+    for hints in misfit.answers[sharpness]:
+        for place, (force, _, variance) in enumerate(hints, 1):
+            if force**2 > _HINT**2 * variance:
+                excess[inputs.bands[place]] = _difference(inputs, result, place)
     variances = excess.max() - excess
     if not variances.any():
         return None
@@ -146,19 +158,30 @@ def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
     return np.asarray(gaussian_filter(image, deviation, mode="nearest"))
 
 
+def _blocks(inputs: Inputs) -> list[slice]:
+    """Rows that may tell a blur."""
+    if inputs.capture.sizes["x"] < _FEWEST:
+        return []
+    return [rows for rows in inputs.blocks if rows.stop - rows.start >= _FEWEST]
+
+
+def sharpness(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[Sums] | None:
+    """Sums of each other band's blur, from the rows in the middle; None of other rows."""
+    every = _blocks(inputs)
+    if not every or reading.rows != every[len(every) // 2]:
+        return None
+    places = range(1, len(inputs.bands))
+    return [_equations(inputs, result, place, 0.0, reading, _LEADING) for place in places]
+
+
 def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
-    excess = 0.0
-    every = [rows for rows in inputs.blocks if rows.stop - rows.start >= _FEWEST]
-    if result.sizes["x"] < _FEWEST or not every:
-        return 0.0
-    hint = _equations(inputs, result, place, excess, every[len(every) // 2], _LEADING)
-    if hint[0] ** 2 < _HINT**2 * hint[2]:
-        return 0.0
+    excess, every = 0.0, _blocks(inputs)
+    rows = every[:: max(1, len(every) // _BLOCKS)]
     for turn in range(_ROUNDS):
-        rows = every[:: max(1, len(every) // _BLOCKS)]
+        readings = (reflected(inputs, result, block) for block in rows)
         forces, form, variance = np.sum(
-            [_equations(inputs, result, place, excess, block) for block in rows], axis=0
+            [_equations(inputs, result, place, excess, reading) for reading in readings], axis=0
         )
         if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
             return 0.0
@@ -179,14 +202,14 @@ def _equations(
     result: xr.Dataset,
     place: int,
     excess: float,
-    rows: slice,
+    reading: Reading,
     leading: int | None = None,
-) -> tuple[float, float, float]:
+) -> Sums:
     """Normal equation of c over some rows, for bands that are blurred by an excess before.
 
     Of all rapid changes, or of a leading number of functions of time that hold most of them.
     """
-    _, films, frames, pixels, gain = reflected(inputs, result, rows)
+    rows, _, films, frames, pixels, gain = reading
     shape = (rows.stop - rows.start, result.sizes["x"])
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
     inner = np.zeros(shape, dtype=bool)
@@ -216,15 +239,15 @@ def _equations(
     remainder, reflection = rapid(second / ratio - first), rapid(first)
     curvature = rapid(laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
-    rng, free = np.random.default_rng(0), len(basis) - basis.shape[1]
-    noise = np.stack(
-        [_details(image, blurs[0]) for image in rng.standard_normal((_NUMBER, *shape))]
-    )
-    bent = laplace(noise, axes=(1, 2))
+    free = len(basis) - basis.shape[1]
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
+    point = np.zeros((1 + 2 * int(np.ceil(4.0 * _BROAD)),) * 2)
+    point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
+    spread = _details(point, blurs[0])
+    bent = laplace(spread)
     level, mixed, bending = (
-        free * levels[0] * np.mean((a * b)[:, inner])
-        for a, b in ((noise, noise), (noise, bent), (bent, bent))
+        free * levels[0] * np.sum(a * b)
+        for a, b in ((spread, spread), (spread, bent), (bent, bent))
     )
     products = (
         np.sum(remainder * reflection, axis=0) + level,

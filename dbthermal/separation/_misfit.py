@@ -10,10 +10,10 @@ bodies, unlike blurs, a camera that shakes), and by changes that no reflection e
 that the model misses, pixels that drift).
 """
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,21 @@ _OCTAVES: Final = float(np.log2(HIGHEST_ORDER))
 _NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the object's range
 
 
+class Reading(NamedTuple):
+    """Samples of some rows, and what they hold beside the object; signals in kelvin."""
+
+    rows: slice
+    signals: Array  # (band, frame, pixel) [K]
+    reflections: Array  # the same less the object's signal, of pixels without a flag
+    frames: Mask  # that are read (time)
+    pixels: Mask  # without a flag (pixel)
+    gain: Array  # noise over that of a sample (band, pixel) [1]
+
+
+Probe: TypeAlias = Callable[[Inputs, xr.Dataset, Reading], Any]
+"""Asks a reading for a cause of what the model leaves; None where it asks nothing."""
+
+
 @dataclass(frozen=True)
 class Misfit:
     """Maps of how far the model fails the measured signals; zero where noise may explain it."""
@@ -49,6 +64,7 @@ class Misfit:
     leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
     single: Array  # the same, by noise of single pixels that is not white (y, x) [K]
+    answers: dict[Probe, list[Any]]  # to each probe, of the rows that it asks
 
     @property
     def size(self) -> float:
@@ -72,11 +88,24 @@ class _Blocks(NamedTuple):
     freedom: Array  # degrees of freedom of each event (event, ...)
 
 
-def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
-    """Measure how far the signals of pixels without a flag deviate from a separation's model."""
+def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) -> Misfit:
+    """Measure how far the signals of pixels without a flag deviate from a separation's model.
+
+    The samples are read for that, and the probes are asked in passing.
+    """
+
+    def examine(rows: slice) -> tuple[_Blocks, list[Any]]:
+        reading = reflected(inputs, result, rows)
+        sums = [probe(inputs, result, reading) for probe in probes]
+        return _of_rows(inputs, result, reading), sums
+
     with ThreadPoolExecutor(workers) as threads:
-        sections = list(threads.map(partial(_of_rows, inputs, result), inputs.blocks))
+        sections, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
     blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
+    answers = {
+        probe: [value for value in values if value is not None]
+        for probe, values in zip(probes, zip(*sums, strict=True), strict=False)
+    }
     # Give each pixel the values of its block.
     heights = [
         min(_BLOCK, rows.stop - top)
@@ -85,7 +114,8 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int) -> Misfit:
     ]
     row = np.repeat(np.arange(len(heights)), heights)
     place = np.ix_(row, np.arange(result.sizes["x"]) // _BLOCK)
-    return Misfit(_leak(blocks)[place], _change(blocks)[place], _single(blocks)[place])
+    leak, change, single = (values(blocks)[place] for values in (_leak, _change, _single))
+    return Misfit(leak, change, single, answers)
 
 
 def _local_mean(blocks: _Blocks, values: Array) -> Array:
@@ -140,31 +170,24 @@ def _leak(blocks: _Blocks) -> Array:
     return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
 
 
-def _of_rows(inputs: Inputs, result: xr.Dataset, rows: slice) -> _Blocks:
+def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     """Averages over the blocks of some rows."""
-    signals, frames, pixels, gain = read(inputs, result, rows)
-    film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
-    ratio, emissivity = (
-        result[name].values[:, rows].reshape(len(inputs.bands), -1)[inputs.bands]
-        for name in ("reflection_ratio", "emissivity")
-    )
-    pixels &= result["status"].values[rows].ravel() == 0
-    for values in (film, ratio, emissivity):
-        pixels &= np.isfinite(values).all(axis=0)
+    rows, signals, reflections, frames, pixels, gain = reading
+    ratio = result["reflection_ratio"].values[inputs.bands, rows].reshape(len(signals), -1)
+    pixels = pixels & np.isfinite(ratio).all(axis=0)
     # Number the blocks, and count their pixels.
     width = result.sizes["x"]
-    shape = -(-film.shape[1] // width // _BLOCK), -(-width // _BLOCK)
-    row, column = np.divmod(np.arange(film.shape[1]), width)
+    shape = -(-pixels.size // width // _BLOCK), -(-width // _BLOCK)
+    row, column = np.divmod(np.arange(pixels.size), width)
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
     number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
     # Weigh the bands, and average what is left beside the object, and the reflection.
     weights, noise = _weights(
         np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, np.newaxis] * gain
     )
-    center, half, curve = _object_signal(inputs, film, weights * emissivity, pixels)
     span, event = _spans(frames)
-    remainder, reflection = np.zeros((2, len(film), number.size))
-    _average(signals, film, weights, center, half, curve, place, remainder, reflection)
+    remainder, reflection = np.zeros((2, signals.shape[1], number.size))
+    _average(signals[0], reflections, weights, place, remainder, reflection)
     single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
     release()
     filled = np.maximum(number, 1.0)
@@ -256,22 +279,44 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
     return signals, frames, pixels, gain
 
 
-def reflected(
-    inputs: Inputs, result: xr.Dataset, rows: slice
-) -> tuple[Array, Array, Mask, Mask, Array]:
-    """Signals (band, frame, pixel) [K] of some rows, and the reflections alone.
+def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
+    """Read some rows, and take the object's signal from those of pixels without a flag.
 
-    And the frames (time), the pixels without a flag, and the noise's gain, as `tiles.read`.
+    It is a cubic polynomial of the temperature over the object's range, of each pixel.
     """
     signals, frames, pixels, gain = read(inputs, result, rows)
     film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
+    emissivity = result["emissivity"].values[inputs.bands, rows].reshape(len(signals), -1)
     pixels &= (result["status"].values[rows].ravel() == 0) & np.isfinite(film).all(axis=0)
+    pixels &= np.isfinite(emissivity).all(axis=0)
+    lowest, highest = film.min(axis=0), film.max(axis=0)
+    center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
+    nodes, powers = center + _NODES[:, np.newaxis] * half, np.vander(_NODES, increasing=True)
     reflections = signals.copy()
     for order, band in enumerate(inputs.bands):
-        curve, emissivity = inputs.curves[band], result["emissivity"].values[band, rows].ravel()
-        emitted = emissivity[pixels] * (curve.signal(film[:, pixels]) - curve.reference)
-        reflections[order][:, pixels] -= emitted
-    return signals, reflections, frames, pixels, gain
+        curve = inputs.curves[band]
+        emitted = curve.signal(np.where(pixels, nodes, curve.reference)) - curve.reference
+        shares = np.linalg.solve(powers, emissivity[order] * emitted)
+        _subtract(film, center, half, shares, pixels, reflections[order])
+    return Reading(rows, signals, reflections, frames, pixels, gain)
+
+
+@compiled
+def _subtract(
+    film: npt.NDArray[np.float32],
+    center: Array,
+    half: Array,
+    shares: Array,
+    pixels: Mask,
+    signal: Array,
+) -> None:
+    """Subtract a polynomial (power, pixel) of a film from a signal (time, pixel), in place."""
+    for t in range(len(film)):
+        for p in range(pixels.size):
+            if pixels[p]:
+                x = (film[t, p] - center[p]) / half[p]
+                value = shares[2, p] + x * shares[3, p]
+                signal[t, p] -= shares[0, p] + x * (shares[1, p] + x * value)
 
 
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
@@ -321,44 +366,23 @@ def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     return every, np.stack(noise)
 
 
-def _object_signal(
-    inputs: Inputs, film: Array, shares: Array, pixels: Mask
-) -> tuple[Array, Array, Array]:
-    """Cubic polynomial (power, pixel) [K] of the object in the weighted bands.
-
-    Over its range: of the temperature less its center, over half the range (pixel) [K].
-    """
-    lowest, highest = film.min(axis=0), film.max(axis=0)
-    center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
-    curves = [inputs.curves[band] for band in inputs.bands]
-    nodes = np.where(pixels, center + _NODES[:, np.newaxis] * half, curves[0].reference)
-    values = sum(share * curve.signal(nodes) for share, curve in zip(shares, curves, strict=True))
-    return center, half, np.linalg.solve(np.vander(_NODES, increasing=True), values)
-
-
 @compiled
-def _average(  # noqa: PLR0913, PLR0917 - a loop over arrays
-    signals: Array,
-    film: npt.NDArray[np.float32],
+def _average(
+    signal: Array,
+    reflections: Array,
     weights: Array,
-    center: Array,
-    half: Array,
-    curve: Array,
     place: Whole,
     remainder: Array,
     reflection: Array,
 ) -> None:
     """Add up what is left beside the object, and the reflection, by block, in place."""
-    for t in range(len(film)):
+    for t in range(len(signal)):
         for p in range(place.size):
             b = place[p]
             if b >= 0:
-                x = (film[t, p] - center[p]) / half[p]
-                value = -(curve[0, p] + x * (curve[1, p] + x * (curve[2, p] + x * curve[3, p])))
-                for m in range(len(signals)):
-                    value += weights[m, p] * signals[m, t, p]
-                remainder[t, b] += value
-                reflection[t, b] += signals[0, t, p]
+                for m in range(len(reflections)):
+                    remainder[t, b] += weights[m, p] * reflections[m, t, p]
+                reflection[t, b] += signal[t, p]
 
 
 @compiled

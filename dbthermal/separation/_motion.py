@@ -25,7 +25,14 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import Misfit, object_weights, reflected, smooth_functions
+from dbthermal.separation._misfit import (
+    Misfit,
+    Reading,
+    Whole,
+    object_weights,
+    reflected,
+    smooth_functions,
+)
 
 _COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
 # Mean square of a motion over its variance, from which it is undone, and undone further: of 10^5
@@ -35,7 +42,7 @@ _SURE, _FURTHER = 10.0, 1.5
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
 _SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
-# Of slow motion: polynomials of the time, windows along a side of the image, and frames, about. By
+# Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. By
 # the square above a drift of one pixel shows 34 or more, 31 plain scenes at most 9; 30 of 24x32
 # pixels, with half the windows, up to 93, but of less than 0.06 pixel.
 _DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
@@ -72,7 +79,7 @@ def stabilise(
     if misfit.common(result["status"].values == 0):
         steps += _rapid(inputs, result, least)
     rapid = bool(np.any(steps))
-    steps += _slow(inputs, result)
+    steps += _slow(inputs, misfit)
     motion = np.asarray(steps if before is None else steps + before)
     if not np.any(steps) or np.sqrt(np.mean(motion**2, axis=(1, 2)).max()) < _LEAST:
         return None
@@ -111,22 +118,15 @@ def _rapid(inputs: Inputs, result: xr.Dataset, least: float) -> Array:
     return np.swapaxes(steps.reshape(-1, count, 2), 0, 1)[np.argsort(inputs.bands)]
 
 
-def _slow(inputs: Inputs, result: xr.Dataset) -> Array:
+def _slow(inputs: Inputs, misfit: Misfit) -> Array:
     """Motion (band, time, axis) [pixel] of the bands against the first one; zero without any."""
-    time = result["time"].values.astype(np.float64)
-    motion = np.zeros((len(inputs.bands), time.size, 2))
-    # Of cameras apart parallax that changes as people come and go is like motion.
-    if inputs.displacement is not None or min(result["status"].shape) < 2 * _WINDOWS:
-        return motion
-    course = smooth.polynomial_basis(time, _DEGREES + 1) * np.sqrt(time.size)
-    blocks = [rows for rows in inputs.blocks if rows.stop - rows.start > 1]
-    blocks = blocks[:: max(1, len(blocks) // _WINDOWS)]
-    for place, band in enumerate(inputs.bands[1:], 1):
-        windows = [_displaced(inputs, result, place, rows, course) for rows in blocks]
-        form, force = (np.concatenate(sums) for sums in zip(*windows, strict=True))
-        # A delay, which feigns motion of what walks by, is that of clocks: it hardly changes.
-        wanted = np.ones((_DEGREES + 1, 3), dtype=bool)
-        wanted[2:, 2] = False
+    time = inputs.capture["time"].values.astype(np.float64)
+    motion, windows = np.zeros((len(inputs.bands), time.size, 2)), misfit.answers[drift]
+    # A delay, which feigns motion of what walks by, is that of clocks: it hardly changes.
+    wanted = np.ones((_DEGREES + 1, 3), dtype=bool)
+    wanted[2:, 2] = False
+    for place, band in enumerate(inputs.bands[1:]) if windows else ():
+        form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
         form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
         # Solve with a prior, and without each window of the image in turn: a jackknife.
         whole = form.sum(axis=0) + np.eye(form.shape[1]) / _COMMON**2
@@ -137,47 +137,65 @@ def _slow(inputs: Inputs, result: xr.Dataset) -> Array:
         score, path = np.zeros((2, *wanted.shape))
         score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps
         if np.any(score[1:, :2].mean(axis=0) > _SURE):
-            motion[band] = course[:, 1:] @ path[1:, :2]
+            motion[band] = _course(time)[:, 1:] @ path[1:, :2]
     return motion
 
 
-def _displaced(
-    inputs: Inputs, result: xr.Dataset, place: int, rows: slice, course: Array
-) -> tuple[Array, Array]:
-    """Normal equations (window, ...) of a band's motion and delay along functions of time.
+def _course(time: Array) -> Array:
+    """Polynomials (time, degree) of slow motion."""
+    return np.asarray(smooth.polynomial_basis(time, _DEGREES + 1) * np.sqrt(time.size))
+
+
+def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Array, Array]] | None:
+    """Normal equations (window, ...) of each other band's motion and delay along functions of time.
 
     Of windows of some rows; what does not change rapidly has no part in them.
     """
-    _, films, frames, pixels, _ = reflected(inputs, result, rows)
-    ratio = result["reflection_ratio"].values[inputs.bands[place], rows].astype(np.float64)
-    used = binary_erosion(pixels.reshape(ratio.shape) & (ratio > 0.0), border_value=1)
-    basis = smooth_functions(inputs, frames)
-    first, second = (
-        (film - basis @ (basis.T @ film)).reshape(-1, *ratio.shape) for film in films[[0, place]]
-    )
-    slopes = np.stack([*np.gradient(first, axis=(1, 2)), np.gradient(first, axis=0)])
-    noise = inputs.noise[inputs.bands] ** 2
-    stride = slice(None, None, max(1, len(first) // _FRAMES))
-    course, forms, forces = course[frames][stride], list[Array](), list[Array]()
-    for columns in np.array_split(np.arange(ratio.shape[1]), _WINDOWS):
-        y, x = np.nonzero(used[:, columns])
-        window = y, columns[x]
-        slope, kappa = slopes[:, stride, *window], ratio[window]
-        remainder = second[stride, *window] / kappa - first[stride, *window]
-        weighted = slope / (noise[0] + noise[place] / kappa**2)
-        form = np.einsum("atp,btp->tab", weighted, slope, optimize=True)
-        force = np.einsum("atp,tp->ta", weighted, remainder)
-        forms.append(np.einsum("tj,tk,tab->jakb", course, course, form, optimize=True))
-        forces.append(np.einsum("tj,ta->ja", course, force))
-    size = course.shape[1] * 3
-    return np.reshape(forms, (-1, size, size)), np.reshape(forces, (-1, size))
+    blocks = [rows for rows in inputs.blocks if rows.stop - rows.start > 1]
+    blocks = blocks[:: max(1, len(blocks) // _WINDOWS)]
+    # Of cameras apart parallax that changes as people come and go is like motion.
+    small = min(result["status"].shape) < 2 * _WINDOWS
+    if inputs.displacement is not None or small or reading.rows not in blocks:
+        return None
+    ratios = result["reflection_ratio"].values[inputs.bands, reading.rows].astype(np.float64)
+    pixels = reading.pixels.reshape(ratios.shape[1:])
+    basis = smooth_functions(inputs, reading.frames)
+    # Rapid changes in some frames, and in those before and after them.
+    at = np.arange(1, len(basis) - 1, -(-len(basis) // _FRAMES))
+    course = _course(inputs.capture["time"].values.astype(np.float64))[reading.frames][at]
+    smoothed = basis.T @ reading.reflections
+
+    def rapid(place: int, at: Whole) -> Array:
+        film = reading.reflections[place][at] - basis[at] @ smoothed[place]
+        return np.asarray(film.reshape(-1, *pixels.shape))
+
+    first, noise = rapid(0, at), inputs.noise[inputs.bands] ** 2
+    in_time = 0.5 * (rapid(0, at + 1) - rapid(0, at - 1))
+    slopes = np.stack([*np.gradient(first, axis=(1, 2)), in_time])
+    equations = []
+    for place, ratio in enumerate(ratios[1:], 1):
+        used = binary_erosion(pixels & (ratio > 0.0), border_value=1)
+        second, forms, forces = rapid(place, at), list[Array](), list[Array]()
+        for columns in np.array_split(np.arange(ratio.shape[1]), _WINDOWS):
+            y, x = np.nonzero(used[:, columns])
+            window = y, columns[x]
+            slope, kappa = slopes[:, :, *window], ratio[window]
+            remainder = second[:, *window] / kappa - first[:, *window]
+            weighted = slope / (noise[0] + noise[place] / kappa**2)
+            form = np.einsum("atp,btp->tab", weighted, slope, optimize=True)
+            force = np.einsum("atp,tp->ta", weighted, remainder)
+            forms.append(np.einsum("tj,tk,tab->jakb", course, course, form, optimize=True))
+            forces.append(np.einsum("tj,ta->ja", course, force))
+        size = course.shape[1] * 3
+        equations.append((np.reshape(forms, (-1, size, size)), np.reshape(forces, (-1, size))))
+    return equations
 
 
 def _add_equations(
     inputs: Inputs, result: xr.Dataset, weights: Array, rows: slice, form: Array, forces: Array
 ) -> None:
     """Add the normal equations of all bands' motion over some rows, by frame, in place."""
-    signals, films, frames, pixels, gain = reflected(inputs, result, rows)
+    _, signals, films, frames, pixels, gain = reflected(inputs, result, rows)
     weights = weights.reshape(len(signals), -1)
     used = pixels & (weights[0] != 0.0)
     basis = smooth_functions(inputs, frames)

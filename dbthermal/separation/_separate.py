@@ -20,14 +20,14 @@ from dbthermal.schema import Status
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced
-from dbthermal.separation._blur import equalise
+from dbthermal.separation._blur import equalise, sharpness
 from dbthermal.separation._budget import SKY
 from dbthermal.separation._completion.complete import Beside, filled
 from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
-from dbthermal.separation._motion import stabilise
+from dbthermal.separation._motion import drift, stabilise
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._reflection import as_gray, restored
@@ -146,21 +146,25 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
 
     def once(capture: xr.Dataset) -> tuple[Measured, Misfit]:
-        scope = check(capture, response, inputs.method, settings=settings)
+        scope = inputs
+        if capture is not corrected:
+            scope = check(capture, response, inputs.method, settings=settings)
         measured = _separated(capture, scope, reflection_shift, materials, workers, progress)
-        return measured, misfits.measure(measured.inputs, measured.result, workers)
+        return measured, misfits.measure(
+            measured.inputs, measured.result, workers, drift, sharpness
+        )
 
     # Separate, and widen the bars by what is left.
-    corrected, (measured, misfit), mended = _mended(corrected, once)
+    capture, (measured, misfit), mended = _mended(corrected, once)
     if colour is not None:
-        corrected, scale, (measured, misfit) = as_gray(corrected, once, measured, colour)
+        capture, scale, (measured, misfit) = as_gray(capture, once, measured, colour)
     result, materials = measured.result, measured.materials
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=measured.reflection_shift)
     doubts = measured.doubts + mended
     if completable:
-        result = filled(result, corrected, response, context, workers)
+        result = filled(result, capture, response, context, workers)
     else:
         doubts.append(_NOT_COMPLETED.format(names))
         result = budget.added(result, measured.inputs)
@@ -194,7 +198,7 @@ def _mended(
             break
         capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
         outcome = measured, misfit = retry
-    alike = equalise(capture, measured.inputs, measured.result)
+    alike = equalise(capture, measured.inputs, measured.result, misfit)
     retry = None if alike is None else once(alike.capture)
     if (
         alike is not None

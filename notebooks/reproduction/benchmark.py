@@ -95,14 +95,20 @@ def scene(cameras: str, shape: tuple[int, int], frames: int = FRAMES) -> xr.Data
     return truth.assign(counts=simulation.observe(truth, rig.response(), rng)["counts"])
 
 
+@lru_cache(maxsize=1)
+def _response() -> xr.Dataset:
+    """Response of the simulated rig, made once: it is not what is timed."""
+    return simulation.Rig().response()
+
+
 def separate(counts: xr.DataArray, workers: int = 1) -> xr.Dataset:
     """Separate by the default call."""
-    return separation.separate(counts.to_dataset(), simulation.Rig().response(), workers=workers)
+    return separation.separate(counts.to_dataset(), _response(), workers=workers)
 
 
 def solver(counts: xr.DataArray, cameras: str) -> Callable[[], xr.Dataset]:
     """Call of `solve`, before cameras apart with the shift of the reflections found beforehand."""
-    capture, response = counts.to_dataset(), simulation.Rig().response()
+    capture, response = counts.to_dataset(), _response()
     apart = "shift" in CAMERAS[cameras]
     shift = alignment.reflection_shift(capture, response) if apart else None
     return partial(separation.solve, capture, response, reflection_shift=shift, workers=1)
