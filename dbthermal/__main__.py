@@ -53,71 +53,71 @@ _KINDS: Final[dict[str, Any]] = {
     "point": kelvin_or_path,
 }
 _ARGUMENTS: Final = """
-files path+             files of one camera, then a '+' and the other's; or a store
+files path+             a file for each camera, or a list for each with '+' between; or a store
 session path            YAML file, see dbthermal.instruments.session
-folder path             new folder for what is written
+folder path             new folder for the output
 capture path            store of a capture
 correction path?        store of gain and offset
---corrected-by-camera flag  in place of it: each camera corrects gain and offset itself
+--corrected-by-camera flag  instead of a correction: the cameras correct gain and offset
 response path           store of the cameras' response
 result path             store of a result
-shown path*             its capture, and the cameras' response, to be shown beside it
-materials name*         as listed by 'data'; all by default
+shown path*             capture and response of this result, to be shown beside it
+materials name*         names as listed by 'data'; all by default
 --output path!          new {output}
 --overwrite flag        replace the output
---dry-run flag          only say what would be read, with sizes, and written
+--dry-run flag          only list what would be read and written, with sizes
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
 --bands name+           names of the bands: 8-14 9.5
---unit name             of the numbers in TIFF, raw files and arrays: 'count' if not stated
---clock number+         frame rate [Hz], of each camera if they differ; FLIR's files have times
+--unit name             unit of the numbers in TIFF, raw files and arrays ('count')
+--clock number+         frame rate [Hz], or a rate for each camera; FLIR's files have times
 --shape n2          rows and columns of raw files [pixel]
---byte-order little|big of the numbers in raw files
---header n=0        before the first frame of raw files [byte]
---frame-header n=0  before each frame of raw files [byte]
---simulated flag        no camera has recorded it: all that is made of it says so
---variable name         name of an array in a file of several, or in a result
---offset number+        start of each other camera after the first's [s]; else found
+--byte-order little|big byte order of raw files
+--header n=0        length of the header of raw files [byte]
+--frame-header n=0  length of the header of each frame of raw files [byte]
+--simulated flag        label the files, and all results made from them, as simulated
+--variable name         name of an array in a file with several, or of a result's variable
+--offset number+        start of each further camera minus the first's [s]; else by dates or images
 --simulate flag         use emulated devices
---side-by-side flag     cameras side by side, in place of one window for both
---at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
---blackbody path        in place of --at: a store of all temperatures
---sweep name2           in place of --at: folder and session of a sweep by 'record'
---maker path            in place of --at: a capture of FLIR's files, for the maker's constants
---frames n+         the first N, or from A up to B: A B; of each temperature 64
---every n=1         take one frame of so many
+--side-by-side flag     cameras side by side instead of one optical path
+--at point+&            blackbody temperature, as 20C or 293.15K, and its files; repeat it
+--blackbody path        instead of --at: a store of all temperatures
+--sweep name2           instead of --at: folder and session of a sweep by 'record'
+--maker path            instead of --at: a capture of FLIR files, for the maker's constants
+--frames n+         N: first N frames; A B: frames A up to B (of a blackbody: the first 64)
+--every n=1         take every N-th frame
 --rows n2           take rows Y0 up to Y1 of the image
---blackbody-accuracy number  error that all temperatures share, standard deviation [K] (0.1)
---blackbody-emissivity number  of the blackbody, which mirrors the room (0.97)
---room-temperature temperature  of that room, as 22C
---offset-std number+    drift of the level of each camera since [K] (0.5)
---gain-std number+      error of the gain of each camera (0.01)
---pattern-std number+   drift of the pixels of each camera since [K] (0.1)
---background-ratio-std number  colour of what surfaces mirror, about gray (0.02)
---correction-output path   store of gain and offset, where the blackbody fills the view
+--blackbody-accuracy number  standard deviation of the common error of temperatures [K] (0.1)
+--blackbody-emissivity number  emissivity of the blackbody, which reflects the room (0.97)
+--room-temperature temperature  temperature of this room, such as 22C
+--offset-std number+    drift of each camera's level since the sweep [K] (0.5)
+--gain-std number+      error of each camera's gain (0.01)
+--pattern-std number+   drift of single pixels of each camera since the sweep [K] (0.1)
+--background-ratio-std number  deviation of reflections from gray (0.02)
+--correction-output path   store for gain and offset; the blackbody must fill the view
 --no-shutter flag       no camera has a shutter
---time-constant number  thermal, of the pixels [s]
---register none|translation|affine|homography   between the views (homography); none: on one grid
---search n=5        largest delay that is sought, either way [frame]
---reference name        band whose frames are left as they are in time
---correction path       store of gain and offset: all steps of a raw capture, by rows
---method name           one step alone, by rows: {methods}
---emissivity number+    of each band, for the method 'calibrated'
---surroundings temperature   temperature of what is reflected, as 22C
---outdoors flag         the sky is mirrored, which is not gray: wider bars
---background-ratio number2  changes of what is mirrored, second band over first; its deviation
+--time-constant number  thermal time constant of the pixels [s]
+--register none|translation|affine|homography   transform of the views (homography); none: same view
+--search n=5        largest delay between the cameras that is searched [frame]
+--reference name        band whose frames keep their times
+--correction path       store of gain and offset, to do all steps from a raw capture
+--method name           a single method, pixel by pixel: {methods}
+--emissivity number+    emissivity of each band, for the method 'calibrated'
+--surroundings temperature   temperature of the reflected surroundings, such as 22C
+--outdoors flag         the sky is reflected, which is not gray: wider error bars
+--background-ratio number2  ratio of reflected changes, second band to first, and its deviation
 --prior name            material of pixels that cannot be measured, as listed by 'data'
 --workers n=2       number of threads
 --title name            heading of the report
---author name           name below it
---logo path             picture beside it, *.png
---noise number!         of the camera without a filter [K]
+--author name           name below the heading
+--logo path             picture beside the heading, *.png
+--noise number!         noise of the camera without a filter [K]
 --seconds number=35     length of the capture
 --rate number=10        frame rate [Hz]
 --span number=25        rise of the object's temperature [K]
 --amplitude number=3    height of the reflected changes [K]
---pixel n2&         row and column of a curve; repeated
---region n4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; repeated
+--pixel n2&         row and column of a curve; may be repeated
+--region n4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; may be repeated
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
@@ -132,7 +132,7 @@ _VALUES: Final = {
 """Option -> names of its values in the help, where it is not that of its kind."""
 
 _METHODS: Final = (
-    "subspace (what the default call begins with), calibrated (emissivities as stated), "
+    "subspace (first step of the default), calibrated (emissivities as stated), "
     "apparent (temperature as of a black body)"
 )
 _OUTPUTS: Final = {
@@ -145,18 +145,18 @@ _OUTPUTS: Final = {
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"
 _COMMANDS: Final = f"""
 demo demo.demo folder --side-by-side
-write the files of a simulated rig, to try everything without cameras, and say what to do next
+write files of a simulated rig, to try everything without cameras, and print the next commands
 try-it
 try-it --side-by-side
 
 info files.info files {_FORM}
-say what a store or recording is, and of a result how hot, how sure and how much of it
+describe a store or recording; of a result: temperature, uncertainty, share measured
 result.zarr
 video.seq
 a.tif --clock 30
 
 import files.make_capture files --bands --offset {_FORM} --frames --every --rows --output
-make a capture of two cameras' files: FLIR, Telops, TIFF, raw, NumPy, HDF5, MATLAB, NetCDF, zarr
+make a capture from cameras' files: FLIR, Telops, TIFF, raw, NumPy, HDF5, MATLAB, NetCDF, zarr
 a.tif b.tif --bands 8-14 9.5 --clock 30 --offset 0 -o scene.zarr
 a*.tif + b*.tif --bands 8-14 9.5 --clock 12 10 --offset 0 -o scene.zarr
 wide.seq narrow.seq --bands 8-14 9.5 --frames 0 3000 --every 3 -o scene.zarr
@@ -188,15 +188,15 @@ scene.zarr response.zarr --correction nuc.zarr -o result.zarr
 aligned.zarr response.zarr --method calibrated --emissivity 0.86 0.72 -o result.zarr
 
 complete steps.complete result capture response --surroundings --prior --workers --output
-complete the result of a single method by what is known of the scene
+complete the result of a single method from materials, surroundings or a library
 result.zarr aligned.zarr response.zarr --surroundings 22C -o completed.zarr
 
 plan steps.plan materials --noise --seconds --rate --span --amplitude --outdoors
-say which accuracy a capture can have, by material and filter, before it is recorded
+predict the accuracy of a capture before it is recorded, by material and filter
 'plate window glass' water --noise 0.03
 
 record record.record session folder --simulate
-record a session with the rig, or with emulated devices; a dry run names the devices
+record a session with the rig, or with emulated devices; --dry-run lists the devices
 sessions/scene.yaml recordings --dry-run
 sessions/scene.yaml recordings --simulate
 
@@ -209,11 +209,11 @@ result.zarr -o object.gif
 result.zarr -o result.nc
 
 explore export.explore result shown --output
-make a notebook to look around in a result or a capture, for JupyterLab
+make a notebook that shows a result or a capture in JupyterLab
 result.zarr aligned.zarr response.zarr -o look.ipynb
 
 report export.report result shown --region --title --author --logo --output
-write a report on a result, one HTML file that needs no network
+write a report on a result as one HTML file, which needs no network
 result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 
 data steps.data
@@ -221,7 +221,7 @@ list the filters and materials that come with the package
 --json
 
 completion main.completion
-print the completion of commands for bash and zsh, taken over by: eval "$(dbthermal completion)"
+print the completion of commands for bash and zsh; use it by: eval "$(dbthermal completion)"
 -
 """
 """Command, its function and arguments; its summary; examples."""
@@ -242,7 +242,7 @@ def _parser() -> argparse.ArgumentParser:
     """Parser of all commands, made of the tables `_ARGUMENTS` and `_COMMANDS`."""
     # The command itself, and the table of all arguments.
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    order = "In this order: demo (or import), calibrate, correct, align, separate, report, explore."
+    order = "Order of work: demo (or import), calibrate, correct, align, separate, report, explore."
     parser = _Parser("dbthermal", description=f"{__doc__}\n{order}", **plain)
     parser.add_argument("--version", action="version", version=f"dbthermal {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
