@@ -26,11 +26,11 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
         "04_separation": (
             (f"{_SCENE}: object RMSE, pixel by pixel (`solve`)", "twin_rmse_subspace_K", "K"),
             (f"{_SCENE}: object RMSE, `separate`", "twin_rmse_whole_K", "K"),
-            (f"{_SCENE}: object RMSE, emissivities known", "twin_rmse_calibrated_K", "K"),
+            (f"{_SCENE}: object RMSE, `calibrated`, per frame", "twin_rmse_calibrated_K", "K"),
         ),
         "10_limits": (
             (
-                "reflection ratio: standard error over Cramér-Rao bound, at 0.1 to 2 times the noise",
+                "reflection ratio: standard error over Cramér-Rao bound, noise factor 0.1 to 2",
                 "noise x .*: scatter of the ratio over its bound",
                 "",
             ),
@@ -42,7 +42,7 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
                 )
                 for n in (4, 25, 100, 400)
             ),
-            ("two materials: pixels assigned to the right material", "plate: right side of the border", "%"),
+            ("two materials: pixels in the right material", "plate: right side of the border", "%"),
         ),
     },
     "Error bars": {
