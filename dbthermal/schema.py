@@ -99,7 +99,7 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
-NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
+NOISE_FACTOR: Final = _of("band", "1", "noise after over noise before the alignment")
 """Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
 
 PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
@@ -135,7 +135,7 @@ BUDGETS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Quantity of a result -> variable of its deviation by cause."""
 
-SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
+SEGMENT: Final = _of("time", "1", "number of shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
 STATUS: Final = _of("y x", "1", "validity flags, 0 is good", "uint32")
@@ -145,8 +145,8 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
         "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
         "reflection_shift": {
-            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
-            "known": _of("y x", "1", "texture tells the shift", "bool"),
+            **_with_std("shift", "axis y x", "pixel", "reflection shift"),
+            "known": _of("y x", "1", "texture determines the shift", "bool"),
         },
         "separated": {
             **_with_std("object_temperature", "time y x", "K", "object temperature"),
@@ -203,7 +203,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "exposure_time": EXPOSURE_TIME,
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
-            "drift": _of("band time", "count", "drift taken out"),
+            "drift": _of("band time", "count", "drift that was removed"),
             "noise_factor": NOISE_FACTOR,
             "pattern_std": PATTERN_STD,
             "status": STATUS,
@@ -212,11 +212,11 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
-            "drift_std": _of("y x", "1", "reference emissivity's part by drift", "float32"),
-            "noise": _of("band", "count", "noise, as used"),
-            "bridged": _of("time y x", "1", "sample bridged in time, not measured", "bool"),
+            "drift_std": _of("y x", "1", "reference emissivity's std by drift", "float32"),
+            "noise": _of("band", "count", "noise that was used"),
+            "bridged": _of("time y x", "1", "interpolated in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),
-            "reflection_shift": _of("axis y x", "pixel", "shift of what is reflected", "float32"),
+            "reflection_shift": _of("axis y x", "pixel", "reflection shift", "float32"),
             "uncertainty": _of("cause y x", "K", "object temperature's std by cause", "float32"),
             "background_uncertainty": _of(
                 "cause y x", "K", "background temperature's std by cause", "float32"
@@ -232,7 +232,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "level": _of("band temperature", "count", "mean over the good pixels"),
             "offset_std": _of("band", "count", "standard deviation of the offset at the centre"),
             "gain_std": _of("band", "1", "standard deviation of the gain"),
-            "centre": _of("band", "count", "level at which the two errors are independent"),
+            "centre": _of("band", "count", "level where offset and gain errors are independent"),
         },
         "response": {
             "noise": NOISE,
@@ -240,10 +240,10 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "offset_std": _of("band", "K", "standard deviation of the offset's drift"),
             "gain_std": _of("band", "1", "standard deviation of the gain"),
             "pattern_std": _of("band", "K", "standard deviation of the pattern's drift"),
-            "blackbody_accuracy": _of("", "K", "error that all blackbody temperatures share"),
+            "blackbody_accuracy": _of("", "K", "std of the blackbody temperatures' shared error"),
             "blackbody_emissivity": _of("", "1", "emissivity of the blackbody"),
-            "room_temperature": _of("", "K", "temperature that the blackbody mirrors"),
-            "background_ratio_std": _of("", "1", "colour of what is mirrored, about gray"),
+            "room_temperature": _of("", "K", "temperature of the room that the blackbody reflects"),
+            "background_ratio_std": _of("", "1", "std of the background ratio about 1 (gray)"),
         },
     }
 )
@@ -321,13 +321,13 @@ class Status(Flags):
     FROZEN_FRAMES = 1 << 11, "the same counts in a band for several frames in a row"
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, part of its curve; the values are valid"
-    BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
+    BANDS_APART = 1 << 14, "rapid changes differ between the bands: time offset or parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "exchanged with the background? low emissivity or lasting step"
-    COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
-    COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
-    COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
+    COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity from the same material"
+    COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity from a library, or stated"
+    COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background from surroundings"
     COMPLETED_FRAMES = 1 << 19, "completed, not measured: 15 % of the pixel's frames or more"
-    NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
+    NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: no estimate"
 
 
 UNMEASURED: Final = Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES

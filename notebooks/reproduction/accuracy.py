@@ -14,7 +14,7 @@ README_MARKS: Final = ("<!-- figure 6, by make record -->", "<!-- end of figure 
 """Marks around the paper's figure 6 beside ours in README.md."""
 
 _SCENE: Final = "scene of README"
-_HELD: Final = "95 % intervals that hold"
+_HELD: Final = "95 % intervals that contain the truth"
 _MODERATE: Final = ": error at moderate noise"
 
 _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
@@ -26,23 +26,23 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
         "04_separation": (
             (f"{_SCENE}: object RMSE, pixel by pixel (`solve`)", "twin_rmse_subspace_K", "K"),
             (f"{_SCENE}: object RMSE, `separate`", "twin_rmse_whole_K", "K"),
-            (f"{_SCENE}: object RMSE, emissivities known", "twin_rmse_calibrated_K", "K"),
+            (f"{_SCENE}: object RMSE, `calibrated`, per frame", "twin_rmse_calibrated_K", "K"),
         ),
         "10_limits": (
             (
-                "reflection ratio: standard error over Cramér-Rao bound, noise times 0.1 to 2",
+                "reflection ratio: standard error over Cramér-Rao bound, noise factor 0.1 to 2",
                 "noise x .*: scatter of the ratio over its bound",
                 "",
             ),
             *(
                 (
-                    f"reflection ratio: gain by pooling {n} pixels of a material",
+                    f"reflection ratio: standard error of one pixel over that of {n} pooled pixels",
                     f"{n} pixels: gain of the ratio",
                     "",
                 )
                 for n in (4, 25, 100, 400)
             ),
-            ("two materials: pixels on the right side", "plate: right side of the border", "%"),
+            ("two materials: pixels in the right material", "plate: right side of the border", "%"),
         ),
     },
     "Error bars": {
@@ -50,14 +50,14 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
             (f"object: {_HELD}, stress cases", "(least|most) covered object", "%"),
             (f"emissivity: {_HELD}, stress cases", ".*: emissivity covered", "%"),
             (
-                "objects off by more than four deviations, without a flag, worst case",
+                "unflagged objects with an error above four deviations, worst case",
                 "wrong objects without a flag, worst case",
                 "%",
             ),
         ),
         "04_separation": ((f"{_SCENE}: {_HELD}, `separate`", "twin_coverage_95_whole", "%"),),
     },
-    "Methods: error of the object at moderate noise": {
+    "Methods: error of the object temperature at moderate noise": {
         "05_methods": (
             ("`subspace`, the default", f"subspace{_MODERATE}", "K"),
             ("`calibrated`, emissivities known", f"calibrated{_MODERATE}", "K"),
@@ -69,7 +69,7 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
         "02_emissivity": (
             ("measured spectra of materials in public libraries", "materials", ""),
             (
-                "spectra whose emissivities in 8-14 and 9.5 µm differ by more than 0.05",
+                "spectra with emissivities in 8-14 and 9.5 µm that differ by more than 0.05",
                 "separable_materials",
                 "",
             ),
@@ -91,18 +91,18 @@ _SINGLE: Final[Mapping[str, Mapping[str, tuple[tuple[str, str, str], ...]]]] = {
 """Title -> notebook -> quantity, pattern of the names of its numbers, unit."""
 
 _TABLES: Final = {
-    "Two cameras: error over that of the same capture without the disturbance": (
+    "Two cameras: error with a disturbance over error without it": (
         "11_rig",
         r"(?P<row>.*), (?P<column>as recorded|undone): error \[1\]",
         {"as recorded": "as recorded", "undone": "after alignment and correction"},
     ),
-    "Twins of the paper's scenes: medians over the moving pixels": (
+    "Simulated twins of the paper's scenes: medians over pixels with moving reflections": (
         "08_twins",
         r"(?P<row>.*, .*): (?P<column>good|object_temperature_rmse|covered)",
         {
             "good": "share of the pixels [%]",
             "object_temperature_rmse": "object RMSE [K]",
-            "covered": "95 % intervals that hold [%]",
+            "covered": "95 % intervals that contain the truth [%]",
         },
     ),
     "From raw counts to temperatures, every step estimated": (
@@ -113,8 +113,8 @@ _TABLES: Final = {
             "pixels with a value": "pixels with a value [%]",
             "object RMSE, measured": "object RMSE, measured [K]",
             "object RMSE, all": "object RMSE, all [K]",
-            "95 % intervals hold, measured": "95 % intervals that hold, measured [%]",
-            "95 % intervals hold, all": "95 % intervals that hold, all [%]",
+            "95 % intervals hold, measured": "95 % intervals that contain the truth, measured [%]",
+            "95 % intervals hold, all": "95 % intervals that contain the truth, all [%]",
         },
     ),
 }
@@ -123,7 +123,7 @@ _TABLES: Final = {
 _WORDS: Final = {
     "coffee_pot": "coffee pot",
     "glass_plate": "glass plate",
-    "found": "views registered by the plate's picture",
+    "found": "views registered by the plate's details",
     "perfect": "views registered exactly",
     "one place": "cameras at one place",
     "side by side": "cameras 4 cm apart",
@@ -184,7 +184,7 @@ def _pivot(
     yield ("case", *heads.values())
     for row, values in cells.items():
         case = ", ".join(_WORDS.get(word, word) for word in row.split(", "))
-        case = case.replace(" frames apart", " frames between the clocks")
+        case = f"clocks {case}" if case.endswith(" frames apart") else case
         yield (case, *(values.get(head, "") for head in heads.values()))
 
 

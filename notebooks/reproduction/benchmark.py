@@ -1,9 +1,9 @@
 """Time, accuracy and memory on this machine: tables in results/bench.
 
 First those of the default call, `separation.separate`, and of `solve`: people walk by a plate of
-glass that is heated, before cameras at one place or apart. Then the time of every method. Times of
-one thread are its processor's, the better of two. What a series would not end within `SHORT` is
-left out of it. All captures are simulated, at `RATE`.
+glass that is heated, seen by cameras at one place or displaced. Then the time of every method.
+Times of one thread are processor times, the better of two. A series leaves out sizes that would
+take longer than `SHORT`. All captures are simulated, at `RATE`.
 """
 
 import argparse
@@ -43,13 +43,13 @@ FRAMES: Final = 350
 RAPID: Final = (2.0, 6.0)  # time of a rapid rise [s]
 CAMERAS: Final[Mapping[str, Mapping[str, Any]]] = {
     "one place": {},
-    "apart": {"shift": (2.4, 1.2)},  # its middle and its variation [pixel]
+    "displaced": {"shift": (2.4, 1.2)},  # its middle and its variation [pixel]
     "one place, rapid heating": {"rise": RAPID},
-    "apart, rapid heating": {"shift": (2.4, 1.2), "rise": RAPID},
+    "displaced, rapid heating": {"shift": (2.4, 1.2), "rise": RAPID},
 }
 """Scenes by the cameras' places and the object's heating."""
 
-WHOLE_SCENES: Final = ("one place", "apart")
+WHOLE_SCENES: Final = ("one place", "displaced")
 SHORT: Final = 8.0  # time from which a call is measured once, not twice [s]
 
 LONGEST_WHOLE: Final = 900.0  # time of one thread from which a whole frame is left out [s]
@@ -107,7 +107,7 @@ def separate(counts: xr.DataArray, workers: int = 1) -> xr.Dataset:
 
 
 def solver(counts: xr.DataArray, cameras: str) -> Callable[[], xr.Dataset]:
-    """Call of `solve`, before cameras apart with the shift of the reflections found beforehand."""
+    """Call of `solve`, for displaced cameras with a reflection shift that was found before."""
     capture, response = counts.to_dataset(), _response()
     apart = "shift" in CAMERAS[cameras]
     shift = alignment.reflection_shift(capture, response) if apart else None
@@ -184,8 +184,8 @@ def peak_memory() -> float:
 
 def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
     """Yield the head of a table and a row for each call."""
-    times = ("us a pixel", "frames/s of 640x512, two cores, from it", "measured")
-    yield ("call", "cameras", *times, "peak memory", "error", "95 % intervals")
+    times = ("us per pixel", "640x512 frames/s on two cores, computed", "the same, measured")
+    yield ("call", "cameras", *times, "peak memory", "error", "intervals that hold")
     for (function, cameras), call in calls.items():
         rate = 2 * FRAMES / (call.pixel * math.prod(WHOLE))
         whole = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"]
@@ -271,13 +271,14 @@ MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the def
 """Marks around the default call's figures in docs/benchmarks.md."""
 
 DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
-pixels, {frames} frames, two bands. `separation.separate` is the default call; `solve` works pixel
-by pixel, and for displaced cameras its time does not include the shift of the reflections. Times
-are processor times of one thread, after a first call that compiles; errors are medians over the
-unflagged pixels. Frames of 640x512 are one capture, timed by the clock, with two threads.
+pixels, {frames} frames, two bands. `separation.separate` is the default call. `solve` works pixel
+by pixel; for displaced cameras its time does not include the search for the reflection shift. Times
+are processor times of one thread, after a first call that compiles. Errors are medians over the
+unflagged pixels; 95 % intervals hold if they contain the truth. Measured frames/s are by wall clock
+for one capture with two threads.
 
 {machine}.
-Load average at the start: {busy:.1f}; on a loaded computer, times by the clock are too long.
+Load average at the start: {busy:.1f}; on a loaded computer, wall-clock times are too long.
 
 {table}
 """
@@ -293,9 +294,9 @@ Load average at the start: {busy:.1f}. All captures are simulated.
 
 ## Every method
 
-Processor time of one thread, {frames} frames, two bands, the largest number of pixels that takes
-less than {longest:.0f} s. A sample: of the shortest and of the longest capture, of {few} pixels.
-Bands: of {pixels} pixels, over the time of two.
+Processor time of one thread, for {frames} frames of two bands and the largest number of pixels that
+takes less than {longest:.0f} s. The time per sample is that of the shortest and the longest capture
+of {few} pixels. The last column compares 3 and 4 bands with two, for {pixels} pixels.
 
 {methods}
 """
@@ -318,8 +319,8 @@ def table(default: str, times: Times, busy: float) -> str:
 
 def methods(times: Times) -> str:
     """Table of the methods' times, by pixel, by sample and by band."""
-    heads = ("method", "us a pixel", "over `subspace`", "of pixels", "ns a sample", "of frames")
-    lines: list[tuple[str, ...]] = [(*heads, "3, 4 bands over 2")]
+    costs = ("us per pixel", "relative to `subspace`", "pixels", "ns per sample", "frames")
+    lines: list[tuple[str, ...]] = [("method", *costs, "3, 4 bands relative to 2")]
     of_pixels = {method: times[method, "pixels"] for method in outside.METHODS}
     cost = {method: found[max(found)] / max(found) for method, found in of_pixels.items()}
     for method, seconds in cost.items():

@@ -131,7 +131,7 @@ def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
         paper = "-" if row.published is None else f"{row.published:g}{_after(row.unit)}"
         here = ", ".join(texts) or "-"
         if row.reference is not None:
-            paper, here = (f"{text} (for {row.reference:g})" for text in (paper, here))
+            paper, here = (f"{text} (reference {row.reference:g})" for text in (paper, here))
         yield (row.place, row.quantity, paper, here, row.data, row.verdict(numbers))
 
 
@@ -147,7 +147,7 @@ def rows() -> tuple[Row, ...]:
 
 def _terms() -> Iterator[Row]:
     for term, value in REDUCTIONS.items():
-        names, quantity = (f"{term}: reduction [%]",), f"error saved by the {term} term"
+        names, quantity = (f"{term}: reduction [%]",), f"error removed by adding the {term} term"
         yield Row("Table 1", quantity, "06_optimiser", names, value, "%", "value", 10.0)
 
 
@@ -178,7 +178,7 @@ def _scenes() -> Iterator[Row]:
             names = (f"{scene}: error of {method} [%]",)
             judged = "error" if method in _ROLES else "no"
             ours = ("08_twins", names, error, "%")
-            yield Row("Fig. 6", quantity, *ours, judged, note="another scene, no target")
+            yield Row("Fig. 6", quantity, *ours, judged, note="another scene, not compared")
 
 
 _ROLES: Final = {"subspace": "emissivities unknown", "calibrated": "emissivities calibrated"}
@@ -220,7 +220,7 @@ _LAST: Final = (
     *(
         Row(
             "section 5.2",
-            f"emissivity, unknown less calibrated: {scene}, {band} \N{MICRO SIGN}m".replace(
+            f"emissivity, estimated minus calibrated: {scene}, {band} \N{MICRO SIGN}m".replace(
                 "_", " "
             ),
             "08_twins",
@@ -242,27 +242,26 @@ _LAST: Final = (
     ),
     Row(
         "Fig. 5",
-        "finger print: share of its warmth that is found as emission; "
-        "finger reflection: share of it that is found as reflection",
+        "share of a finger print found as emission, of a finger's reflection found as reflection",
         "08_twins",
         tuple(f"{name}: share found [1]" for name in ("fingerprint", "fingers")),
         labels=("print", "reflection"),
     ),
     Row(
         "Fig. 6",
-        "coffee pot: map of the reflection, correlation with the authors'",
+        "coffee pot: correlation of the reflection map with the authors' map",
         "12_published",
         ("coffeepot_map_correlation",),
     ),
     Row(
         "Fig. 6",
-        "glass plate: the same",
+        "glass plate: correlation of the reflection map with the authors' map",
         "12_published",
         ("glass-plate_map_correlation",),
     ),
     Row(
         "Fig. 7",
-        "residual of the Sakuma-Hattori curve, and of the line, 0 to 75 \N{DEGREE SIGN}C",
+        "residual of the Sakuma-Hattori curve and of a line, 0 to 75 \N{DEGREE SIGN}C",
         "01_calibration",
         ("residual_8-14_K", "linear_residual_8-14_K"),
         unit="K",
@@ -272,14 +271,14 @@ _LAST: Final = (
     ),
     Row(
         "Fig. 8",
-        "ablation over noise: the noise terms' share at the highest level",
+        "error removed by adding the noise term, at the highest noise",
         "06_optimiser",
         ("noise: reduction at the highest noise [%]",),
         unit="%",
     ),
     Row(
         "Fig. 9",
-        "median condition number of 8-14 \N{MICRO SIGN}m with each filter",
+        "median condition number of 8-14 \N{MICRO SIGN}m and each filter",
         "02_emissivity",
         tuple(f"condition_8-14_{name}" for name in _PAIRS),
         judged="lowest",
