@@ -5,16 +5,19 @@ gradient of its mean:
 
 .. math:: r(t) = \sum_b w_b \, s_b(t) \cdot \nabla \bar z_b
 
-Rapid motion is told by what is left of the combination beside the object, frame by frame: least
-squares over all pixels, with a prior for s, as cameras on one support move alike. Slow motion the
-object takes up; where only one band's image moves, its reflections h move against those of the
-first band, beside a delay of the clocks:
+Rapid motion is told frame by frame from what smooth functions of time leave of the combination, at
+the ratio with which each pixel leaves least: Gauss-Newton steps over windows of the image, with a
+prior for s, as cameras on one support move alike. Slow motion the object takes up: the deviations
+hold what is expected of it, from the motion in the next octave of time. Where only one band's image
+moves slowly, its reflections h move against those of the first band, beside a delay of the clocks:
 
 .. math:: h_b / k_b - h_1 = s_b(t) \cdot \nabla h_1 + \tau(t) \, \partial_t h_1
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from itertools import product
+from typing import Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -22,26 +25,36 @@ from scipy.ndimage import binary_erosion
 from scipy.ndimage import shift as shifted
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, empty, quotient, release
+from dbthermal._arrays import Array, Mask, empty, quotient, release
+from dbthermal.schema import Status
 from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import (
     Misfit,
     Reading,
     Whole,
-    object_weights,
-    reflected,
     smooth_functions,
 )
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
-_COMMON, _APART = 1.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
-# Mean square of a motion over its variance, from which it is undone, and undone further: of 10^5
-# frames without motion none has a mean over 250 of more than 1.5; rapid heat feigns up to 7.4 in
-# eight scenes at random, and a shake of 0.2 pixel shows 27 or more.
-_SURE, _FURTHER = 10.0, 1.5
+_COMMON, _APART = 3.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
+# Square of a motion over its variance by a jackknife of windows, from which it is undone. Slow: see
+# below. Rapid motion, median over the frames: at most 2 without any, 9 to 28 of 0.3 pixel.
+_SURE, _SHAKEN = 10.0, 5.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
-_SEEN: Final = 1e-6  # share of the largest eigenvalue, below which a motion is not seen
+# Of rapid motion: pixels of a window at most and around it [pixel], steps at most, the longest
+# [pixel], and their rms that ends them [pixel].
+_SIDE, _AROUND, _TURNS, _STEP, _SETTLED = 32, 6, 6, 2.0, 0.02
+_SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
+# Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
+# counts half.
+_RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
+_HALF: Final = 4.0
+_DISTURBED: Final = (
+    Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
+) | Status.NONPHYSICAL_EMISSIVITY  # flags that motion brings about
+_MANY: Final = 0.1  # share of the pixels that have them
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. By
 # the square above a drift of one pixel shows 34 or more, 31 plain scenes at most 9; 30 of 24x32
 # pixels, with half the windows, up to 93, but of less than 0.06 pixel.
@@ -54,7 +67,7 @@ class Stabilised:
 
     capture: xr.Dataset
     motion: Array  # of each band's image (band, time, axis) [pixel]
-    rapid: bool  # seen in what a separation leaves, or in its object
+    slow: Array  # expected motion that is left (axis) [pixel]
 
     @property
     def sentence(self) -> str:
@@ -65,6 +78,15 @@ class Stabilised:
         )
         return f"The image moved, by {sizes} pixel (rms), which was undone."
 
+    def detail(self, inputs: Inputs, result: xr.Dataset) -> Array:
+        """Deviation (y, x) [K] of the object's signal by the motion that is left."""
+        curve, film = inputs.curves[inputs.bands[0]], result["object_temperature"].values
+        sound = np.isfinite(film).any(axis=0)
+        mean = np.full(sound.shape, np.nan)
+        mean[sound] = curve.signal(np.nanmean(film[:, sound], axis=0, dtype=np.float64))
+        slopes = np.gradient(without_gaps(np.nan_to_num(mean), sound))
+        return np.asarray(np.hypot(slopes[0] * self.slow[0], slopes[1] * self.slow[1]))
+
 
 def stabilise(
     corrected: xr.Dataset,
@@ -74,48 +96,178 @@ def stabilise(
     before: Array | None = None,
 ) -> Stabilised | None:
     """Move each frame back by the cameras' motion, beside one found before; None without motion."""
-    shape = corrected["counts"].shape
-    steps, least = np.zeros((shape[0], shape[1], 2)), _SURE if before is None else _FURTHER
-    if misfit.common(result["status"].values == 0):
-        steps += _rapid(inputs, result, least)
-    rapid = bool(np.any(steps))
-    steps += _slow(inputs, misfit)
-    motion = np.asarray(steps if before is None else steps + before)
+    shape, status = corrected["counts"].shape, result["status"].values
+    steps, slow = np.zeros((*shape[:2], 2)), np.zeros(2)
+    disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
+    if before is None and (disturbed or misfit.common(status == 0)):
+        steps = _rapid(corrected, inputs)
+        slow = _expected(inputs, steps.mean(axis=0))
+    steps = steps + _slow(inputs, misfit)
+    motion = steps if before is None else steps + before
     if not np.any(steps) or np.sqrt(np.mean(motion**2, axis=(1, 2)).max()) < _LEAST:
         return None
     counts, good = empty(shape, np.float32), good_pixels(inputs)
+    y, x = np.ogrid[: shape[2], : shape[3]]
+    middle = 0.5 * (np.array(shape[2:]) - 1.0)
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
-        for frame, image, step in zip(film, moved, path, strict=True):
+        for frame, image, (down, right) in zip(film, moved, path, strict=True):
             valid = good & np.isfinite(image)
-            whole = shifted(without_gaps(image, valid), step, order=3, mode="nearest")
+            whole = shifted(without_gaps(image, valid), (down, right), order=3, mode="nearest")
             frame[:] = np.where(valid, whole, image)
+            # What was outside of the image was not seen.
+            outside = np.abs(y - down - middle[0]) > middle[0] + _LEAST
+            outside = outside | (np.abs(x - right - middle[1]) > middle[1] + _LEAST)
+            frame[outside & good] = np.nan
         release()
-    return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion, rapid)
+    return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion, slow)
 
 
-def _precision(count: int) -> Array:
-    """Inverse covariance of the motion (band, axis) of so many bands, by its prior."""
-    prior = _COMMON**2 * np.ones((count, count)) + _APART**2 * np.eye(count)
-    return np.kron(np.linalg.inv(prior), np.eye(2))
+def _expected(inputs: Inputs, path: Array) -> Array:
+    """Motion (axis) [pixel] in the smooth functions, by that (time, axis) in the next octave."""
+    time = inputs.capture["time"].values.astype(np.float64)
+    order = min(HIGHEST_ORDER, time.size // 4)
+    octave = smooth.polynomial_basis(time, 2 * order)[:, order:]
+    return np.asarray(np.sqrt(np.sum((octave.T @ path) ** 2, axis=0) / time.size))
 
 
-def _rapid(inputs: Inputs, result: xr.Dataset, least: float) -> Array:
-    """Motion (band, time, axis) [pixel] in what a separation leaves; zero without any."""
-    count, frames = len(inputs.bands), result.sizes["time"]
-    size = 2 * count
-    form, forces = np.zeros((frames, size, size)), np.zeros((frames, size))
-    weights = object_weights(inputs, result)[inputs.bands]
-    for rows in inputs.blocks:
-        _add_equations(inputs, result, weights[:, rows], rows, form, forces)
-    # Is there any?
-    level, axes = np.linalg.eigh(form)
-    pull = np.einsum("tba,tb->ta", axes, forces)
-    seen = level > _SEEN * level[:, -1:]
-    square = np.sum(quotient(pull**2, level * seen, 0.0), axis=0) / np.maximum(seen.sum(axis=0), 1)
-    if not np.any(square > least):
-        return np.zeros((count, frames, 2))
-    steps = np.linalg.solve(form + _precision(count), forces[..., np.newaxis])
-    return np.swapaxes(steps.reshape(-1, count, 2), 0, 1)[np.argsort(inputs.bands)]
+class _Window(NamedTuple):
+    """A window of the image, with what lies around it."""
+
+    films: Array  # signals (band, frame, y, x) [K]
+    used: Mask  # pixels of the window itself, without a flag (y, x)
+
+
+class _Changes(NamedTuple):
+    """What smooth functions of time leave in the pixels of a window, and their gradients."""
+
+    rapid: Array  # (band, frame, pixel) [K]
+    slopes: Array  # of the slow image (band, axis, function, pixel) [K / pixel]
+
+
+def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
+    """Motion (band, time, axis) [pixel] of images that move rapidly; zero without any."""
+    films, bands = corrected["counts"], inputs.bands
+    motion = np.zeros((*films.shape[:2], 2))
+    frames = np.isfinite(films.values).any(axis=(0, 2, 3))
+    windows = list(_windows(films, inputs, frames))
+    basis = smooth_functions(inputs, frames)
+    prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
+    precision = np.kron(np.linalg.inv(prior), np.eye(2))
+    path, places = np.zeros((len(bands), len(basis), 2)), range(1, len(bands))
+    for turn in range(_TURNS):
+        changes = [_changes(window, path, basis) for window in windows]
+        if turn < _SEARCHED:  # motion hides the ratios until most of it is undone
+            ratios = [_ratios(inputs, changes, place, basis) for place in places]
+        pairs = [
+            _equations(inputs, changes, ratio, place, basis, _REPEATS)
+            for place, ratio in zip(places, ratios, strict=True)
+        ]
+        form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
+        whole = form.sum(axis=0) + precision
+        steps = _solved(whole, force.sum(axis=0))
+        # Is there any? Without each window of the image in turn, a jackknife.
+        less = _solved(whole - form, force.sum(axis=0) - force)
+        variance = np.var(less, axis=0) * (len(less) - 1)
+        if turn == 0 and not np.any(np.median(quotient(steps**2, variance, 0.0), axis=0) > _SHAKEN):
+            return motion
+        steps = np.swapaxes(steps.reshape(-1, len(bands), 2), 0, 1)
+        path += np.clip(steps, -_STEP, _STEP)
+        if np.sqrt(np.mean(steps**2)) < _SETTLED:
+            break
+    motion[np.ix_(bands, frames)] = path
+    return motion
+
+
+def _solved(form: Array, force: Array) -> Array:
+    return np.asarray(np.linalg.solve(form, force[..., np.newaxis])[..., 0])
+
+
+def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Window]:
+    """Yield windows of the image, of some frames (time), without gaps."""
+    good = good_pixels(inputs)
+    sides = []
+    for size in good.shape:
+        side = max(1, min(_SIDE, size // _WINDOWS))
+        starts = np.linspace(0, size - side, min(_WINDOWS, size)).astype(int)
+        sides.append([slice(start, start + side) for start in starts])
+    for y, x in product(*sides):
+        around = tuple(slice(max(0, it.start - _AROUND), it.stop + _AROUND) for it in (y, x))
+        used = np.zeros(good.shape, dtype=bool)
+        used[y, x] = good[y, x]
+        counts = films.values[..., around[0], around[1]][inputs.bands][:, frames]
+        signals = np.empty(counts.shape)
+        for signal, film, band in zip(signals, counts, inputs.bands, strict=True):
+            for frame, image in zip(signal, inputs.curves[band].linearise(film), strict=True):
+                valid = good[around] & np.isfinite(image)
+                frame[:] = without_gaps(image - inputs.curves[band].reference, valid)
+        yield _Window(signals, used[around])
+
+
+def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
+    """Rapid changes of a window whose frames are moved by a path (band, frame, axis) [pixel]."""
+    films = window.films
+    if path.any():
+        films = np.empty_like(films)
+        for place in np.ndindex(path.shape[:2]):
+            shifted(window.films[place], path[place], films[place], order=3, mode="nearest")
+    maps = np.einsum("tj,btyx->bjyx", basis[:, :_SLOW], films)
+    sides = [np.gradient(maps, axis=it) if maps.shape[it] > 1 else 0.0 * maps for it in (2, 3)]
+    signals = films[:, :, window.used]
+    slopes = np.stack(sides, axis=1)[..., window.used]
+    return _Changes(signals - basis @ (basis.T @ signals), slopes)
+
+
+def _ratios(inputs: Inputs, changes: list[_Changes], place: int, basis: Array) -> list[Array]:
+    """Ratio (pixel) of each window with which a pixel leaves least, of a band and the first one."""
+    trials = []
+    for ratio in _RATIOS:
+        same = [np.full(change.rapid.shape[2], ratio) for change in changes]
+        trials.append(_equations(inputs, changes, same, place, basis, 1)[2])
+    return [_RATIOS[np.argmin(energies, axis=0)] for energies in zip(*trials, strict=True)]
+
+
+def _equations(
+    inputs: Inputs,
+    changes: list[_Changes],
+    ratios: list[Array],
+    place: int,
+    basis: Array,
+    repeats: int,
+) -> tuple[Array, Array, list[Array]]:
+    """Normal equations (window, frame, ...) of the motion, by a band and the first one.
+
+    At ratios (pixel) of each window; and what that leaves (pixel), its energies over those of
+    noise, by which a pixel weighs less.
+    """
+    noise, course = inputs.noise[inputs.bands], basis[:, :_SLOW]
+    combinations = []
+    for (rapid, slopes), ratio in zip(changes, ratios, strict=True):
+        weights = np.zeros((len(noise), ratio.size))
+        weights[0], weights[place] = -1.0, 1.0 / ratio
+        null = rapid[place] / ratio - rapid[0]
+        deviation = np.sqrt((noise[place] / ratio) ** 2 + noise[0] ** 2)
+        slope = slopes * (weights / deviation)[:, np.newaxis, np.newaxis]
+        combinations.append((null / deviation, slope.reshape(2 * len(noise), _SLOW, -1)))
+    energies = [np.mean(null**2, axis=0) for null, _ in combinations]
+    for _ in range(repeats):
+        forms, forces = list[Array](), list[Array]()
+        for (null, slope), energy in zip(combinations, energies, strict=True):
+            weighted = slope / (1.0 + energy / _HALF)
+            form = np.tensordot(weighted, slope, (2, 2))
+            forms.append(np.einsum("tj,tk,ajbk->tab", course, course, form, optimize=True))
+            pull = np.tensordot(weighted, null, (2, 1))
+            pull -= pull @ basis @ basis.T
+            forces.append(np.einsum("tj,ajt->ta", course, pull))
+        form, force = np.array(forms), np.array(forces)
+        ridge = np.eye(form.shape[-1]) / _COMMON**2
+        steps = _solved(form.sum(axis=0) + ridge, force.sum(axis=0))
+        moved = np.einsum("ta,tj->taj", steps, course).reshape(len(steps), -1)
+        energies = []
+        for null, slope in combinations:
+            explained = moved @ slope.reshape(moved.shape[1], -1)
+            left = null - explained + basis @ (basis.T @ explained)
+            energies.append(np.mean(left**2, axis=0))
+    return form, force, energies
 
 
 def _slow(inputs: Inputs, misfit: Misfit) -> Array:
@@ -189,34 +341,3 @@ def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Ar
         size = course.shape[1] * 3
         equations.append((np.reshape(forms, (-1, size, size)), np.reshape(forces, (-1, size))))
     return equations
-
-
-def _add_equations(
-    inputs: Inputs, result: xr.Dataset, weights: Array, rows: slice, form: Array, forces: Array
-) -> None:
-    """Add the normal equations of all bands' motion over some rows, by frame, in place."""
-    _, signals, films, frames, pixels, gain = reflected(inputs, result, rows)
-    weights = weights.reshape(len(signals), -1)
-    used = pixels & (weights[0] != 0.0)
-    basis = smooth_functions(inputs, frames)
-    # Gradients of the image, which changes slowly; a side of one pixel shows no motion.
-    shape = (_SLOW, len(films), rows.stop - rows.start, result.sizes["x"])
-    images = np.einsum("tj,btp->jbp", basis[:, :_SLOW], signals).reshape(shape)
-    whole = pixels.reshape(shape[2:])
-    for image in images.reshape(-1, *images.shape[2:]):
-        image[:] = without_gaps(image, whole)
-    sides = [np.gradient(images, axis=it) if shape[it] > 1 else 0.0 * images for it in (2, 3)]
-    slopes = np.stack(sides, axis=2)
-    slopes = slopes.reshape(_SLOW, len(signals), 2, -1) * weights[:, np.newaxis]
-    slopes = slopes[..., used].reshape(_SLOW * 2 * len(signals), -1)
-    noise = inputs.noise[inputs.bands, np.newaxis] * gain
-    weighted = slopes / np.sum((weights * noise)[:, used] ** 2, axis=0)
-    remainder = np.einsum("bp,btp->tp", weights[:, used], films[..., used])
-    pull = weighted @ remainder.T
-    pull -= pull @ basis @ basis.T
-    # In each frame the gradients are sums over these functions of time.
-    course = basis[:, :_SLOW]
-    forces[frames] += np.einsum("tj,jbt->tb", course, pull.reshape(_SLOW, -1, len(course)))
-    products = (weighted @ slopes.T).reshape(_SLOW, 2 * len(signals), _SLOW, -1)
-    form[frames] += np.einsum("tj,tk,jbkc->tbc", course, course, products, optimize=True)
-    release()

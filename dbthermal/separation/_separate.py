@@ -43,9 +43,8 @@ _UNEXPLAINED: Final = (
     "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
     "small."
 )
-# Rounds in which motion is undone, and what must be left at most, of what was left before.
-_ROUNDS, _BETTER = 3, 0.8
-_KEPT: Final = 0.9  # share of the pixels without a flag that bands of one blur must keep
+_ROUNDS: Final = 3  # in which motion is undone
+_KEPT: Final = 0.9  # share of the pixels without a flag that a mended capture must keep
 _NOT_COMPLETED: Final = (
     "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
     f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
@@ -185,19 +184,20 @@ def _mended(
 
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
-    capture, motion, sentences = original, None, []
-    outcome = measured, misfit = once(capture)
+    capture, motion, sentences, left = original, None, list[str](), np.zeros(())
+    measured, misfit = once(capture)
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
         if steady is None or retry is None:
             break
-        # Of rapid motion less is left; slow motion is in the object, which is to stay measured.
-        fails = _measured(retry[0]) < _KEPT * _measured(measured)
-        if retry[1].size > _BETTER * misfit.size if steady.rapid else fails:
+        if _measured(retry[0]) < _KEPT * _measured(measured):
             break
         capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
-        outcome = measured, misfit = retry
+        measured, misfit = retry
+        left = np.hypot(left, steady.detail(measured.inputs, measured.result))
+    misfit = replace(misfit, change=np.hypot(misfit.change, left))
+    outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
     retry = None if alike is None else once(alike.capture)
     if (
