@@ -538,11 +538,22 @@ info result.zarr/status -> an array. Must be the store that it is in: 'result.za
 report result.zarr -o x.html --region 0 900 0 4 -> Invalid rows 0 to 900, columns 0 to
 report {STORES} nuc.zarr -o x.html -> Invalid 3 stores beside 'result.zarr'. Must be its capture
 explore response.zarr -o x.ipynb -> Invalid result 'response.zarr' of stage 'response'.
-explore result.zarr nuc.zarr -o x.ipynb -> Missing variable 'counts' in the capture
+explore result.zarr nuc.zarr -o x.ipynb -> Invalid capture 'nuc.zarr' of stage 'correction'
+report result.zarr response.zarr aligned.zarr -o x.html -> Exchanged with the response
+report result.zarr -o x.pdf -> Invalid output 'x.pdf'. Must end in '.html'
+separate aligned.zarr response.zarr -o result2 -> Invalid output 'result2'. Must end in '.zarr'
 export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
 export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
-separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> Must be one for each
+separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
+ -> Must be one for each
+separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid number 'nan'
+plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
+calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
+calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
+demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
+info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
+info folder -> Invalid folder 'folder', no zarr. Must be files: folder/.*.tif
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
@@ -598,6 +609,8 @@ def mistaken(results: Path) -> Path:
     mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    (results / "noise.tif").write_bytes(bytes(range(50)))
+    (results / "folder").mkdir()
     return results
 
 
