@@ -118,7 +118,7 @@ def test_commands_and_one_call_agree(
 def test_a_response_of_another_integration_time() -> None:
     """Cameras apart whose noise is not as stated: all steps take the same band for the quietest."""
     truth, raw, correction, response = recorded((24, 40), 4, (3.0, 0.0), 1)
-    noise = response["noise"] * xr.where(response["band"] == "9.5", 0.02, 1.0)
+    noise = response["noise"].where(response["band"] != "9.5", 0.02 * response["noise"])
     options: dict[str, Any] = {"registration": None, "aligning": {"offset": 0.0}}
     with pytest.warns(UserWarning, match="The noise of the capture, which is used, is"):
         result = separate_capture(raw, correction, response.assign(noise=noise), **options)

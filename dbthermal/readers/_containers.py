@@ -225,7 +225,7 @@ def _check_pieces(array: Any, path: Path) -> None:
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
     if not any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
-        raise ValueError(f"Invalid folder '{path}', no zarr. Must be files: {path}/*.tif.")
+        raise ValueError(f"Invalid folder '{path}', no whole zarr. Must be files: {path}/*.tif.")
     deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         # Each array by its metadata, of which consolidated ones are a copy that may be old.

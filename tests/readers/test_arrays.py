@@ -262,7 +262,7 @@ def test_what_is_no_file_of_arrays(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(bytes(range(200, 250)))
     with pytest.raises(ValueError, match=f"Invalid '{name}': of no format, by its first bytes"):
         read(tmp_path / name)
-    with pytest.raises(ValueError, match=r"Invalid folder '.*', no zarr\. Must be files: .*\.tif"):
+    with pytest.raises(ValueError, match=r"Invalid folder '.*', no whole zarr.* files: .*\.tif"):
         read(tmp_path)
 
 
@@ -279,7 +279,7 @@ def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Damaged 'b\.zarr': .*pickle"):
         read(path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"Invalid folder '.*empty', no zarr"):
+    with pytest.raises(ValueError, match=r"Invalid folder '.*empty', no whole zarr"):
         read(tmp_path / "empty")
 
 
