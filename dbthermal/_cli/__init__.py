@@ -96,7 +96,7 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     for path in targets:
         place = path.resolve()
         if any(place in (used, *used.parents) or used in place.parents for used in taken):
-            label = f"Invalid output '{path}': it is another one, or it is read"
+            label = f"Invalid output '{path}': an input or another output lies there"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
         if path.exists() and not getattr(options, "overwrite", path.is_dir()):

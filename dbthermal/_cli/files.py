@@ -188,7 +188,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
-        scene = warned(scene, f"The capture has {frames} frames. {rule}.")
+        scene = warned(scene, f"Too few frames of the capture: {frames}. {rule}.")
     return saved(scene, options)
 
 
