@@ -130,7 +130,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """
     # Check the inputs, before the work.
     context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
-    schema.band_positions(corrected, [], "the corrected")
+    schema.check_corrected(corrected)
     names = [str(band) for band in corrected["band"].values]
     completable = check_stated(names, workers, prior, surroundings)
     if outdoors and background_ratio is not None:
