@@ -553,6 +553,7 @@ calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
+import folder --bands a b --clock 10 -o x.zarr -> Invalid 1 files: which are of the second camera
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'

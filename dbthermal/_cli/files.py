@@ -143,7 +143,7 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
-    if len(paths) == 1 and paths[0].is_dir():
+    if len(paths) == 1 and (paths[0].suffix == ".zarr" or _is_store(paths[0])):
         return opened(paths[0])
     number = len(options.bands or "ab")
     cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
