@@ -21,6 +21,7 @@ from typing import Any, Final, NoReturn
 
 from dbthermal import __version__
 from dbthermal._cli import (
+    finite,
     kelvin,
     kelvin_or_path,
     lines_of,
@@ -47,7 +48,7 @@ _EXTRAS: Final = {
 _KINDS: Final[dict[str, Any]] = {
     "path": Path,
     "name": str,
-    "number": float,
+    "number": finite,
     "n": int,
     "temperature": kelvin,
     "point": kelvin_or_path,
@@ -232,10 +233,16 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit."""
-        listed = ", ".join(re.findall(r"(?m)^--[\w-]+", _ARGUMENTS))
+        names = ", ".join(self._option_string_actions)
         for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
-            message += suggestion(f"'{wrong}': choose from {listed}")
+            message += suggestion(f"'{wrong}': choose from {names}")
         super().error(message + suggestion(message))
+
+    def parse_known_args(self, *arguments: Any, **named: Any) -> Any:
+        """Options; the command refuses those that it does not know."""
+        if (found := super().parse_known_args(*arguments, **named))[1]:
+            self.error(f"unrecognized arguments: {' '.join(found[1])}")
+        return found
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -312,7 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         status, reason = 1, _reason(error, options)
         for name in vars(options):  # an argument of Python is named as the option is
-            reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
+            reason = re.sub(f" {name}=(?!b') ?", f" --{name.replace('_', '-')} ", reason)
         reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
         reason += suggestion(reason)
     print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
@@ -377,9 +384,7 @@ def _command(module: str, function: str) -> Any:
 def _completion() -> str:
     """Function of bash, and of zsh, for names of commands and options; files are left to it."""
     commands = next(action.choices for action in _parser()._actions if action.choices)
-    named = {
-        name: " ".join(parser._option_string_actions) for name, parser in dict(commands).items()
-    }
+    named = {name: " ".join(it._option_string_actions) for name, it in dict(commands).items()}
     cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
     return f"""_dbthermal() {{
   local words='{" ".join(named)}'

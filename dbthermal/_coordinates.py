@@ -39,9 +39,8 @@ def laid_on(
             raise ValueError(f"Invalid size {array.sizes[dim]} of '{dim}' of {label}. {rule}.")
         if dim in array.coords and dim in reference.coords:
             _require_same(array[dim].values, reference[dim].values, f"'{dim}' of {label}", of)
-    return array.assign_coords(
-        {dim: reference[dim].variable for dim in shared if dim in reference.coords}
-    )
+    places = {dim: reference[dim].variable for dim in shared if dim in reference.coords}
+    return array.assign_coords(places)
 
 
 def _require_same(
@@ -60,7 +59,5 @@ def _require_same(
         equal = values.astype(str) == reference.astype(str)
     if not equal.all():
         first = int(np.argmin(equal))
-        raise ValueError(
-            f"Invalid {label}: {values[first]} at position {first}, where that of {of} is "
-            f"{reference[first]}. Must be the same."
-        )
+        label = f"Invalid {label}: {values[first]} at position {first}, where that of {of} is"
+        raise ValueError(f"{label} {reference[first]}. Must be the same.")

@@ -276,9 +276,8 @@ def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
     """Return where samples at an end, out of those near it, are more than noise puts there."""
     share = min(1.0, np.sqrt(2.0 * np.pi) * band.chance / _END)
     # The first sample makes the end; bdtrc is the tail of the binomial distribution.
-    return np.asarray(
-        bdtrc(np.asarray(number) - 2, np.asarray(near, dtype=np.intp) - 1, share) < _FALSE_ALARM
-    )
+    chance = bdtrc(np.asarray(number) - 2, np.asarray(near, dtype=np.intp) - 1, share)
+    return np.asarray(chance < _FALSE_ALARM)
 
 
 def repeated(counts: npt.NDArray[Any], valid: Mask) -> Mask:

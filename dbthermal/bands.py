@@ -101,9 +101,8 @@ class Band:
             inverse = inverse - step
             if np.all(np.abs(step) <= 4.0 * np.finfo(np.float64).eps * inverse):
                 return 1.0 / inverse
-        raise RuntimeError(
-            f"No convergence in band '{self.name}' after {_NEWTON_STEPS} Newton steps."
-        )
+        number = f"{_NEWTON_STEPS} Newton steps"
+        raise RuntimeError(f"No convergence in band '{self.name}' after {number}.")
 
     def _integral(self, function: planck.Spectral, temperature: Array) -> Array:
         # One pass a node instead of a (..., node) array: whole images fit in memory.

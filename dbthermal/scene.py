@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 import xarray as xr
 
 from dbthermal import _rows, store
+from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk, release
 from dbthermal.alignment import _joint as joint
 from dbthermal.alignment import align, register
@@ -21,6 +22,8 @@ from dbthermal.alignment._resampling import on_one_clock
 from dbthermal.alignment._views import registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
+from dbthermal.separation._inputs import decide_noise
+from dbthermal.separation._separate import check_stated
 from dbthermal.store._whole import check_place
 
 __all__ = ["separate_capture"]
@@ -111,11 +114,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> bool(abs(error).median() < 0.3)  # K
     True
     """
-    options: dict[str, Any] = {
-        "correcting": correcting,
-        "aligning": aligning,
-        "separating": separating,
-    }
+    options: dict[str, Any] = {"correcting": correcting, "aligning": aligning}
+    options["separating"] = separating
     for step, values in zip(_STEPS, options.values(), strict=True):
         _check_options(step, values)
     # With a target: the same call with its films on disk, saved row by row.
@@ -133,8 +133,12 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     # Correct each camera, register the views, and synchronise the bands.
     lazy = made_on_disk()
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
+    names = [str(name) for name in corrected["band"].values]
+    check_stated(names, **separating)
     if registration is not None and "transform" not in aligning:
         aligning = {**aligning, "transform": register(corrected, model=registration)}
+    curves = responses.curves(response, names)
+    response, _ = decide_noise(corrected, response, curves)  # of which all steps know the quietest
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     del corrected
     result = separate(aligned, response, **{"reflection_shift": field, **separating})
@@ -150,13 +154,9 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
     if not isinstance(options, Mapping):
         kind = type(options).__name__
         raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
-    by_name = [
-        parameter
-        for parameter in signature(step).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    ]
     hidden = {"lazy", "reflection_shift"} if step is align else {"lazy"}
-    names = [parameter.name for parameter in by_name if parameter.name not in hidden]
+    by_name = [it for it in signature(step).parameters.values() if it.kind is it.KEYWORD_ONLY]
+    names = [it.name for it in by_name if it.name not in hidden]
     for option in options:
         if option not in names:
             raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {names}.")
@@ -175,7 +175,7 @@ def _aligned(
     options = {name: value for name, value in options.items() if value is not None}
     if "transform" in options:
         corrected = registered(corrected, options.pop("transform"), lazy=bool(options.get("lazy")))
-    scale = Scale.of_response(response, [str(name) for name in corrected["band"].values])
+    scale = Scale.of_response(response, corrected["band"].values.tolist())
     # Stated clocks: the shift alone is estimated.
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)

@@ -449,12 +449,12 @@ def test_nothing_is_overwritten(results: Path) -> None:
     done(results, *command, "--overwrite", "--no-shutter")
     assert store.open_dataset(results / "again.zarr").attrs["gain_offset_corrected"] == 1
     line = refused(results, "correct", "scene.zarr", "-o", "scene.zarr", "--overwrite")
-    assert "it is read. Must be another place" in line
+    assert "lies there. Must be another place" in line
     line = refused(results, "correct", "scene.zarr", "nuc.zarr", "-o", "scene.zarr/inner.zarr")
-    assert "it is read. Must be another place" in line
+    assert "lies there. Must be another place" in line
     twice = ["-o", "new.zarr", "--correction-output", "./new.zarr"]
     line = refused(results, "calibrate", "--blackbody", "scene.zarr", *twice)
-    assert "Invalid output 'new.zarr': it is another one" in line
+    assert "Invalid output 'new.zarr': an input or another output lies there" in line
     assert not (results / "new.zarr").exists()
 
 
@@ -524,7 +524,7 @@ SWEEP = f"calibrate {' '.join(STATED)} --at 5C a5.tif b5.tif --at 70C a70.tif b7
 STORES = "result.zarr aligned.zarr response.zarr"
 ROWS = f"""
 {ONE.replace("a.", "warm.").replace("b.", "cold.")} --offset 0 -o h.zarr -> Warning: The medians
-{ONE.replace("a.", "five.").replace("b.", "few.")} -o 5.zarr --offset 0 -> Warning: .* has 5 frames
+{ONE.replace("a.", "five.").replace("b.", "few.")} -o 5.zarr --offset 0 -> Warning: Too few frames
 {ONE} -o x.zarr -> Unknown dates of the recordings.* --offset \\[s\\].
 {SWEEP} --at 278C a25.tif b25.tif -> Invalid levels .* Must rise with its temperature
 {ONE} --offset 3 -o later.zarr; correct later.zarr nuc.zarr -o late.zarr; align late.zarr
@@ -538,11 +538,23 @@ info result.zarr/status -> an array. Must be the store that it is in: 'result.za
 report result.zarr -o x.html --region 0 900 0 4 -> Invalid rows 0 to 900, columns 0 to
 report {STORES} nuc.zarr -o x.html -> Invalid 3 stores beside 'result.zarr'. Must be its capture
 explore response.zarr -o x.ipynb -> Invalid result 'response.zarr' of stage 'response'.
-explore result.zarr nuc.zarr -o x.ipynb -> Missing variable 'counts' in the capture
+explore result.zarr nuc.zarr -o x.ipynb -> Invalid capture 'nuc.zarr' of stage 'correction'
+report result.zarr response.zarr aligned.zarr -o x.html -> Exchanged with the response
+report result.zarr -o x.pdf -> Invalid output 'x.pdf'. Must end in '.html'
+separate aligned.zarr response.zarr -o result2 -> Invalid output 'result2'. Must end in '.zarr'
 export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
 export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
-separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x -> Must be one for each
+separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
+ -> Must be one for each
+separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid number 'nan'
+plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
+calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
+calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
+demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
+info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
+import folder --bands a b --clock 10 -o x.zarr -> Invalid 1 files: which are of the second camera
+info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
@@ -598,6 +610,8 @@ def mistaken(results: Path) -> Path:
     mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    (results / "noise.tif").write_bytes(bytes(range(50)))
+    (results / "folder").mkdir()
     return results
 
 

@@ -174,6 +174,7 @@ CASES: list[tuple[Call, str]] = [
     (lambda: store.open_dataset(NOTHING), "path"),
     (lambda: readers.flir(NOTHING), "path"),
     (lambda: separation.separate(NOTHING, CAMERA), "corrected"),
+    (lambda: separation.separate(cast(Any, "a.zarr"), CAMERA), "of type str. Must be a Dataset"),
     (lambda: separation.separate(CAPTURE, CAMERA, workers=cast(Any, 1.5)), "workers 1.5.*whole"),
     (lambda: separation.solve(RAW, CAMERA), "correct_capture.*correction.corrected_by"),
     (lambda: solve("magic"), r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated'"),

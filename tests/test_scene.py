@@ -115,6 +115,29 @@ def test_commands_and_one_call_agree(
         assert "reflection_shift" in one_call
 
 
+def test_a_response_of_another_integration_time() -> None:
+    """Cameras apart whose noise is not as stated: all steps take the same band for the quietest."""
+    truth, raw, correction, response = recorded((24, 40), 4, (3.0, 0.0), 1)
+    noise = response["noise"].where(response["band"] != "9.5", 0.02 * response["noise"])
+    options: dict[str, Any] = {"registration": None, "aligning": {"offset": 0.0}}
+    with pytest.warns(UserWarning, match="The noise of the capture, which is used, is"):
+        result = separate_capture(raw, correction, response.assign(noise=noise), **options)
+    assert result.attrs["reference_band"] == "8-14"
+    good, rms, hold = accuracy(result, truth)
+    print(f"no flag {good:.3f}, RMS {rms:.3f} K, hold {hold:.3f}")
+    assert good > 0.5
+    assert rms < 0.15  # [K]
+    assert hold > 0.9
+
+
+@pytest.mark.parametrize("wrong", [{"workers": 0}, {"prior": "gold"}, {"surroundings": 9000.0}])
+def test_what_cannot_be_is_refused_before_the_work(wrong: dict[str, Any]) -> None:
+    """Options of the last step come before the clocks, which of a still scene cannot be found."""
+    _, raw, correction, response = recorded((24, 40), 0, None, 1)
+    with pytest.raises(ValueError, match=r"workers 0|Unknown prior 'gold'|surroundings \[K\] 9000"):
+        separate_capture(raw, correction, response, registration=None, separating=wrong)
+
+
 def test_a_target_has_the_same_result(tmp_path: Path) -> None:
     """Films on disk, from a lazy capture to a store, of cameras apart, are those in memory."""
     truth, raw, fitted, response = recorded((24, 36), 6, (2.4, 1.2), 5)

@@ -54,12 +54,19 @@ def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]
     }
 
 
+def finite(text: str) -> float:
+    """Finite number of a text."""
+    if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?", text, re.IGNORECASE):
+        raise ArgumentTypeError(f"Invalid number '{text}'. Must be digits, with a decimal point.")
+    return float(text)
+
+
 def kelvin(text: str) -> float:
     """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
     try:
-        value, unit = float(text[:-1]), text[-1:]
+        value, unit = finite(text[:-1]), text[-1:]
         temperature = value + {"C": 273.15, "K": 0.0}[unit]
-    except (KeyError, ValueError) as error:
+    except (KeyError, ArgumentTypeError) as error:
         rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"
         raise ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
     if unit == "C" and value > _UNIT_DOUBTED:
@@ -81,6 +88,7 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
     written = ("output", "folder")
     targets = [value for name, value in arguments if name.endswith(written) and value]
+    end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
     for path in sources:
         if not path.exists():
             raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
@@ -88,11 +96,13 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     for path in targets:
         place = path.resolve()
         if any(place in (used, *used.parents) or used in place.parents for used in taken):
-            label = f"Invalid output '{path}': it is another one, or it is read"
+            label = f"Invalid output '{path}': an input or another output lies there"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
         if path.exists() and not getattr(options, "overwrite", path.is_dir()):
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+        if "output" in options and not path.name.endswith(end):
+            raise ValueError(f"Invalid output '{path}'. Must end in '{end}'.")
     return sources, targets
 
 

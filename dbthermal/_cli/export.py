@@ -127,10 +127,8 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     drawing.draw_image(figure, axes[0, 0], image, label, f"{label} [{unit}]")
     figure.suptitle(drawing.provenance_note(result).removeprefix(", "))
     store.save_figure(figure, path, provenance(options))
-    return {
-        "shape": list(image.shape),
-        "at": {str(k): str(v.values) for k, v in image.coords.items()},
-    }
+    at = {str(k): str(v.values) for k, v in image.coords.items()}
+    return {"shape": list(image.shape), "at": at}
 
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
@@ -149,7 +147,9 @@ def _shown(options: argparse.Namespace, stages: str) -> list[xr.Dataset]:
     if len(options.shown) > 2:
         label = f"{len(options.shown)} stores beside '{options.result}'"
         raise ValueError(f"Invalid {label}. Must be its capture, and the cameras' response.")
-    return [*staged(options, result=stages), *map(opened, options.shown)]
+    beside = dict(zip(("capture", "response"), options.shown, strict=False))
+    kinds = {name: {"capture": "corrected|capture"}.get(name, name) for name in beside}
+    return staged(argparse.Namespace(result=options.result, **beside), result=stages, **kinds)
 
 
 def report(options: argparse.Namespace) -> dict[str, Any]:
@@ -158,11 +158,9 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
 
     result, *shown = _shown(options, "separated")
     regions = _regions(result, options.region)
-    named = {"title": options.title} if options.title else {}
-    named |= {"logo": options.logo} if options.logo else {}
-    named["author"] = ", ".join(
-        filter(None, [options.author, f"reported on {datetime.now().astimezone():%Y-%m-%d}"])
-    )
+    named = {name: vars(options)[name] for name in ("title", "logo") if vars(options)[name]}
+    today = f"reported on {datetime.now().astimezone():%Y-%m-%d}"
+    named["author"] = ", ".join(filter(None, [options.author, today]))
     reporting.report(result, options.output, *shown, regions=regions, **named)
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 

@@ -135,7 +135,7 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
     every = vars(options).get("every", 1) if name == "frames" else 1
     if len(ends) > 2 or first < 0 or (end is not None and end <= first):
         label = f"Invalid --{name} {' '.join(map(str, ends))}"
-        raise ValueError(f"{label}. Must be a number, or first and end: 100 400.")
+        raise ValueError(f"{label}. Must be a number from 1, or first and end: 100 400.")
     if every < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
     return slice(first, end, every)
@@ -143,7 +143,7 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
-    if len(paths) == 1 and paths[0].is_dir():
+    if len(paths) == 1 and (paths[0].suffix == ".zarr" or _is_store(paths[0])):
         return opened(paths[0])
     number = len(options.bands or "ab")
     cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
@@ -188,7 +188,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
-        scene = warned(scene, f"The capture has {frames} frames. {rule}.")
+        scene = warned(scene, f"Too few frames of the capture: {frames}. {rule}.")
     return saved(scene, options)
 
 
@@ -282,24 +282,24 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
     aligned = {"without --correction, for the capture is aligned": "register offset"}
     names = "surroundings outdoors background_ratio prior workers"
     completing = {"with --method: 'dbthermal complete'": names}
-    return aligned | (
-        completing if options.method else {"without --method calibrated": "emissivity"}
-    )
+    alone = completing if options.method else {"without --method calibrated": "emissivity"}
+    return aligned | alone
 
 
 def _of_files(options: argparse.Namespace) -> dict[str, str]:
     """Options that neither the files of a command nor its other source take."""
     # Kinds of the files; a folder alone is a store, unless it is read as another program's.
     kinds, foreign = set[str](), options.command == "info" and options.unit is not None
-    for group in options.at if options.command == "calibrate" else [options.files]:
-        paths = [leaf for leaf in leaves(group) if isinstance(leaf, Path) and leaf != PLUS]
-        if foreign or len(paths) != 1 or not paths[0].is_dir():
+    groups = options.at if options.command == "calibrate" else [options.files]
+    listed = [[it for it in leaves(group) if is_source("", it)] for group in groups]
+    for paths in listed:
+        if foreign or len(paths) != 1 or not _is_store(paths[0]):
             kinds |= {kind_of(path, options) for path in paths}
     # Sources of a calibration in place of files, and what each leaves without effect.
     sources = {"blackbody": "frames", "sweep": ""}
     sources["maker"] = " ".join(["frames", "correction_output", *ACCURACY])
     stated = [source for source in sources if vars(options).get(source)]
-    if options.command == "calibrate" and not (options.at or stated):
+    if not (stated or (listed and all(listed))):
         return {}
     taken = {"bands", "offset"} if kinds else set[str]()
     for kind in kinds:

@@ -81,10 +81,8 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
     if devices.session.blackbody is None:
         summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
     else:
-        set_temperature = partial(_set_blackbody, devices)
-        summaries = protocols.record_sweep(
-            devices, folder, set_temperature=set_temperature, preview=show
-        )
+        ask = partial(_set_blackbody, devices)
+        summaries = protocols.record_sweep(devices, folder, set_temperature=ask, preview=show)
     _say("")
     return summaries
 

@@ -43,9 +43,8 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `calibrate`."""
     stated = [name for name in ("at", "blackbody", "sweep", "maker") if getattr(options, name)]
     if len(stated) != 1:
-        raise ValueError(
-            f"Invalid sources {stated}. Must be --at, --blackbody, --sweep or --maker."
-        )
+        label = f"Invalid sources {stated}" if stated else "Missing source"
+        raise ValueError(f"{label}. Must be one of --at, --blackbody, --sweep or --maker.")
     # The constants of the cameras' maker.
     if options.maker:
         response = calibration.maker_response(files.opened(options.maker).attrs.get("files", {}))
@@ -71,7 +70,6 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
 
 def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
-    # A store, or the recordings of a sweep.
     frames = files.between(options, "frames", most=_SWEEP)
     if options.blackbody:
         return files.opened(options.blackbody).load()
@@ -109,17 +107,14 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
     by_maker = bool(records) and all("file_planck_R1" in attrs for attrs in records)
     if by_camera == bool(options.correction) and (by_camera or not by_maker):
         sources = "both a file and --corrected-by-camera" if by_camera else "neither"
-        raise ValueError(
-            f"Invalid correction of gain and offset: {sources}. Must be the file of 'dbthermal "
-            "calibrate --correction-output nuc.zarr' or, only if the cameras correct gain and "
-            "offset themselves, --corrected-by-camera."
-        )
+        rule = "Must be the file of 'dbthermal calibrate --correction-output nuc.zarr' or, only if "
+        rule += "the cameras correct gain and offset themselves, --corrected-by-camera"
+        raise ValueError(f"Invalid correction of gain and offset: {sources}. {rule}.")
     gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
     named = accepted(correction.correct_capture, options)
     shutter = not options.no_shutter
-    return files.saved(
-        correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named), options
-    )
+    corrected = correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named)
+    return files.saved(corrected, options)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:

@@ -93,8 +93,7 @@ def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
 
 def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
-    values = flags.values
-    shares = {"no_flag": float((values == 0).mean())}
+    shares = {"no_flag": float((flags.values == 0).mean())}
     for name in str(flags.attrs["flag_meanings"]).split():
         share = float(schema.has_flag(flags, name).mean())
         shares |= {name: share} if share else {}

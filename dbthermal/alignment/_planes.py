@@ -90,8 +90,7 @@ class Scale:
 
 def _noise_factor(corrected: xr.Dataset) -> Array:
     """Noise (band) [1] over that before the alignment."""
-    whole = np.ones(corrected.sizes["band"])
-    return np.asarray(corrected["noise_factor"].values if "noise_factor" in corrected else whole)
+    return np.asarray(corrected.get("noise_factor", np.ones(corrected.sizes["band"])))
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ class Capture:
                 f"at least {SMALLEST} of each to match reflections."
             )
         slopes, noise = scale.slopes, scale.noise_of(corrected)
-        order = np.argsort(noise, kind="stable")
+        order = np.argsort(noise / _noise_factor(corrected), kind="stable")
         valid = np.ones(counts.shape[2:], dtype=bool)
         if "status" in corrected:
             valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
@@ -295,7 +294,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     """
     frames = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
     noise = scale.noise_of(corrected)
-    bands, time = np.argsort(noise, kind="stable")[:2], corrected["time"].values[frames]
+    bands = np.argsort(noise / _noise_factor(corrected), kind="stable")[:2]
+    time = corrected["time"].values[frames]
     slopes = scale.slopes[bands].astype(np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
     counts, (rows, columns) = corrected["counts"].variable[:, frames], _measured(corrected)
 

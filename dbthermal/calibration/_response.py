@@ -180,7 +180,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     }
     for name in drifts:
         values = _numbers.real_numbers(name, known[name])
-        if values.shape not in {(), (len(names),)}:
+        if values.shape not in {(), (1,), (len(names),)}:
             rule = f"Must be one for all bands, or {len(names)}"
             raise ValueError(f"Invalid {name} of shape {values.shape}. {rule}.")
         known[name] = np.broadcast_to(values, len(names)).copy()

@@ -220,7 +220,7 @@ def _copies(counts: xr.DataArray) -> Mask:
     if moving.sum() < _MINIMUM_PIXELS:
         label = f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the"
         rule = f"Must be at least {_MINIMUM_PIXELS}"
-        raise ValueError(f"{label} {moving.size} pixels looked at change. {rule}.")
+        raise ValueError(f"{label} {moving.size} pixels change in {len(sample)} frames. {rule}.")
     repeats = np.zeros(counts.sizes["time"], dtype=bool)
     # Compare the whole image where the sample of pixels repeats.
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))

@@ -108,7 +108,10 @@ def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[An
     What the libraries raise until the file is closed names it as damaged.
     """
     kind = formats.format_of(path)
-    form = f"a whole {kind}" if kind in _OPENED else ".npy, .npz, HDF5, NetCDF or zarr"
+    if not kind:
+        rule = "Must be .npy, .npz, HDF5, NetCDF, MATLAB or zarr"
+        raise ValueError(f"Invalid '{path.name}': of no format, by its first bytes. {rule}.")
+    form = f"a whole {kind}" if kind in _OPENED else "a whole .npy or .npz"
     state = "Damaged" if kind in {*_OPENED, "zip"} else "Invalid"
     stack.enter_context(recordings.damage_named(f"{state} '{path.name}'", form))
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
@@ -221,6 +224,8 @@ def _check_pieces(array: Any, path: Path) -> None:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
+    if not any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+        raise ValueError(f"Invalid folder '{path}', no whole zarr. Must be files: {path}/*.tif.")
     deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         # Each array by its metadata, of which consolidated ones are a copy that may be old.
@@ -242,9 +247,8 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
             raise ValueError(f"Invalid serializer '{kind}' of '{name}'. Must be bytes alone.")
         missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
         if array.ndim == 3 and missing:
-            raise ValueError(
-                f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
-            )
+            label = f"Missing {missing} chunks of '{name}' of '{path.name}'"
+            raise ValueError(f"{label}. Must be whole.")
     return arrays
 
 

@@ -120,7 +120,7 @@ def check_memory(shape: Sequence[int], memory: float, name: str, stored: float =
     """Raise ValueError if counts (time, y, x) take more memory than allowed, or the file holds."""
     check_number(memory, "memory")
     if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
-        raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
+        raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x), not 0.")
     frames, height, width = map(int, shape)
     needed = 2 * (frames + 3) * height * width  # 3 while one is decoded
     label = f"{frames} frames of {height} x {width} pixels take {needed:.3g} bytes"
@@ -260,10 +260,9 @@ def recording(
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
     if _of_8_bits(counts):
-        raise ValueError(
-            f"Invalid counts of '{name}': they have 8 bits, alone or spread over two bytes, as in "
-            "pictures or with automatic gain. Must be 16-bit counts of the detector: record those."
-        )
+        form = "they have 8 bits, alone or spread over two bytes, as in pictures or automatic gain"
+        label = f"Invalid counts of '{name}': {form if counts.any() else 'all are 0'}"
+        raise ValueError(f"{label}. Must be 16-bit counts of the detector: record those.")
     # Times, which must rise where they are known.
     (stamped,) = np.nonzero(np.isfinite(seconds))
     steps = np.diff(seconds[stamped])
@@ -276,10 +275,9 @@ def recording(
     stands = ~np.isin(np.arange(seconds.size), stamped)
     exposed = np.where(stands, np.nan, seconds)
     if stamped.size < min(2, seconds.size):
-        raise ValueError(
-            f"Unknown times in '{name}': {stamped.size} of {seconds.size} frames have one. Must be "
-            "given: clock= is the frame rate [Hz], or the time of each frame [s]."
-        )
+        label = f"Unknown times in '{name}': {stamped.size} of {seconds.size} frames have one"
+        rule = "Must be given: clock= is the frame rate [Hz], or the time of each frame [s]"
+        raise ValueError(f"{label}. {rule}.")
     # Flags of frames without a time, and behind a gap.
     flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
     flags[stands] |= FileFlag.TIME_STANDS.value

@@ -78,8 +78,9 @@ def raw(
         if value < 0:
             raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
     sizes = np.asarray(shape)
-    if sizes.shape != (2,) or sizes.dtype.kind not in "iu" or sizes.min() < 1:
-        rule = "Must be rows and columns, two whole numbers"
+    frame = 2.0 * np.prod(sizes, dtype=float) if sizes.dtype.kind in "iu" else np.nan  # [byte]
+    if sizes.shape != (2,) or not frame < 2**31 or sizes.min() < 1:
+        rule = "Must be rows and columns, two whole numbers, of less than 2 GB"
         raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
@@ -88,10 +89,9 @@ def raw(
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
     if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
-        rule = (
-            "Must be 16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
-        )
-        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
+        rule = "16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
+        label = f"Invalid counts of '{name}': no images of 16-bit numbers"
+        raise ValueError(f"{label}. Must be {rule}.")
     if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")

@@ -253,7 +253,7 @@ def _pages(path: Path) -> list[_Page]:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
             raise ValueError(f"{label}. Must end within its {size}.")
         return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
-    if stated not in {0, len(pages)}:
+    if stated not in {0, 1, len(pages)}:  # 1 of a file to which frames were appended
         label = f"Truncated TIFF '{path.name}': {len(pages)} pages"
         raise ValueError(f"{label}. Must be the {stated} that its description states.")
     return pages
@@ -309,9 +309,8 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     if not math.prod(shape) or not (total == 2 * math.prod(shape) if not codec else rows):
         raise ValueError(f"Truncated: {total} bytes of page {number}. Must be 2 x {shape}.")
     if codec and len(spans) != -(-shape[0] // rows):
-        raise ValueError(
-            f"Truncated: {len(spans)} strips of page {number}. Must be of {rows} rows."
-        )
+        label = f"{len(spans)} strips of page {number}"
+        raise ValueError(f"Truncated: {label}. Must be of {rows} rows.")
     form = (codec, rows, predictor == 2)
     return _Page(path, shape, 1, order, spans, _no_data(page, number), *form)
 

@@ -56,9 +56,8 @@ class Stream(NamedTuple):
         size += len(self.stream.read(1))
         if size != counts.nbytes:
             actual = f"{size} bytes or more of counts in '{self.name}'"
-            raise ValueError(
-                f"Truncated or damaged {actual}. Must be {counts.nbytes}, by its header."
-            )
+            rule = f"Must be {counts.nbytes}, by its header"
+            raise ValueError(f"Truncated or damaged {actual}. {rule}.")
         return counts.T if self.by_columns else counts
 
 

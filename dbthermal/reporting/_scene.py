@@ -106,6 +106,8 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     ...     "<h1>Wall</h1>" in page.read_text("utf-8")
     True
     """
+    if Path(path).suffix != ".html":
+        raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
     view = View(data, capture, response)
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
@@ -173,8 +175,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         script=Markup(script.read_text("utf-8")),
         json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
     )
-    if Path(path).suffix != ".html":
-        raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
     store.save_text(text, path, made_by)
 
 

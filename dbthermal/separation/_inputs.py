@@ -176,12 +176,13 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         dims = ("time",), ("y", "x"), ("time", "y", "x")
         used = _selection(capture, mask, "mask", "b", *dims)
         capture = capture.assign(mask=used.drop_vars(list(used.coords)))
-    response, noise = _noise(capture, response, curves)
+    response, noise = decide_noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
     value, covariance = _known_emissivity(
         corrected, emissivity, emissivity_std, emissivity_covariance
     )
-    order = [int(band) for band in np.argsort(noise, kind="stable")]
+    # The quietest camera leads, however resampling or a blur took noise from the others.
+    order = np.argsort(noise / _noise_factor(capture), kind="stable").tolist()
     return Inputs(
         response=response,
         response_kind=response_kind,
@@ -249,7 +250,7 @@ def _selection(
     return laid_on(array, capture, f"the {name}", "the capture")
 
 
-def _noise(
+def decide_noise(
     capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]
 ) -> tuple[xr.Dataset, Array]:
     """Noise (band) [K], and the response with it, for all parts; `noise_source` says of which."""

@@ -5,12 +5,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import xarray as xr
 
-from dbthermal import alignment, schema
+from dbthermal import _numbers, alignment, schema
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
@@ -23,7 +23,7 @@ from dbthermal.separation._apart import displaced
 from dbthermal.separation._blur import equalise, sharpness
 from dbthermal.separation._budget import SKY
 from dbthermal.separation._completion.complete import Beside, filled
-from dbthermal.separation._completion.prior import stated
+from dbthermal.separation._completion.prior import stated as of_prior
 from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
@@ -129,10 +129,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """
     # Check the inputs, before the work.
     context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
-    schema.band_positions(corrected, [], "the corrected")
+    schema.check_corrected(corrected)
     names = [str(band) for band in corrected["band"].values]
-    completable = _completable(prior, names)
-    require_workers(workers)
+    completable = check_stated(names, workers, prior, surroundings)
     if outdoors and background_ratio is not None:
         raise ValueError("Invalid outdoors beside a background_ratio. State one of them.")
     response = response.assign(background_ratio_std=SKY) if outdoors else response
@@ -177,8 +176,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 
 def _mended(
-    original: xr.Dataset,
-    once: Callable[..., tuple["Measured", Misfit]],
+    original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate; again, while what is left shows that cameras move, or that their blurs differ.
 
@@ -200,11 +198,7 @@ def _mended(
     outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
     retry = None if alike is None else once(alike.capture)
-    if (
-        alike is not None
-        and retry is not None
-        and _measured(retry[0]) > _KEPT * _measured(measured)
-    ):
+    if alike and retry and _measured(retry[0]) > _KEPT * _measured(measured):
         measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
         less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
@@ -262,11 +256,16 @@ def _separated(
     return Measured(result, inputs, materials, reflection_shift, doubts)
 
 
-def _completable(prior: str | xr.DataArray | xr.Dataset | None, names: list[str]) -> bool:
-    """Tell whether a prior knows the bands; ValueError for one that is stated and does not."""
+def check_stated(
+    names: list[str], workers: int = 1, prior: Any = None, surroundings: Any = None, **_: Any
+) -> bool:
+    """Tell whether a prior knows the bands; ValueError for what is stated and cannot be."""
+    require_workers(workers)
+    if surroundings is not None:
+        _numbers.real_numbers("surroundings [K]", surroundings, _numbers.KELVIN)
     if prior is None and not FILTERS.keys() >= set(names):
         return False
-    stated(prior, names)
+    of_prior(prior, names)
     return True
 
 

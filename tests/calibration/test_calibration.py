@@ -311,6 +311,12 @@ def test_impossible_accuracy_is_refused(stated: dict[str, Any], message: str) ->
         calibration.fit_response(blackbody(), **stated)
 
 
+def test_one_drift_of_a_list_is_of_all_bands() -> None:
+    """As an option of a command has it, which may be stated for each band."""
+    listed = calibration.fit_response(blackbody(), offset_std=[0.3])
+    xr.testing.assert_identical(listed, calibration.fit_response(blackbody(), offset_std=0.3))
+
+
 def test_accuracy_is_never_zero_unless_stated() -> None:
     """A sweep states what is usual, and more drift where its counts are off the curve."""
     usual = calibration.fit_response(blackbody())

@@ -152,7 +152,10 @@ BARE: Any = np.zeros((2, 60), bool)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: find_shutter(still() * 0), "Invalid counts of band '8-14': 0 of the 480"),
+        (
+            lambda: find_shutter(still() * 0),
+            "Invalid counts of band '8-14': 0 of the 480 pixels change in 60 f",
+        ),
         (lambda: mark_shutter(still().astype(int)), "Must be floating"),
         (lambda: mark_shutter(still(count=50), EVENTS), r"of frames 59 to 59. Must lie in \[0, 49"),
         (lambda: mark_shutter(still(), EVENTS.drop_vars("renewed")), "Missing 'renewed' of the ev"),

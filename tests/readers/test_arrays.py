@@ -70,6 +70,11 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (FRAMES.assign_attrs(scale_factor=0.01), {}, "Invalid 'scale_factor' of 'array'"),
         (np.ma.masked_equal(scene(), scene()[1, 2, 3]), {}, "Missing counts in 'array': masked"),
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
+        (
+            scene()[:0],
+            {},
+            r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0",
+        ),
         (scene().tolist(), {}, "Invalid dtype object of 'array'"),
         *(
             (scene(), {"memory": m}, "memory.*Must be a finite number")
@@ -251,6 +256,16 @@ def test_arrays_in_other_files_are_refused(tmp_path: Path) -> None:
         read(tmp_path / "b.h5")
 
 
+@pytest.mark.parametrize("name", ["a.npy", "a.h5", "a.mat"])
+def test_what_is_no_file_of_arrays(tmp_path: Path, name: str) -> None:
+    """Bytes of no format are so named, whatever the suffix; a folder of pictures is no zarr."""
+    (tmp_path / name).write_bytes(bytes(range(200, 250)))
+    with pytest.raises(ValueError, match=f"Invalid '{name}': of no format, by its first bytes"):
+        read(tmp_path / name)
+    with pytest.raises(ValueError, match=r"Invalid folder '.*', no whole zarr.* files: .*\.tif"):
+        read(tmp_path)
+
+
 def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     """A store of pickled objects is not read, and a chunk that is missing is no image of zeros."""
     path = write(tmp_path / "a.zarr", "zarr3")
@@ -264,7 +279,7 @@ def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Damaged 'b\.zarr': .*pickle"):
         read(path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"Damaged 'empty': .*Must be a whole zarr"):
+    with pytest.raises(ValueError, match=r"Invalid folder '.*empty', no whole zarr"):
         read(tmp_path / "empty")
 
 

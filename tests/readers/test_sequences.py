@@ -129,6 +129,8 @@ def test_raw(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
         bare(path, shape=(32, 24))
     path.write_bytes(counts.astype(">u2").tobytes())
+    with pytest.raises(ValueError, match=r"Invalid shape \(1000000, .* of less than 2 GB"):
+        bare(path, shape=(1_000_000, 1_000_000))
     with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
         bare(path, shape=(0, 32))
     with pytest.raises(ValueError, match="Invalid frame_header -1"):

@@ -54,6 +54,16 @@ def test_stacks_come_back(tmp_path: Path, form: str) -> None:
     assert found.attrs["byte_order"] == ("big" if form == "big-endian" else "little")
 
 
+def test_frames_appended_one_by_one(tmp_path: Path) -> None:
+    """Each has a description of one image; one of another size is named."""
+    for image in scene():
+        write(path := tmp_path / "a.tif", image, append=True)
+    assert_array_equal(read(path).counts, scene())
+    write(path, scene()[0, :9], append=True)
+    with pytest.raises(ValueError, match=r"page of \(9, 32\) in 'a.tif'\. Must be \(24, 32\)"):
+        read(path)
+
+
 def test_one_file_a_frame(tmp_path: Path) -> None:
     """Files in the order of time; an order of text is noticed."""
     paths = [tmp_path / f"frame{number}.tif" for number in (8, 9, 10)]
@@ -210,6 +220,7 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
         (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
         (scene() // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
         (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
+        (0 * scene(), {}, "Invalid counts of 'a.tif': all are 0. Must be 16-bit counts"),
         (scene() // np.uint16(256) * np.uint16(256) + np.uint16(9), {}, "they have 8 bits"),
         (FOUR, {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
         (FOUR, BANDS, r"Invalid axes of \[2, 2\] images"),

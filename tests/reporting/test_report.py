@@ -162,7 +162,7 @@ def test_words_stay_words(tmp_path: Path) -> None:
 def test_bad_input_is_named(tmp_path: Path) -> None:
     """Another ending, and data without a temperature, are refused before anything is written."""
     with pytest.raises(ValueError, match=r"scene\.pdf'\. Must end in '\.html'"):
-        dbthermal.report(scene(), tmp_path / "scene.pdf")
+        dbthermal.report("nothing.zarr", tmp_path / "scene.pdf")  # looked at before the result
     with pytest.raises(ValueError, match="'object_temperature'"):
         dbthermal.report(scene().drop_vars("object_temperature"), tmp_path / "scene.html")
     regions: Any = {"left": (10, 40, 5, 30)}

@@ -10,7 +10,7 @@ from captures import emissivity_of
 from scenes import GLASS, RIG, field, judged, painted
 from scipy.sparse import csr_array
 
-from dbthermal import separation, simulation
+from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.separation._apart.equations import Equations
 from reproduction.experiments.pictures import Picture, smooth_shift
@@ -113,6 +113,18 @@ def test_bad_field_is_a_clear_error(what: str) -> None:
     capture = capture.assign_coords(x=np.arange(48.0))
     with pytest.raises(ValueError, match=message):
         separation.solve(capture, RIG.response(), reflection_shift=bad)
+
+
+def test_the_quietest_camera_stays_the_reference() -> None:
+    """Whatever noise a blur or resampling takes from another band; the field's is the same."""
+    shift = smooth_shift((24, 48), 2.5, 0.0)
+    capture = painted(1, picture=replace(SMALL, shape=(24, 48)), time=TIME, shift=shift).capture
+    smooth = capture.assign(noise_factor=("band", [1.0, 0.01]))
+    response = RIG.response().assign_attrs(noise_source="response")
+    result = separation.solve(smooth, response, reflection_shift=field(shift))
+    assert result.attrs["reference_band"] == "8-14"
+    found = alignment.reflection_shift(smooth, response)
+    assert found.attrs["reference_band"] == "8-14"
 
 
 def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:
