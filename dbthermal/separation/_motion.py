@@ -148,19 +148,22 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
     """Motion (band, time, axis) [pixel] of images that move rapidly; zero without any."""
     films, bands = corrected["counts"], inputs.bands
     motion = np.zeros((*films.shape[:2], 2))
-    frames = np.isfinite(films.values).any(axis=(0, 2, 3))
+    seen = [[np.isfinite(image).any() for image in film] for film in films.values]
+    frames = np.asarray(np.all(seen, axis=0))
+    if np.count_nonzero(frames) < inputs.method.minimum_frames:
+        return motion
     windows = list(_windows(films, inputs, frames))
     basis = smooth_functions(inputs, frames)
     prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
     precision = np.kron(np.linalg.inv(prior), np.eye(2))
-    path, places = np.zeros((len(bands), len(basis), 2)), range(1, len(bands))
+    path = np.zeros((len(bands), len(basis), 2))
     for turn in range(_TURNS):
         changes = [_changes(window, path, basis) for window in windows]
         if turn < _SEARCHED:  # motion hides the ratios until most of it is undone
-            ratios = [_ratios(inputs, changes, place, basis) for place in places]
+            ratios = [_ratios(inputs, changes, place, basis) for place in range(1, len(bands))]
         pairs = [
             _equations(inputs, changes, ratio, place, basis, _REPEATS)
-            for place, ratio in zip(places, ratios, strict=True)
+            for place, ratio in enumerate(ratios, 1)
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
         whole = form.sum(axis=0) + precision
@@ -174,7 +177,11 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         path += np.clip(steps, -_STEP, _STEP)
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
-    motion[np.ix_(bands, frames)] = path
+    # The motion of lost frames lies between those before and after.
+    places = np.flatnonzero(frames)
+    for band, axis in product(range(len(bands)), range(2)):
+        course = np.interp(np.arange(frames.size), places, path[band, :, axis])
+        motion[bands[band], :, axis] = course
     return motion
 
 
