@@ -29,12 +29,7 @@ from dbthermal._arrays import Array, Mask, empty, quotient, release
 from dbthermal.schema import Status
 from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import (
-    Misfit,
-    Reading,
-    Whole,
-    smooth_functions,
-)
+from dbthermal.separation._misfit import Misfit, Reading, Whole, smooth_functions
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 _COMMON, _APART = 3.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
@@ -51,10 +46,9 @@ _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of th
 # counts half.
 _RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
 _HALF: Final = 4.0
-_DISTURBED: Final = (
-    Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
-) | Status.NONPHYSICAL_EMISSIVITY  # flags that motion brings about
-_MANY: Final = 0.1  # share of the pixels that have them
+# Flags that motion brings about, and the share of the pixels that have them.
+_DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
+_MANY: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. By
 # the square above a drift of one pixel shows 34 or more, 31 plain scenes at most 9; 30 of 24x32
 # pixels, with half the windows, up to 93, but of less than 0.06 pixel.
@@ -69,14 +63,14 @@ class Stabilised:
     motion: Array  # of each band's image (band, time, axis) [pixel]
     slow: Array  # expected motion that is left (axis) [pixel]
 
-    @property
-    def sentence(self) -> str:
+    def sentence(self, *, undone: bool) -> str:
         """Sentence on how far the image of each band moved."""
         sizes = ", ".join(
             f"'{band}' {np.sqrt(np.mean(path**2)):.2f}"
             for band, path in zip(self.capture["band"].values, self.motion, strict=True)
         )
-        return f"The image moved, by {sizes} pixel (rms), which was undone."
+        outcome = "was undone" if undone else "could not be undone: intervals may be too small"
+        return f"The image moved, by {sizes} pixel (rms), which {outcome}."
 
     def detail(self, inputs: Inputs, result: xr.Dataset) -> Array:
         """Deviation (y, x) [K] of the object's signal by the motion that is left."""
@@ -84,8 +78,15 @@ class Stabilised:
         sound = np.isfinite(film).any(axis=0)
         mean = np.full(sound.shape, np.nan)
         mean[sound] = curve.signal(np.nanmean(film[:, sound], axis=0, dtype=np.float64))
-        slopes = np.gradient(without_gaps(np.nan_to_num(mean), sound))
+        slopes = _gradients(without_gaps(np.nan_to_num(mean), sound))
         return np.asarray(np.hypot(slopes[0] * self.slow[0], slopes[1] * self.slow[1]))
+
+
+def _gradients(images: Array) -> Array:
+    """Gradients (axis, ..., y, x) [1 / pixel] of images; zero across a single row or column."""
+    axes = images.ndim - 2, images.ndim - 1
+    sides = [np.gradient(images, axis=it) if images.shape[it] > 1 else 0.0 * images for it in axes]
+    return np.stack(sides)
 
 
 def stabilise(
@@ -218,9 +219,8 @@ def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
         for place in np.ndindex(path.shape[:2]):
             shifted(window.films[place], path[place], films[place], order=3, mode="nearest")
     maps = np.einsum("tj,btyx->bjyx", basis[:, :_SLOW], films)
-    sides = [np.gradient(maps, axis=it) if maps.shape[it] > 1 else 0.0 * maps for it in (2, 3)]
     signals = films[:, :, window.used]
-    slopes = np.stack(sides, axis=1)[..., window.used]
+    slopes = np.swapaxes(_gradients(maps), 0, 1)[..., window.used]
     return _Changes(signals - basis @ (basis.T @ signals), slopes)
 
 

@@ -189,9 +189,11 @@ def _mended(
         retry = None if steady is None else once(steady.capture)
         if steady is None or retry is None:
             break
-        if _measured(retry[0]) < _KEPT * _measured(measured):
+        undone = _measured(retry[0]) >= _KEPT * _measured(measured)
+        sentences = [steady.sentence(undone=undone)]
+        if not undone:
             break
-        capture, motion, sentences = steady.capture, steady.motion, [steady.sentence]
+        capture, motion = steady.capture, steady.motion
         measured, misfit = retry
         left = np.hypot(left, steady.detail(measured.inputs, measured.result))
     misfit = replace(misfit, change=np.hypot(misfit.change, left))
