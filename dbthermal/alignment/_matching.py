@@ -101,8 +101,7 @@ class Movies:
 def _whole_pixels(
     first: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """
-    Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
+    """Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
 
     Movies are in deviations of noise. Explained is a part of the others' energy in a window; the
     weight is the share that is.
@@ -138,8 +137,7 @@ def inside(places: Array, valid: Mask) -> Mask:
 
 
 def _information(movies: Movies, shift: Array) -> Information:
-    r"""
-    Information on a step of the field at each pixel, by Gauss-Newton.
+    r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
     With a ratio k for each window, the residual r of a pixel, and the slope g of the moved movie,
 
@@ -244,8 +242,7 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
 
 
 def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Array]:
-    r"""
-    Time by which the others show what the first movie shows at a shift, and its deviation [s].
+    r"""Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
     The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What
     moves one way only is shifted or late. One Newton step of both, the shift free in each window:

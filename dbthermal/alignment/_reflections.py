@@ -38,8 +38,7 @@ _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapo
 
 
 def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
-    r"""
-    Displacement between the reflections that two cameras side by side see in one surface.
+    r"""Displacement between the reflections that two cameras side by side see in one surface.
 
     A registration of the object's surface does not register what that surface mirrors. What the
     other bands show at p, the reference band, the quietest, shows at p + d(p):
@@ -203,8 +202,7 @@ def _squares(data: Information, factor: int = 1) -> Array:
 
 
 def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> Array:
-    """
-    Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
+    """Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """

@@ -35,14 +35,12 @@ _NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no noise 1.4 ti
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
-# Negative eigenvalue of a covariance that is rounding [1].
-_ROUNDED: Final = 1e-6
+_ROUNDED: Final = 1e-6  # negative eigenvalue of a covariance that is rounding [1]
 
 
 @dataclass(frozen=True)
 class Method:
-    """
-    A separation method: its functions of a tile, and its demands on the capture.
+    """A separation method: its functions of a tile, and its demands on the capture.
 
     Attributes
     ----------

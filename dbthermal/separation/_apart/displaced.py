@@ -33,13 +33,11 @@ _UNSOLVED: Final = 1e-2
 # A place so far outside of the image is still at its border, as a shift that is known may be off by
 # so much [pixel].
 _OUTSIDE: Final = 0.2
-# Weight of pixels without a value that the others may take over [1].
-_LOST_WEIGHT: Final = 0.25
+_LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that the others may take over [1]
 # Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
-# Weight below which a pixel's flags do not count [1].
-_NO_WEIGHT: Final = 1e-3
+_NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
 # Memory of samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
 
@@ -237,8 +235,7 @@ def read(
     fewest: int,
     grains: list[samples.Grain],
 ) -> tuple[Array, Mask, Bits, Array]:
-    """
-    Read some rows of the reference band, and what the others show of the same reflections.
+    """Read some rows of the reference band, and what the others show of the same reflections.
 
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
     `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
@@ -301,8 +298,7 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
-    """
-    Weights without the bad pixels, whose part the others take over; a plane stays one.
+    """Weights without the bad pixels, whose part the others take over; a plane stays one.
 
     Where that part is large the weights stay as they are.
     """

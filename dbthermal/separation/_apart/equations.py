@@ -32,12 +32,10 @@ Floats = npt.NDArray[np.floating[Any]]
 Mask = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.intp]
 
-# Share of an error that a step may leave.
-_LARGEST: Final = 0.95
+_LARGEST: Final = 0.95  # share of an error that a step may leave
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
 _MARGIN: Final = 0.02
-# Degree of the polynomial that the bend between two responses is.
-_DEGREE: Final = 4
+_DEGREE: Final = 4  # degree of the polynomial that the bend between two responses is
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,7 @@ class Equations:
         return result
 
     def solve(self, target: Floats, start: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
-        """
-        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
+        """Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
@@ -291,8 +288,7 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
 
 
 def change(inputs: Inputs, loose: Whole) -> Change:
-    """
-    Change of the reference band's signal to p of loose pixels, smoothed over time.
+    """Change of the reference band's signal to p of loose pixels, smoothed over time.
 
     So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
     no part in it.

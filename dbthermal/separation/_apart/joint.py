@@ -42,10 +42,8 @@ from dbthermal.separation._tiles import USELESS, Material
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20
 _SETTLED: Final = 1e-3
-# Change of the object [K] below which its emissivity is not told.
-_LEAST_CHANGE: Final = 0.1
-# Frames that are solved together.
-_FRAMES: Final = 8
+_LEAST_CHANGE: Final = 0.1  # change of the object [K] below which its emissivity is not told
+_FRAMES: Final = 8  # frames that are solved together
 # Frames from which it is told whether the object's gradient matters, and the share of the object's
 # deviation from which it does, in more than a few of the samples.
 _LOOKED_AT: Final = 32
@@ -193,8 +191,7 @@ def solve(
     before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
-    """
-    Solve the equations of all pixels, from a result that takes x(p) for x(r).
+    """Solve the equations of all pixels, from a result that takes x(p) for x(r).
 
     Or from one of inputs with the difference of a solution `before`. Of an object that changes
     smoothly the combination without background is that of the `maps`, at the ratios of a material,
@@ -418,8 +415,7 @@ def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
 def _factor(
     inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
 ) -> Floats:
-    """
-    Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
+    """Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 
     The `std` (2, pixel) [K] is that of a pixel alone, and of its target through the emissivity; the
     `variance` (loose) [K^2] that of the change.

@@ -53,8 +53,7 @@ _AROUND: Final = 0.125
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
-    """
-    Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
+    """Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
 
     Their variance is times the reduced chi-square about the mean of those around. A pixel whose
     model does not hold takes that mean, with the variance of the ratios around beside their mean.

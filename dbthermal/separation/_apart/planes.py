@@ -35,8 +35,7 @@ TAIL: Final = 3.0
 # Functions of the rapid changes, pixels that make them, and degree of the responses' polynomials.
 _PLANES, _SAMPLE = 128, 1024
 _DEGREE: Final = 7
-# Share of a neighbourhood without which a blurred pixel is none [1].
-_LEAST_SHARE: Final = 1e-3
+_LEAST_SHARE: Final = 1e-3  # share of a neighbourhood without which a blurred pixel is none [1]
 # Deviations of noise across the axis of the ratios from which the bands are apart.
 _APART: Final = 8.0
 _TINY: Final = float(np.finfo(np.float64).tiny)

@@ -21,10 +21,8 @@ from dbthermal.separation._tiles import Material
 Each: TypeAlias = Callable[[Inputs, Material | None], object]
 """Separates each pixel alone, into the result."""
 
-# Turns of the materials and the object of each camera's own place.
-_TURNS: Final = 2
-# What a displacement keeps of the pixels alone.
-_OBJECTS: Final = "objects"
+_TURNS: Final = 2  # turns of the materials and the object of each camera's own place
+_OBJECTS: Final = "objects"  # what a displacement keeps of the pixels alone
 
 
 def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Executor) -> None:

@@ -38,8 +38,7 @@ _WORSE: Final = 0.04
 _STEPS, _SETTLED = 8, 0.02
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
-# Where nothing bounds the fluctuation of the background: its variance [K^2].
-_VAGUE: Final = 1e6
+_VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,7 @@ _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 # Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
-# Precision of a level that a pixel does not show [1/K^2].
-_NOTHING: Final = 1e-9
+_NOTHING: Final = 1e-9  # precision of a level that a pixel does not show [1/K^2]
 
 Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`

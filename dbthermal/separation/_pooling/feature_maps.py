@@ -19,16 +19,14 @@ from dbthermal._arrays import Array, Mask, release
 from dbthermal.noise import MAD
 from dbthermal.separation._pooling.region_merging import Labels
 
-# Rows of a capture that are read at a time.
-_ROWS: Final = 64
+_ROWS: Final = 64  # rows of a capture that are read at a time
 # Standard deviation of the Gaussian window of the edge statistic, and distance of the windows'
 # centres from the pixel, to both sides [pixel].
 _BLUR: Final = 1.0
 _REACH: Final = 1
 # Edge strength [standard deviation] that a path longer by one pixel is worth.
 _COMPACTNESS: Final = 0.5
-# Share of the largest weight below which a window holds nothing [1].
-_EMPTY: Final = 1e-3
+_EMPTY: Final = 1e-3  # share of the largest weight below which a window holds nothing [1]
 
 
 def mean_signals(

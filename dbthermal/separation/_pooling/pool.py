@@ -29,8 +29,7 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 
 # Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
-# Rounds of leaving out pixels that are not of the material.
-_ROUNDS: Final = 6
+_ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
 # Share of the pixels from which those with an emissivity of their own speak for a material [1].
 _MAJORITY: Final = 0.5
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
@@ -38,8 +37,7 @@ _REACH: Final = 2
 _SINGLE: Final = 3
 # Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
 _HARDLY: Final = 0.5
-# Share of gray pixels from which their material is [1].
-_MOSTLY: Final = 0.5
+_MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of those around [1].
 _MORE: Final = 4.0
 _MORE_AROUND: Final = 1.5

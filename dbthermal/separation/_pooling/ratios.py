@@ -11,8 +11,7 @@ from dbthermal.separation._pooling import gradients
 from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Survey
 
-# Deviations beyond which a pixel is not of the material.
-_OUTLIER_SIGMAS: Final = 4.0
+_OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
 # Deviations beyond which the order of the pixels is too small for their material.
 _ORDER_SIGMAS: Final = 3.0
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].

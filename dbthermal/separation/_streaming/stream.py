@@ -36,8 +36,7 @@ _ROWS: Final = 16  # that a thread takes at once
 
 
 class Stream:
-    r"""
-    Live separation of two bands: frames in as they come, temperatures out a fixed time later.
+    r"""Live separation of two bands: frames in as they come, temperatures out a fixed time later.
 
     A history of 64 to 128 samples of each pixel, means of more and more frames, is separated by the
     method "subspace" without its pieces for rapid objects, some rows of the image at a time: it

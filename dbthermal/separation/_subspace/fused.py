@@ -70,8 +70,7 @@ class Solution(Pixels):
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
     def survey(self, sound: Mask, plain: Mask) -> Survey:
-        """
-        Survey of the pixels whose model is sound, with emissivities of those without a flag.
+        """Survey of the pixels whose model is sound, with emissivities of those without a flag.
 
         A selection by the estimate itself would bias the sum over a material.
         """
@@ -358,8 +357,7 @@ def solve(
     drift: float,
     divided: Iterable[tuple[Whole, smooth.Subspace]] | None = None,
 ) -> Solution:
-    """
-    Steps 1 to 4, where it matters again on signals with proportional reflections.
+    """Steps 1 to 4, where it matters again on signals with proportional reflections.
 
     With the limit of the background's `drift` [K]. Of all pixels, or in parts that have functions
     of their own, with the same rising ones; one part after another is taken: of a long capture the

@@ -85,8 +85,7 @@ _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_E
 # Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
 # whatever order their bands are.
 _EMITTED: Final = (0.7, 1.3)
-# Last orders of the smooth curve at which its polynomials may be too few.
-_LAST: Final = 6
+_LAST: Final = 6  # last orders of the smooth curve at which its polynomials may be too few
 # Flags of pixels in which rapid changes of the object are looked for.
 _SUSPECT: Final = np.uint32(
     Status.OBJECT_NOT_SMOOTH
@@ -108,8 +107,7 @@ _NUMBERS: Final = (smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
 
 @dataclass(frozen=True)
 class SubspaceSettings:
-    """
-    Options of the method "subspace".
+    """Options of the method "subspace".
 
     Attributes
     ----------

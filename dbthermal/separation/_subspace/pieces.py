@@ -22,8 +22,7 @@ FUNCTIONS: Final = 4
 COST: Final = 2.5
 # Functions by whose cost pieces must be better than a smooth curve to be asked for.
 _MARGIN: Final = 3.0
-# Levels of the pieces that are enough to see that pieces are better.
-_COARSE: Final = 4
+_COARSE: Final = 4  # levels of the pieces that are enough to see that pieces are better
 # Halvings after which the pieces give the axes to start from.
 STARTS: Final = (0, 2, 3, 4, 5)
 ROUNDS: Final = 4
@@ -32,8 +31,7 @@ AXES: Final = 4
 # Costs that differ by less are the same but for rounding: of two divisions the finer one is taken,
 # whose pieces may be joined, and of two ways to join pieces that of the longest.
 TIE: Final = 1e-6
-# Standard deviations between two axes that are told apart.
-APART: Final = 6.0
+APART: Final = 6.0  # standard deviations between two axes that are told apart
 
 # Time in which a sudden step is so large a share of the object's change [s].
 _AROUND: Final = 1.0
@@ -52,8 +50,7 @@ def blocks(frames: int) -> Whole:
 
 
 def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Whole) -> Mask:
-    """
-    Pixels whose smooth curve is described shorter in pieces.
+    """Pixels whose smooth curve is described shorter in pieces.
 
     Of the sums (block, pixel) [K] over `blocks` of a null residual and of the curve taken from it,
     with noise of a variance (pixel) [K^2] and the number of functions used (pixel).
@@ -111,8 +108,7 @@ def _outside(
 
 
 def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
-    """
-    Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
+    """Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
 
     Object and background change more than two bands along two lines: of the whitened signals all
     but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
@@ -127,8 +123,7 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
-    """
-    Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
+    """Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
 
     Of the functions that the lowest information criterion selects, and one more; across a known
     `axis` (2, pixel) where it is not NaN.
@@ -159,8 +154,7 @@ def _order(null_energy: Array, frames: int) -> Whole:
 
 
 def returning(signal: Array) -> Mask:
-    """
-    Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
+    """Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
 
     Of means over parts of the capture: their total variation over their range is 1 for a change
     that stays, 2 for one that comes and goes.
@@ -172,8 +166,7 @@ def returning(signal: Array) -> Mask:
 
 
 def sudden(curve: Array, std: Array, time: Array) -> Mask:
-    """
-    Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
+    """Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
 
     By more than most of its change within a second, and beyond its standard deviations; not over a
     pause of the frames.

@@ -33,8 +33,7 @@ TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 def rapid_orders(orders: int) -> Whole:
-    """
-    Two large orders (2,): that of all functions, and before it of a few less.
+    """Two large orders (2,): that of all functions, and before it of a few less.
 
     What the order of one pixel leaves of its object, unseen in its noise, adds up over the pixels
     of a material.
@@ -66,8 +65,7 @@ def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def inverse_energy(energy: Array, length: Array, freedom: Array | float) -> Array:
-    """
-    Inverse of the background's effective energy: sigma^2 of `pixel.ratios` [1/K^2].
+    """Inverse of the background's effective energy: sigma^2 of `pixel.ratios` [1/K^2].
 
     Of the energy S in the first band [K^2], the squared length of the whitened ratios [1/K^2], and
     the degrees of freedom. Infinite where the energy is not positive.
@@ -93,8 +91,7 @@ def _ratio_error(ratio: Array, noise: Array) -> Array:
 
 
 def agrees(scatter: Array, axis: Array) -> Mask:
-    """
-    Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
+    """Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
 
     Of a background along the unit vector v and white noise, the part across v is not correlated
     with that along it: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.

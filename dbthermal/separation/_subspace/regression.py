@@ -29,8 +29,7 @@ _GUESSES: Final = 60  # of the value of a rank, at most
 
 @compiled
 def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
-    """
-    Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
+    """Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
 
     By interpolation between the numbers of values below two others. The bits of such numbers, as
     whole numbers, are in the same order, and NaN above all.
