@@ -66,27 +66,19 @@ class Movies:
         noise: Array,
         freedom: float,
         factor: int,
-        whole: float = 0.0,
+        whole: float,
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = binned(valid.astype(np.float64), factor) > 0.5
-        sample = tuple(
-            index[:: max(1, index.size // _NOISE_PIXELS)] for index in np.nonzero(mostly)
-        )
+        step = max(1, np.count_nonzero(mostly) // _NOISE_PIXELS)
+        sample = tuple(index[::step] for index in np.nonzero(mostly))
         if sample[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
             usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
-        return cls(
-            splines(movies[0], BLUR),
-            [blurred(movie, BLUR) for movie in movies[1:]],
-            mostly,
-            noise / factor,
-            freedom,
-            max(whole / freedom, 1.0),
-            factor,
-        )
+        films = splines(movies[0], BLUR), [blurred(movie, BLUR) for movie in movies[1:]]
+        return cls(*films, mostly, noise / factor, freedom, max(whole / freedom, 1.0), factor)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -277,10 +269,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
-    of_parts = [
-        np.add.reduceat(np.add.reduceat(array, starts[0], axis=0), starts[1], axis=1)
-        for array in (gradient, information)
-    ]
+    of_parts = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
     std = np.sqrt((without.size - 1) * np.var(without))

@@ -1,6 +1,7 @@
 """Shift between the reflections that two cameras side by side see in one surface."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -152,12 +153,8 @@ def _coarse(
         if begin is None:
             # Whole frames, of which what is rare in a pixel's time is cut.
             half = 2 if min(level.shape) >= 2 * _START else 1
-            rough = replace(
-                level,
-                valid=binned(level.valid * 1.0, half) > 0.5,
-                noise=level.noise / half,
-                factor=factor * half,
-            )
+            mostly = binned(level.valid * 1.0, half) > 0.5
+            rough = replace(level, valid=mostly, noise=level.noise / half, factor=factor * half)
             smoothing = capture.smoothing(period)
             films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
@@ -206,11 +203,8 @@ def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> A
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    sums = [
-        gaussian_filter(array * resolved, _WIDE / level.factor, axes=(-2, -1))
-        for array in (squares, np.ones(resolved.shape))
-    ]
-    chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
+    blur = partial(gaussian_filter, sigma=_WIDE / level.factor, axes=(-2, -1))
+    chi = np.maximum(blur(squares * resolved) / np.maximum(blur(resolved * 1.0), 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
 
 

@@ -171,13 +171,12 @@ class _Plan:
 
     def of_pixels(self, **places: slice) -> "_Plan":
         """Plan with the options of some rows and columns."""
-        options = {
+        arrays = {
             name: value.isel(places, missing_dims="ignore")
-            if isinstance(value, xr.DataArray)
-            else value
             for name, value in self.options.items()
+            if isinstance(value, xr.DataArray)
         }
-        return replace(self, options=options)
+        return replace(self, options={**self.options, **arrays})
 
 
 def _separate_capture(

@@ -338,11 +338,11 @@ def _separate(
     rows: slice,
 ) -> int:
     """Separate a block of rows, or what is wanted of it, into its place; return its pixels."""
-    size = 0
+    size, options = 0, [] if inputs.settings is None else [inputs.settings]
     for cut in tiles.cut(inputs, rows, material, wanted):
         estimates = []
         for frames, pixels, tile in cut.parts:
-            estimate: Estimate = inputs.apply(inputs.method.separate, tile)
+            estimate: Estimate = inputs.method.separate(tile, *options)
             if estimate.status.size == pixels.size and not pixels.all():
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))

@@ -9,6 +9,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
 
@@ -75,11 +76,6 @@ class Displacement:
         if used.size == 0:
             return rows
         return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
-
-    @property
-    def moves(self) -> bool:
-        """Some reflection is seen at another place."""
-        return bool(self.resample.nnz > self.resample.shape[0])
 
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the pixels of some rows of the source, for those of some rows."""
@@ -203,10 +199,9 @@ def paired(
     The source is read if they are not kept; only those of a small capture are.
     """
     films, key = displacement.read, (rows.start, rows.stop)
-    every, chosen = (
-        (*key, None),
-        (*key, None if isinstance(selected, slice) else selected.tobytes()),
-    )
+    every = chosen = (*key, b"")
+    if not isinstance(selected, slice):
+        chosen = (*key, selected.tobytes())
     if chosen not in films:
         reading = films.get(every)
         if reading is None:
@@ -217,9 +212,8 @@ def paired(
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, reading = 1.0, tuple(select(film, selected) for film in reading)
-        size, held = (
-            sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
-        )
+        groups = reading, chain(*films.values())
+        size, held = (sum(film.nbytes for film in group) for group in groups)
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
             return reading
         films[chosen] = reading
@@ -242,9 +236,8 @@ def read(
     """
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
-    first = block.isel(
-        band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
-    )
+    inner = slice(rows.start - source.start, rows.stop - source.start)
+    first = block.isel(band=[reference], y=inner)
     weights = displacement.weights(rows, needed)
     used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
@@ -277,13 +270,9 @@ def read(
     good = ~quality.unusable(flags)
     if "noise_factor" in block and np.any(block["noise_factor"][second_bands] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
-        key = (rows.start, rows.stop, source.start, source.stop)
-        gain *= displacement.once(
-            key,
-            lambda: samples.resampled_noise(
-                seen[:, :, good], counts[second_bands], gain, displacement.shape[1]
-            ),
-        )
+        key, films = (rows.start, rows.stop, source.start, source.stop), counts[second_bands]
+        measure = partial(samples.resampled_noise, stated=gain, width=displacement.shape[1])
+        gain *= displacement.once(key, lambda: measure(seen[:, :, good], films))
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 

@@ -33,7 +33,8 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
     inputs.division[:] = 0  # it holds what each camera sees to rise
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
-    if inputs.method.pools and displacement.moves:
+    moves = displacement.resample.nnz > displacement.resample.shape[0]  # reflections, somewhere
+    if inputs.method.pools and moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)

@@ -82,9 +82,8 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
     The median is the background at rest, which makes no edges. 0 without a background estimate:
     that is where nothing moved; and of other pixels than those (y, x).
     """
-    share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * (
-        1.0 - result["emissivity"].values[bands[0]]
-    )
+    dark = 1.0 - result["emissivity"].values[bands[0]]
+    share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * dark
     films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
     frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
     for row in np.flatnonzero(of.any(axis=1)):
@@ -143,9 +142,8 @@ def superpixels(strength: Array, valid: Mask, spacing: int) -> Labels:
     rows, columns = (np.arange(min(spacing // 2, n - 1), n, spacing) for n in strength.shape)
     markers = np.zeros(strength.shape, dtype=np.intp)
     markers[np.ix_(rows, columns)] = 1 + np.arange(rows.size * columns.size).reshape(rows.size, -1)
-    flooded = segmentation.watershed(
-        strength, markers * valid, mask=valid, compactness=_COMPACTNESS
-    )
+    grown = {"markers": markers * valid, "mask": valid, "compactness": _COMPACTNESS}
+    flooded = segmentation.watershed(strength, **grown)
     return connected(np.where(valid, 1 + flooded, 0))
 
 

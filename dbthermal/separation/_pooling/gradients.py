@@ -121,12 +121,8 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = _powers(asked, measured, more)
     left, side = Left(residual, cost), round(np.sqrt(_TOGETHER * asked[0].size / pixels))
-    return Gradient(
-        chosen,
-        value,
-        np.einsum("pi,ij,pj->p", at, covariance, at),
-        (left, left.over_squares(measured, max(side, 1))),
-    )
+    lefts = left, left.over_squares(measured, max(side, 1))
+    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
 
 
 def spreads(fits: list[Gradient]) -> list[float]:

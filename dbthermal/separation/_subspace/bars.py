@@ -341,11 +341,7 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
     variance = 2.0 / (9.0 * max(count, 1.0))
     mean = at_changes / (null * count) if count > 0 else 1.0
     score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
-    return (
-        correlation * sqrt(LAGS * frames),
-        score,
-        _unexplained(model, record, work, common),
-    )
+    return correlation * sqrt(LAGS * frames), score, _unexplained(model, record, work, common)
 
 
 @inlined
