@@ -80,14 +80,9 @@ class Movies:
         films = splines(movies[0], BLUR), [blurred(movie, BLUR) for movie in movies[1:]]
         return cls(*films, mostly, noise / factor, freedom, max(whole / freedom, 1.0), factor)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.valid.shape[0], self.valid.shape[1]
-
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
-        return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.shape]
+        return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.valid.shape]
 
 
 def _whole_pixels(
@@ -138,7 +133,7 @@ def _information(movies: Movies, shift: Array) -> Information:
     less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
     and larger where it is not.
     """
-    places = np.indices(movies.shape) + shift / movies.factor
+    places = np.indices(movies.valid.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
@@ -187,7 +182,7 @@ def _positive(tensor: Array) -> Array:
 
 def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
     """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
-    reach = movies.shape[0] // 3, movies.shape[1] // 3
+    reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
         # Changes as large as there are seldom are cut: an object's, if rapid.
@@ -248,13 +243,13 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
     that the moved movie explains, and all of it, in variances of noise.
     """
-    places = np.indices(movies.shape) + shift / movies.factor
+    places = np.indices(movies.valid.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
-    totals = np.zeros((4, *movies.shape))
+    totals = np.zeros((4, *movies.valid.shape))
     for array, level in zip(sums, movies.noise[1:], strict=True):
         windows = blurred(array, WINDOW)
         equations = normal_equations(windows, less)
@@ -268,7 +263,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals
-    starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
+    starts = [np.arange(_PARTS) * size // _PARTS for size in movies.valid.shape]
     of_parts = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])

@@ -152,7 +152,7 @@ def _coarse(
         begin = None if result is None else result[-1]
         if begin is None:
             # Whole frames, of which what is rare in a pixel's time is cut.
-            half = 2 if min(level.shape) >= 2 * _START else 1
+            half = 2 if min(level.valid.shape) >= 2 * _START else 1
             mostly = binned(level.valid * 1.0, half) > 0.5
             rough = replace(level, valid=mostly, noise=level.noise / half, factor=factor * half)
             smoothing = capture.smoothing(period)

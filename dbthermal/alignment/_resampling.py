@@ -97,9 +97,8 @@ def _offsets(
         values = schema.band_values(offset, names, "the time offset", "s")
     else:
         if len(names) != 2:
-            raise ValueError(
-                f"Invalid offset {offset} s for bands {names}. Must be one for each, (band)."
-            )
+            rule = "Must be one for each, (band)"
+            raise ValueError(f"Invalid offset {offset} s for bands {names}. {rule}.")
         values = np.array([0.0, _numbers.real_number("offset [s]", offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
         raise ValueError(

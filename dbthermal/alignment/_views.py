@@ -139,9 +139,8 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
             )
         return [*values.astype(np.float64)]
     if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
-        )
+        rule = "Must be 3x3 and finite in each band"
+        raise ValueError(f"Invalid transform of shape {values.shape}. {rule}.")
     return [positions(matrix, shape) for matrix in values.astype(np.float64)]
 
 

@@ -221,8 +221,7 @@ def _selection(
     capture: xr.Dataset, array: xr.DataArray, name: str, kinds: str, *dims: tuple[str, ...]
 ) -> xr.DataArray:
     """Return a mask or labels of some dims, laid on the capture."""
-    if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {name} of type {type(array).__name__}. Must be a DataArray.")
+    schema.require(array, xr.DataArray, name)
     if array.dtype.kind not in kinds:
         rule = "bool" if kinds == "b" else "whole numbers"
         raise TypeError(f"Invalid dtype {array.dtype} of the {name}. Must be {rule}.")

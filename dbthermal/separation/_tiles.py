@@ -218,8 +218,7 @@ class Estimate(Pixels):
             self.survey.frames[order, selected] = np.where(sound, frames, 0.0)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
-        """
-        Flag temperatures outside the calibrated range of a response, and values without a number.
+        """Flag temperatures outside the calibrated range of a response, and missing values.
 
         Samples without a useful standard deviation become NaN. No bit is set for variables that are
         `not_estimated`, or NaN in all samples of a pixel with another bit.

@@ -87,13 +87,10 @@ class Displacement:
         return csr_array((self.resample.data[entries], columns, start - start[0]), shape=shape)
 
 
-def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
+def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacement:
     """Check a field of the reflections' shift, see `solve`, against the capture, and invert it."""
     label = "the reflection shift"
-    if not isinstance(field, xr.Dataset):
-        raise TypeError(
-            f"Invalid reflection_shift of type {type(field).__name__}. Must be a Dataset."
-        )
+    schema.require(field, xr.Dataset, "reflection_shift")
     schema.check(field, "reflection_shift")
     names = [str(name) for name in corrected["band"].values]
     _check_bands(field, names, names[reference])

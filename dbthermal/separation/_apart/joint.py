@@ -376,8 +376,7 @@ def _emissivities(
 def _emission(
     places: tuple[Floats, Floats], band: tuple[Floats, Floats], emissivity: Floats, noise: float
 ) -> tuple[Floats, Floats, Mask]:
-    """
-    Emissivity of the first band as its slope over the object, its variance, and where it is told.
+    """Emissivity of the first band as its slope over the object, its variance, and where it holds.
 
     Of the object's signals at both places (solved, frame), and those of the band and the steps of
     the camera in it (frame, solved).

@@ -129,7 +129,8 @@ def _survey(
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
     sound = ((status & _BROKEN) == 0) & ~scatters.apart[places]
-    scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
+    scale = scatters.noise[:, places] / noise[:, np.newaxis]  # whitened by the noise of samples
+    scatter = np.where(sound, scatters.scatter[..., places] * scale * scale[:, np.newaxis], 0.0)
     frames = np.where(sound, scatters.freedom[places], 0.0)
     return Survey(
         scatter=np.stack([scatter] * 3),
@@ -198,8 +199,7 @@ def emissivities(inputs: Inputs, result: xr.Dataset) -> Floats:
 def shared(
     value: Floats, variance: Floats, sound: Mask, shape: tuple[int, ...]
 ) -> tuple[Floats, Floats]:
-    """
-    Values (pixel) [1] that lean on those around, the more the less they are known; and variances.
+    """Values (pixel) [1] that lean on their neighbours, the more the less certain; and variances.
 
     The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
     The variances are times the reduced chi-square about the median of those around, for a slow

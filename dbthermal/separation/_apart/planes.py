@@ -71,11 +71,6 @@ class Scatters:
         across = trace - np.linalg.eigvalsh(whole)[:, -1]
         return np.asarray(across > _APART * np.sqrt(2.0 * (bands - 1) * self.freedom))
 
-    def whitened(self, noise: Array) -> Array:
-        """Scatter (band, band, pixel) [1] whitened by another noise (band) [K]."""
-        scale = self.noise / noise[:, np.newaxis]
-        return np.asarray(self.scatter * scale * scale[:, np.newaxis])
-
 
 @dataclass(frozen=True)
 class Planes:

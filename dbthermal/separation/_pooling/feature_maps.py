@@ -74,8 +74,7 @@ def mean_signals(
 
 
 def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tuple[Array, Array]:
-    r"""
-    Reflection in the differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
+    r"""Reflection in differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
 

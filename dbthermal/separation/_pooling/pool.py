@@ -198,7 +198,8 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     expected = total(where, weight**2 * noise, count) / whole**2
     # Neighbours mirror the same people: var(mean) = sum_s (sum_i w (e - mean))^2 n / (n - 1) of n
     # squares s (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13).
-    squares = image.squares(_SQUARE)
+    rows, columns = np.divmod(image.surveyed, image.width)
+    squares = rows // _SQUARE * (image.width // _SQUARE + 1) + columns // _SQUARE
     groups = np.where(valid, where + count * squares, -1)
     sums = total(groups, weight * (value - mean[where]), count * (1 + int(squares.max())))
     sums = sums.reshape(-1, count)

@@ -31,11 +31,6 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def squares(self, side: int) -> Labels:
-        """Numbers (surveyed,) of the squares of the image that the surveyed pixels are in."""
-        rows, columns = np.divmod(self.surveyed, self.width)
-        return np.asarray(rows // side * (self.width // side + 1) + columns // side)
-
     def gradient(
         self, label: int, known: Labels, cost: gradients.Cost, limit: int = gradients.DEGREE
     ) -> gradients.Gradient:

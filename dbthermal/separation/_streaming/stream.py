@@ -270,10 +270,8 @@ class Stream:
         before = np.concatenate([[self._now], times[:-1]])
         bad = ~((times > before) & np.isfinite(times))
         if np.any(bad):
-            place = int(np.argmax(bad))
-            raise ValueError(
-                f"Invalid time {times[place]} s of a frame, after {before[place]} s. Must rise."
-            )
+            now, last = times[bad][0], before[bad][0]
+            raise ValueError(f"Invalid time {now} s of a frame, after {last} s. Must rise.")
         if segment < self._segment:
             raise ValueError(f"Invalid segment {segment} after {self._segment}. Must not fall.")
         if segment > self._segment:  # a mean is of one segment

@@ -116,10 +116,8 @@ class SubspaceSettings:
     def __post_init__(self) -> None:
         """Refuse a drift that is negative or not finite."""
         check_fields(self, "subspace")
-        if not 0 <= self.background_drift < np.inf:
-            raise ValueError(
-                f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
-            )
+        if not 0 <= (drift := self.background_drift) < np.inf:
+            raise ValueError(f"Invalid background_drift {drift} K. Must be zero or positive.")
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:

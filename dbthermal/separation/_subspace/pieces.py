@@ -194,8 +194,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
 
 
 def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None) -> None:
-    r"""
-    Refuse times [s] over which the slow changes are not smooth, but smooth in the frames' numbers.
+    r"""Refuse times [s] over which slow changes are not smooth, but smooth in the frames' numbers.
 
     So are those at which frames arrived in bursts, and those of a clock that was set. Of signals
     (band, time, pixel) [K], quietest band first, with `noise` (band) [K], the energy E across the

@@ -40,8 +40,7 @@ def principal_ratio(scatter: Array, noise: Array) -> Array:
 
 
 def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
-    r"""
-    Weights (band, pixel) of the bands that cancel the background, and their noise variance (pixel).
+    r"""Weights (band, pixel) of bands that cancel the background, and noise variance (pixel).
 
     Least variance with :math:`\sum w_m = 1`, :math:`\sum w_m \kappa_m = 0` (eq. 5); for two bands
     :math:`w = (-\kappa_2, 1) / (1 - \kappa_2)`.
