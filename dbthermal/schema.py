@@ -535,3 +535,9 @@ def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:
     if "segment" not in capture:
         return np.zeros(capture.sizes["time"], dtype=np.intp)
     return np.asarray(capture["segment"].values, dtype=np.intp)
+
+
+def noise_factor(capture: xr.Dataset) -> npt.NDArray[np.float64]:
+    """Noise (band) [1] over that before an alignment, 1 without a variable `noise_factor`."""
+    whole = xr.DataArray(np.ones(capture.sizes["band"]), dims="band")
+    return np.asarray(capture.get("noise_factor", whole).values, dtype=np.float64)

@@ -10,9 +10,9 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3513, 18),
+    "": (3519, 18),
     "_cli": (1263, 7),
-    "alignment": (3007, 13),
+    "alignment": (2931, 13),
     "calibration": (827, 3),
     "correction": (1850, 7),
     "emissivity": (452, 3),
@@ -22,11 +22,11 @@ BUDGET = {
     "limits": (750, 4),
     "readers": (2745, 12),
     "reporting": (439, 3),
-    "separation": (12957, 54),
+    "separation": (12626, 53),
     "simulation": (630, 3),
     "store": (1484, 6),
 }
-INSTALLED = 37_613  # lines of all rooms
+INSTALLED = 37_212  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -32,17 +32,14 @@ class Interpolation:
     The bend b is 0 for a random walk, and without four frames in a row; for a smooth signal the
     result is nearly the cubic. Half-way between frames the line keeps 71 % of a change of four
     frames from crest to crest, the cubic 88.
-
-    `before`, `after` (wanted): frames; `weight` (wanted): w [1]; `bend` (wanted, 4): b [1];
-    `valid` (wanted): false across a gap or past an end; `stamps` (time): exposure times [s].
     """
 
-    before: Indices
+    before: Indices  # frames (wanted)
     after: Indices
-    weight: Array
-    bend: Array
-    valid: Mask
-    stamps: Array
+    weight: Array  # w (wanted) [1]
+    bend: Array  # b (wanted, 4) [1]
+    valid: Mask  # false across a gap or past an end (wanted)
+    stamps: Array  # exposure times (time) [s]
 
     def apply(
         self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest_step: float = np.inf

@@ -15,14 +15,12 @@ from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_solve_banded, cholesky_banded
 
 from dbthermal._arrays import Array
-
-Whole = npt.NDArray[np.intp]
+from dbthermal._smooth import Whole
 
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
 _SPACING: Final = 6.0
@@ -75,13 +73,10 @@ class Spline:
     def before(self) -> Array:
         """Information (node, node) before there are data: on each node, and on a level field."""
         (row, down, _), (column, right, _) = self._differences
-        height, width = (
-            (size - 1) / (count - 3) for size, count in zip(self.shape, self.nodes, strict=True)
-        )
-        level = (
-            np.kron(down.T @ down, column) / height**2 + np.kron(row, right.T @ right) / width**2
-        )
-        return np.eye(len(level)) / self.prior**2 + level / _SLOPE**2
+        height, width = (np.array(self.shape) - 1) / (np.array(self.nodes) - 3)
+        level = np.kron(down.T @ down, column) / height**2
+        level += np.kron(row, right.T @ right) / width**2
+        return np.asarray(np.eye(len(level)) / self.prior**2 + level / _SLOPE**2)
 
     @cached_property
     def _order(self) -> Whole:
@@ -101,18 +96,14 @@ class Spline:
 
     def solved(self, factor: Array, right: Array) -> Array:
         """Nodes of a factored matrix and a right side."""
-        result = np.empty_like(right)
-        result[self._order] = cho_solve_banded(
-            (factor, True), right[self._order], check_finite=False
-        )
+        result, ordered = np.empty_like(right), right[self._order]
+        result[self._order] = cho_solve_banded((factor, True), ordered, check_finite=False)
         return result
 
     def values(self, centres: list[Array]) -> list[Array]:
         """Splines (place, node) at rows and at columns."""
-        return [
-            _splines(place.tobytes(), size, count)
-            for place, size, count in zip(centres, self.shape, self.nodes, strict=True)
-        ]
+        places = (place.tobytes() for place in centres)
+        return [_splines(*side) for side in zip(places, self.shape, self.nodes, strict=True)]
 
     def fitted(
         self, data: Information, centres: list[Array], guess: "Field | None" = None

@@ -334,10 +334,8 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
     values = {"known": (field["known"].dims, field["known"].values[squares], field["known"].attrs)}
     for name in ("shift", "shift_std"):
         filled = field[name].values[:, nearest[0], nearest[1]]
-        shift = side * np.stack(
-            [map_coordinates(component, places, order=1, mode="nearest") for component in filled]
-        )
-        full = np.where(missing[squares], np.nan, shift)
+        enlarged = [map_coordinates(plane, places, order=1, mode="nearest") for plane in filled]
+        full = np.where(missing[squares], np.nan, side * np.stack(enlarged))
         values[name] = (field[name].dims, full, field[name].attrs)
     coordinates = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
     return xr.Dataset(values, coords={"axis": field["axis"], **coordinates}, attrs=field.attrs)

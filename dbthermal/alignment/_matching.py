@@ -66,43 +66,29 @@ class Movies:
         noise: Array,
         freedom: float,
         factor: int,
-        whole: float = 0.0,
+        whole: float,
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = binned(valid.astype(np.float64), factor) > 0.5
-        sample = tuple(
-            index[:: max(1, index.size // _NOISE_PIXELS)] for index in np.nonzero(mostly)
-        )
+        step = max(1, np.count_nonzero(mostly) // _NOISE_PIXELS)
+        sample = tuple(index[::step] for index in np.nonzero(mostly))
         if sample[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
             usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
-        return cls(
-            splines(movies[0], BLUR),
-            [blurred(movie, BLUR) for movie in movies[1:]],
-            mostly,
-            noise / factor,
-            freedom,
-            max(whole / freedom, 1.0),
-            factor,
-        )
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.valid.shape[0], self.valid.shape[1]
+        films = splines(movies[0], BLUR), [blurred(movie, BLUR) for movie in movies[1:]]
+        return cls(*films, mostly, noise / factor, freedom, max(whole / freedom, 1.0), factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
-        return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.shape]
+        return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.valid.shape]
 
 
 def _whole_pixels(
     first: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """
-    Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
+    """Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
 
     Movies are in deviations of noise. Explained is a part of the others' energy in a window; the
     weight is the share that is.
@@ -138,8 +124,7 @@ def inside(places: Array, valid: Mask) -> Mask:
 
 
 def _information(movies: Movies, shift: Array) -> Information:
-    r"""
-    Information on a step of the field at each pixel, by Gauss-Newton.
+    r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
     With a ratio k for each window, the residual r of a pixel, and the slope g of the moved movie,
 
@@ -148,7 +133,7 @@ def _information(movies: Movies, shift: Array) -> Information:
     less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
     and larger where it is not.
     """
-    places = np.indices(movies.shape) + shift / movies.factor
+    places = np.indices(movies.valid.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
@@ -197,7 +182,7 @@ def _positive(tensor: Array) -> Array:
 
 def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
     """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
-    reach = movies.shape[0] // 3, movies.shape[1] // 3
+    reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
         # Changes as large as there are seldom are cut: an object's, if rapid.
@@ -244,8 +229,7 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
 
 
 def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Array]:
-    r"""
-    Time by which the others show what the first movie shows at a shift, and its deviation [s].
+    r"""Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
     The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What
     moves one way only is shifted or late. One Newton step of both, the shift free in each window:
@@ -259,13 +243,13 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
     that the moved movie explains, and all of it, in variances of noise.
     """
-    places = np.indices(movies.shape) + shift / movies.factor
+    places = np.indices(movies.valid.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
-    totals = np.zeros((4, *movies.shape))
+    totals = np.zeros((4, *movies.valid.shape))
     for array, level in zip(sums, movies.noise[1:], strict=True):
         windows = blurred(array, WINDOW)
         equations = normal_equations(windows, less)
@@ -279,11 +263,8 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals
-    starts = [np.arange(_PARTS) * size // _PARTS for size in movies.shape]
-    of_parts = [
-        np.add.reduceat(np.add.reduceat(array, starts[0], axis=0), starts[1], axis=1)
-        for array in (gradient, information)
-    ]
+    starts = [np.arange(_PARTS) * size // _PARTS for size in movies.valid.shape]
+    of_parts = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
     std = np.sqrt((without.size - 1) * np.var(without))

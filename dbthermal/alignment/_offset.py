@@ -46,15 +46,11 @@ _ORDER: Final = 8  # smooth functions that are projected out
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two bands on one clock of even steps.
+    """Two bands on one clock of even steps."""
 
-    `signals` (2, time, pixel): counts [count], NaN in missing frames; `segments` (2, time): number
-    of shutter events before each frame; `times` (time) [s].
-    """
-
-    signals: Array
-    segments: clocks.Indices
-    times: Array
+    signals: Array  # counts (2, time, pixel) [count], NaN in missing frames
+    segments: clocks.Indices  # number of shutter events before each frame (2, time)
+    times: Array  # (time) [s]
 
     def shifted(self, lag: int) -> "_Pair":
         """Pair with the first band taken `lag` frames later."""
@@ -148,9 +144,8 @@ def require_one_clock(
     before, after, undone = (stamps.copy() for _ in range(3))
     before[band, last + 1 :] = after[band, : last + 1] = undone[band, : last + 1] = np.nan
     undone[band] -= excess[band]
-    reference, stepped, without = (
-        _try(pair, signals, times, search) for times in (before, after, undone)
-    )
+    trials = before, after, undone
+    reference, stepped, without = (_try(pair, signals, times, search) for times in trials)
     # NaN, of no motion before or after the step, refuses nothing.
     if abs(without - reference) < np.nan_to_num(abs(stepped - reference), nan=np.inf):
         raise ValueError(

@@ -74,23 +74,16 @@ class Scale:
         scatter, relative = noise_levels(sample(corrected), clocks.exposure_times(corrected))
         if not np.all(relative > 0.0):
             raise ValueError("Missing noise of the capture. Must be seen to match reflections.")
-        return cls(scatter / relative, relative / _noise_factor(corrected))
+        return cls(scatter / relative, relative / schema.noise_factor(corrected))
 
     def noise_of(self, corrected: xr.Dataset) -> Array:
         """Noise of a capture (band) [K]."""
         if self.noise is not None:
-            return np.asarray(self.noise * _noise_factor(corrected))
+            return np.asarray(self.noise * schema.noise_factor(corrected))
         signals = sample(corrected)
         frames = np.all(np.isfinite(signals), axis=(0, 2))
-        scaled = [
-            signal[frames] / slope for signal, slope in zip(signals, self.slopes, strict=True)
-        ]
-        return noises.estimate_bands(scaled, corrected["time"].values[frames])
-
-
-def _noise_factor(corrected: xr.Dataset) -> Array:
-    """Noise (band) [1] over that before the alignment."""
-    return np.asarray(corrected.get("noise_factor", np.ones(corrected.sizes["band"])))
+        scaled = signals[:, frames] / self.slopes[:, np.newaxis, np.newaxis]
+        return noises.estimate_bands([*scaled], corrected["time"].values[frames])
 
 
 @dataclass(frozen=True)
@@ -118,7 +111,7 @@ class Capture:
                 f"at least {SMALLEST} of each to match reflections."
             )
         slopes, noise = scale.slopes, scale.noise_of(corrected)
-        order = np.argsort(noise / _noise_factor(corrected), kind="stable")
+        order = np.argsort(noise / schema.noise_factor(corrected), kind="stable")
         valid = np.ones(counts.shape[2:], dtype=bool)
         if "status" in corrected:
             valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
@@ -144,9 +137,8 @@ class Capture:
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
         size, weight = self.frames.size, (2.0 * np.sin(np.pi / period)) ** -6
-        third = sparse.diags_array(
-            [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
-        )[self.rough]
+        terms, shape = [-1.0, 3.0, -3.0, 1.0], (size - 3, size)
+        third = sparse.diags_array(terms, offsets=range(4), shape=shape, format="csr")[self.rough]
         penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
@@ -167,10 +159,9 @@ class Capture:
                 planes = film.reshape(len(film), -1).T @ (together / np.float32(slope))
                 movie[rows] = planes.reshape(movie[rows].shape)
         if not self.valid.all():
-            nearest = distance_transform_edt(
-                ~self.valid, return_distances=False, return_indices=True
-            )
-            result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+            lost = ~self.valid
+            nearest = distance_transform_edt(lost, return_distances=False, return_indices=True)
+            result[:, lost] = result[:, *nearest[:, lost]]
         ends = np.cumsum([array.shape[1] for array in functions])
         return [list(array) for array in np.split(result, ends[:-1], axis=3)]
 
@@ -294,7 +285,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     """
     frames = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
     noise = scale.noise_of(corrected)
-    bands = np.argsort(noise / _noise_factor(corrected), kind="stable")[:2]
+    bands = np.argsort(noise / schema.noise_factor(corrected), kind="stable")[:2]
     time = corrected["time"].values[frames]
     slopes = scale.slopes[bands].astype(np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
     counts, (rows, columns) = corrected["counts"].variable[:, frames], _measured(corrected)
@@ -317,9 +308,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     segment = schema.segments(corrected)[frames]
     orders = min(_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
-    functions = [
-        smooth.leading(signals - signals @ block @ block.T, _RAPID_PLANES) for block in curves
-    ]
+    changes = [signals - signals @ block @ block.T for block in curves]
+    functions = [smooth.leading(change, _RAPID_PLANES) for change in changes]
     rates = [np.gradient(block, axis=0).T @ block for block in functions]
 
     # Sums over the windows of rows of windows.

@@ -59,9 +59,8 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
         for other, out in zip(others, result, strict=True):
-            _sum_pairs(
-                signals, other[rows].reshape(-1, planes), out[rows].reshape(-1, out.shape[2])
-            )
+            sums = out[rows].reshape(-1, out.shape[2])
+            _sum_pairs(signals, other[rows].reshape(-1, planes), sums)
     return result
 
 

@@ -1,6 +1,7 @@
 """Shift between the reflections that two cameras side by side see in one surface."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -38,8 +39,7 @@ _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapo
 
 
 def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
-    r"""
-    Displacement between the reflections that two cameras side by side see in one surface.
+    r"""Displacement between the reflections that two cameras side by side see in one surface.
 
     A registration of the object's surface does not register what that surface mirrors. What the
     other bands show at p, the reference band, the quietest, shows at p + d(p):
@@ -152,13 +152,9 @@ def _coarse(
         begin = None if result is None else result[-1]
         if begin is None:
             # Whole frames, of which what is rare in a pixel's time is cut.
-            half = 2 if min(level.shape) >= 2 * _START else 1
-            rough = replace(
-                level,
-                valid=binned(level.valid * 1.0, half) > 0.5,
-                noise=level.noise / half,
-                factor=factor * half,
-            )
+            half = 2 if min(level.valid.shape) >= 2 * _START else 1
+            mostly = binned(level.valid * 1.0, half) > 0.5
+            rough = replace(level, valid=mostly, noise=level.noise / half, factor=factor * half)
             smoothing = capture.smoothing(period)
             films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
@@ -203,16 +199,12 @@ def _squares(data: Information, factor: int = 1) -> Array:
 
 
 def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> Array:
-    """
-    Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
+    """Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
-    sums = [
-        gaussian_filter(array * resolved, _WIDE / level.factor, axes=(-2, -1))
-        for array in (squares, np.ones(resolved.shape))
-    ]
-    chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
+    blur = partial(gaussian_filter, sigma=_WIDE / level.factor, axes=(-2, -1))
+    chi = np.maximum(blur(squares * resolved) / np.maximum(blur(resolved * 1.0), 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
 
 

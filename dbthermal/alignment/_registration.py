@@ -133,28 +133,19 @@ def register(
 
 def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
     """Smooth curves at a few times (time, y, x), over their mean and standard deviation."""
-    frames = np.asarray(view.values)
+    frames, label = np.asarray(view.values), f"Invalid view in band '{view['band'].item()}'"
     present = np.flatnonzero(~clocks.missing(frames))
     if present.size == 0:
-        raise ValueError(
-            f"Invalid view in band '{view['band'].item()}': all {len(frames)} frames are missing. "
-            "Must have one."
-        )
+        raise ValueError(f"{label}: all {len(frames)} frames are missing. Must have one.")
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
     frames = frames[present[chosen]].astype(np.float64)
     if not np.all(np.isfinite(frames)):
-        raise ValueError(
-            f"Invalid view in band '{view['band'].item()}': "
-            f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
-            "every frame that is not missing."
-        )
+        count, rule = np.sum(~np.isfinite(frames).all(axis=0)), "in every frame that is not missing"
+        raise ValueError(f"{label}: {count} pixels are not finite. Must be finite {rule}.")
     # Smooth curves, bad pixels replaced by the median around them.
     images = np.stack([_smooth(row) for row in frames.swapaxes(0, 1)], axis=1)
     if not images.mean(axis=0).std() > 0:
-        raise ValueError(
-            f"Invalid view in band '{view['band'].item()}': all pixels are alike. Must show an "
-            "object."
-        )
+        raise ValueError(f"{label}: all pixels are alike. Must show an object.")
     for image in images:
         median = median_filter(image, size=_MEDIAN_WINDOW)
         difference = abs(image - median)

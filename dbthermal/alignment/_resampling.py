@@ -62,7 +62,10 @@ def on_one_clock(
             movie = views.single(movies.isel(band=band).values)
             if missing[band].any():
                 movie = np.where(missing[band][:, None, None], np.float32(np.nan), movie)
-            plan.apply(movie, result[band], _largest(steps * noise[band], movie))
+            # The largest step of noise: a difference less the mean of its two neighbours.
+            rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
+            largest = float(np.sqrt(3.0) * (steps * noise[band]) + rounding)
+            plan.apply(movie, result[band], largest)
         return result
 
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
@@ -73,8 +76,7 @@ def on_one_clock(
     outside = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
     gone = [name for name, away in zip(names, outside, strict=True) if away]
     result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
-    if "noise_factor" in corrected:
-        factors = factors * corrected["noise_factor"].values
+    factors = factors * schema.noise_factor(corrected)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(
         clock=names[reference],
@@ -95,9 +97,8 @@ def _offsets(
         values = schema.band_values(offset, names, "the time offset", "s")
     else:
         if len(names) != 2:
-            raise ValueError(
-                f"Invalid offset {offset} s for bands {names}. Must be one for each, (band)."
-            )
+            rule = "Must be one for each, (band)"
+            raise ValueError(f"Invalid offset {offset} s for bands {names}. {rule}.")
         values = np.array([0.0, _numbers.real_number("offset [s]", offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
         raise ValueError(
@@ -105,12 +106,6 @@ def _offsets(
             "first."
         )
     return values
-
-
-def _largest(noise: float, movie: Movie) -> float:
-    """Largest step [count] of this noise: a difference less the mean of its two neighbours."""
-    rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
-    return float(np.sqrt(3.0) * noise + rounding)
 
 
 def _missing(films: xr.DataArray) -> Mask:

@@ -33,7 +33,7 @@ _DIGITS: Final = 9  # of a rounded position, so that a border met exactly counts
 def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) -> xr.Dataset:
     """Capture with all views on the first one's grid, each band on its own clock."""
     result, shares = moved(corrected, _maps(transform, corrected), lazy=lazy)
-    factors = shares * (corrected["noise_factor"].values if "noise_factor" in corrected else 1.0)
+    factors = shares * schema.noise_factor(corrected)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     if "pattern_std" in result:
         result["pattern_std"] = result["pattern_std"] * shares
@@ -53,10 +53,8 @@ def moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[
 
     def views(rows: slice) -> Movie:
         """Rows of all bands."""
-        warped_views = [
-            _warped(view, matrix, rows) for view, matrix in zip(counts, weights, strict=True)
-        ]
-        return np.stack(warped_views)
+        pairs = zip(counts, weights, strict=True)
+        return np.stack([_warped(view, matrix, rows) for view, matrix in pairs])
 
     warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
     result = corrected.assign(counts=warped)
@@ -114,9 +112,8 @@ def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
     """
     rows, columns = np.indices(shape, dtype=np.float64)
-    column, row, scale = np.einsum(
-        "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
-    )
+    points = np.stack([columns, rows, np.ones_like(rows)])
+    column, row, scale = np.einsum("ij,jyx->iyx", matrix, points)
     scale = np.where(scale * matrix[2, 2] > 0, scale, np.nan)  # else behind the camera
     return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
 
@@ -142,9 +139,8 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
             )
         return [*values.astype(np.float64)]
     if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
-        )
+        rule = "Must be 3x3 and finite in each band"
+        raise ValueError(f"Invalid transform of shape {values.shape}. {rule}.")
     return [positions(matrix, shape) for matrix in values.astype(np.float64)]
 
 

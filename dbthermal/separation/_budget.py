@@ -204,7 +204,7 @@ def _combined(weights: Array, stds: Array) -> Array:
 
 
 def _mean(film: Array) -> Array:
-    """Mean (y, x) over time of a film; NaN without any."""
+    """Mean (y, x) over time of a film, at some frames; NaN without any."""
     values = film[:: max(1, len(film) // _FRAMES)]
     finite = np.isfinite(values)
     number = np.where(finite.any(axis=0), finite.sum(axis=0), np.nan)
@@ -215,8 +215,4 @@ def _rms(film: Array, zero: Array | float = 0.0) -> Array:
     """Root mean square (y, x) over time of a film, about a number or another; NaN without any."""
     frames = slice(None, None, max(1, len(film) // _FRAMES))
     values = film[frames] - (zero[frames] if isinstance(zero, np.ndarray) else zero)
-    finite = np.isfinite(values)
-    number = np.where(finite.any(axis=0), finite.sum(axis=0), np.nan)
-    return np.asarray(
-        np.sqrt(np.sum(values.astype(np.float64) ** 2, axis=0, where=finite) / number)
-    )
+    return np.asarray(np.sqrt(_mean(values.astype(np.float64) ** 2)))

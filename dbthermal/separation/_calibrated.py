@@ -50,9 +50,8 @@ class CalibratedSettings:
 
 def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     """Temperatures with their standard deviations, at the known emissivities (band, pixel)."""
-    if tile.emissivity is None:
-        raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
     e, covariance = tile.emissivity, tile.emissivity_covariance
+    assert e is not None
     if covariance is None:
         covariance = np.zeros((len(e), *e.shape))
     level = np.zeros(e.shape[1])

@@ -38,9 +38,8 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     good = (status.astype(np.uint32) & np.uint32(Status.DEAD_PIXEL))[::step, ::step] == 0
     names = [str(name) for name in counts["band"].values]
     noises = responses.noise(response, names) if "noise" in response else np.zeros(len(names))
-    factors = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
-    stds = np.hypot(noises * factors, patterns)
+    stds = np.hypot(noises * schema.noise_factor(corrected), patterns)
     curves = responses.curves(response, names)
     for name, curve, film, std in zip(names, curves, counts, stds, strict=True):
         every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
@@ -62,8 +61,8 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     counts, time = corrected["counts"], corrected["time"].values
     pixels = min(_PIXELS, max(_FEWEST, _SAMPLES // time.size))
     step = stride(counts.shape[2:], pixels)
-    segment = corrected["segment"].values if "segment" in corrected else np.zeros(time.size)
-    joined = (np.diff(segment) == 0) & (np.diff(time) < _PAUSE * np.median(np.diff(time)))
+    joined = np.diff(time) < _PAUSE * np.median(np.diff(time))
+    joined &= np.diff(schema.segments(corrected)) == 0
     films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)
     # Samples of all bands: one clock's resampling leaves out those of one band where much moves.
     valid = schema.measured(films).all(axis=0)

@@ -104,10 +104,10 @@ def solve(
     bands, frames, pixels = tile.signals.shape
     if covariance is None:
         covariance = np.zeros((bands + 1, bands + 1, pixels))
-    pattern = np.zeros(bands) if tile.pattern is None else np.square(tile.pattern)
+    pattern = np.square(tile.pattern or np.zeros(bands))
     share = np.ones(bands) if not apart else np.eye(bands)[0]
     unseen = np.outer(fluctuation, 1.0 - share) * np.square(1.0 - emissivity.T)
-    result = np.empty((5, pixels, frames))
+    result, spare = np.empty((5, pixels, frames)), np.empty((9, frames))
     _solve(
         response_tables(tile),
         np.ascontiguousarray(tile.signals.transpose(2, 0, 1)),
@@ -115,9 +115,7 @@ def solve(
         np.stack([level, fluctuation], axis=-1),
         np.ascontiguousarray(covariance.transpose(2, 0, 1)),
         np.stack([share, pattern]),
-        _Work(
-            *np.empty((4, bands, frames)), *np.empty((2, bands + 1, frames)), *np.empty((9, frames))
-        ),
+        _Work(*np.empty((4, bands, frames)), *np.empty((2, bands + 1, frames)), *spare),
         result,
     )
     return Frames(*result.transpose(0, 2, 1))
@@ -130,15 +128,14 @@ def response_tables(tile: Tile) -> tuple[kernels.Table, ...]:
 
 @compiled
 def other_band(
-    first: kernels.Table,
-    second: kernels.Table,
+    tables: tuple[kernels.Table, kernels.Table],
     signal: Array,
     value: Array,
     slope: Array,
-    place: Array,
-    rate: Array,
+    spare: Array,
 ) -> None:
-    """B_m and its slope of a band at signals of the first band's, in place; the last are spare."""
+    """B_m and its slope of a band at signals of the first band's, in place; two rows are spare."""
+    (first, second), place, rate = tables, spare[0], spare[1]
     kernels.temperature(first, signal, place)
     kernels.blackbody(first, place, value, rate)
     for t in range(signal.size):  # Newton's step
@@ -213,11 +210,8 @@ def _step(
         ss[t], sr[t], rr[t] = 0.0, 0.0, 1.0 / level[1]
         to_s[t], to_r[t] = 0.0, (level[0] - work.behind[0, t]) / level[1]
     for m in range(share.size):
-        e, weight, dark = (
-            parameters[0, m],
-            1.0 / parameters[1, m],
-            (1.0 - parameters[0, m]) * share[m],
-        )
+        e, weight = parameters[0, m], 1.0 / parameters[1, m]
+        dark = (1.0 - parameters[0, m]) * share[m]
         for t in range(ss.size):
             by_s = e * work.slope[m, t] / work.slope[0, t]
             by_r = dark * work.rate[m, t] / work.rate[0, t]

@@ -35,14 +35,12 @@ _NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no noise 1.4 ti
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
-# Negative eigenvalue of a covariance that is rounding [1].
-_ROUNDED: Final = 1e-6
+_ROUNDED: Final = 1e-6  # negative eigenvalue of a covariance that is rounding [1]
 
 
 @dataclass(frozen=True)
 class Method:
-    """
-    A separation method: its functions of a tile, and its demands on the capture.
+    """A separation method: its functions of a tile, and its demands on the capture.
 
     Attributes
     ----------
@@ -93,7 +91,7 @@ class Inputs:
     capture: xr.Dataset  # counts, where present status and segment, and `mask`; may be lazy
     curves: list[Curve]
     noise: Array  # standard deviation of the linearised signals (band) [K]
-    pattern: Array | None  # deviation of what the correction leaves, constant in time (band) [K]
+    pattern: Array  # deviation of what the correction leaves, constant in time (band) [K]
     bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
     emissivity_covariance: Array | None  # (band, band, y, x) [1]
@@ -110,18 +108,6 @@ class Inputs:
         fitting = max(1, min(BLOCK_ROWS, _TOGETHER // row))
         rows = height if self.method.whole_image else fitting
         return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-
-    def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:
-        """Apply a function of the method to a tile, with the settings where it has any."""
-        assert function is not None
-        return function(tile) if self.settings is None else function(tile, self.settings)
-
-
-def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> None:
-    """Refuse a setting of a method for which a rule does not hold."""
-    if not holds:
-        value = getattr(settings, name)
-        raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
 
 
 def check_fields(settings: Any, method: str) -> None:
@@ -178,11 +164,10 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         capture = capture.assign(mask=used.drop_vars(list(used.coords)))
     response, noise = decide_noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
-    value, covariance = _known_emissivity(
-        corrected, emissivity, emissivity_std, emissivity_covariance
-    )
+    stds = emissivity_std, emissivity_covariance
+    value, covariance = _known_emissivity(corrected, emissivity, *stds)
     # The quietest camera leads, however resampling or a blur took noise from the others.
-    order = np.argsort(noise / _noise_factor(capture), kind="stable").tolist()
+    order = np.argsort(noise / schema.noise_factor(capture), kind="stable").tolist()
     return Inputs(
         response=response,
         response_kind=response_kind,
@@ -198,9 +183,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         emissivity_covariance=covariance,
         labels=None if pool is None else numbered(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, order[0]),
-        division=np.zeros(
-            (-(-capture.sizes["time"] // 8), capture["y"].size * capture["x"].size), np.uint8
-        ),
+        division=np.zeros((-(-frames // 8), capture["y"].size * capture["x"].size), np.uint8),
     )
 
 
@@ -239,8 +222,7 @@ def _selection(
     capture: xr.Dataset, array: xr.DataArray, name: str, kinds: str, *dims: tuple[str, ...]
 ) -> xr.DataArray:
     """Return a mask or labels of some dims, laid on the capture."""
-    if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {name} of type {type(array).__name__}. Must be a DataArray.")
+    schema.require(array, xr.DataArray, name)
     if array.dtype.kind not in kinds:
         rule = "bool" if kinds == "b" else "whole numbers"
         raise TypeError(f"Invalid dtype {array.dtype} of the {name}. Must be {rule}.")
@@ -255,7 +237,9 @@ def decide_noise(
 ) -> tuple[xr.Dataset, Array]:
     """Noise (band) [K], and the response with it, for all parts; `noise_source` says of which."""
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
-    factor, decided = _noise_factor(capture), response.attrs.get("noise_source")
+    factor, decided = schema.noise_factor(capture), response.attrs.get("noise_source")
+    if "noise_factor" in capture:
+        planck.require_positive("noise_factor of the corrected", factor)
     # With a stated noise: that, unless the capture proves more.
     if "noise" in response:
         stated_noise = np.asarray(responses.noise(response, names) / slopes)
@@ -299,23 +283,13 @@ def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise
         return
     order = np.argsort(noise, kind="stable")
     signals = np.stack([curves[band].linearise(counts[band]) for band in order])
-    segment = capture["segment"].values[frames] if "segment" in capture else None
-    method.check_clock(signals, time[frames], noise[order], segment)
+    method.check_clock(signals, time[frames], noise[order], schema.segments(capture)[frames])
 
 
-def _noise_factor(capture: xr.Dataset) -> Array | float:
-    """Noise (band) [1] over that before the alignment, 1 without a variable `noise_factor`."""
-    if "noise_factor" not in capture:
-        return 1.0
-    factor = capture["noise_factor"].values.astype(np.float64)
-    return planck.require_positive("noise_factor of the corrected", factor)
-
-
-def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
-    """Deviation (band) [K] of a residual fixed pattern, None without a variable `pattern_std`."""
-    if "pattern_std" not in capture:
-        return None
-    counts = capture["pattern_std"].values.astype(np.float64)
+def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array:
+    """Deviation (band) [K] of a residual fixed pattern, 0 without a variable `pattern_std`."""
+    stated = capture["pattern_std"].values if "pattern_std" in capture else np.zeros(len(curves))
+    counts = stated.astype(np.float64)
     if not np.all((counts >= 0) & schema.measured(counts)):
         values = counts.tolist()
         raise ValueError(f"Invalid pattern_std {values} count. Must be zero or positive, finite.")

@@ -171,13 +171,12 @@ class _Plan:
 
     def of_pixels(self, **places: slice) -> "_Plan":
         """Plan with the options of some rows and columns."""
-        options = {
+        arrays = {
             name: value.isel(places, missing_dims="ignore")
-            if isinstance(value, xr.DataArray)
-            else value
             for name, value in self.options.items()
+            if isinstance(value, xr.DataArray)
         }
-        return replace(self, options=options)
+        return replace(self, options={**self.options, **arrays})
 
 
 def _separate_capture(
@@ -289,9 +288,8 @@ def _share(
     counts, columns = capture["counts"], capture.sizes["x"]
     column, lazy = counts[..., 0, 0].size, counts.chunksizes.get("y", ())
     stored = counts.encoding.get("preferred_chunks", {})
-    chunk, chunk_width = (
-        max(counts.chunksizes.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx"
-    )
+    chunks = counts.chunksizes
+    chunk, chunk_width = (max(chunks.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx")
     sample = _TILE if method.compiled else _TILE * _TIMES
     tile = sample * largest(method, settings, capture) * column
 
@@ -304,8 +302,8 @@ def _share(
         """Memory [byte] of the chunks read, of the blocks' samples, and of a tile."""
         rows, whole = read(height)
         held = width if width == columns else min(columns, width + 2 * chunk_width)
-        chunks = (rows if whole else rows + 2 * chunk) * held if lazy else 0
-        samples = _READ * (rows * width + chunks) + _SAMPLE * height * width
+        read_again = (rows if whole else rows + 2 * chunk) * held if lazy else 0
+        samples = _READ * (rows * width + read_again) + _SAMPLE * height * width
         return samples * column + min(sample * column * height * width, tile)
 
     fewest = columns if lazy else 1  # a chunk of dask's is made anew for each of its blocks

@@ -61,8 +61,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     seed: int = 0,
     progress: bool = False,
 ) -> xr.Dataset:
-    r"""
-    Separate emission and reflection in a capture of two bands or more.
+    r"""Separate emission and reflection in a capture of two bands or more.
 
     Of the image formation (`mixing`) with the responses U of `response`, object temperature x,
     background temperature y and emissivities e are estimated:
@@ -208,8 +207,7 @@ def separated(
     workers: int = 2,
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
-    """
-    Separate checked inputs; and the surveys per pixel, of cameras at one place.
+    """Separate checked inputs; and the surveys per pixel, of cameras at one place.
 
     To pool pixels before displaced cameras, the result per pixel (`alone`) is needed; made if not
     passed. The materials may be regrouped by their ratios (`regroup`).
@@ -300,8 +298,7 @@ def require_seed(seed: Any) -> None:
 
 
 def get_method(name: str | Method) -> Method:
-    """
-    Record of a method: its functions, its settings, and its demands on the capture.
+    """Record of a method: its functions, its settings, and its demands on the capture.
 
     Parameters
     ----------
@@ -341,11 +338,11 @@ def _separate(
     rows: slice,
 ) -> int:
     """Separate a block of rows, or what is wanted of it, into its place; return its pixels."""
-    size = 0
+    size, options = 0, [] if inputs.settings is None else [inputs.settings]
     for cut in tiles.cut(inputs, rows, material, wanted):
         estimates = []
         for frames, pixels, tile in cut.parts:
-            estimate: Estimate = inputs.apply(inputs.method.separate, tile)
+            estimate: Estimate = inputs.method.separate(tile, *options)
             if estimate.status.size == pixels.size and not pixels.all():
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import mixing
+from dbthermal import mixing, schema
 from dbthermal._arrays import select
 from dbthermal._samples import Grain
 from dbthermal.response import Curve
@@ -47,6 +47,7 @@ _NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are s
 RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 
+_MAPS: Final = ("emissivity", "reflection_ratio")
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
 """Variables that a method without standard deviations never estimates."""
 WITHOUT_BACKGROUND: Final = (*WITHOUT_STD, "background_temperature")
@@ -59,14 +60,10 @@ class Pixels:
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
-        return self.each(lambda values: select(values, selected))
-
-    def each(self, function: Callable[[Any], Any]) -> Self:
-        """Return the record with a function of each of its arrays."""
         arrays: dict[str, Any] = {}
         for name, value in vars(self).items():
-            within = value.each(function) if isinstance(value, Pixels) else value
-            arrays[name] = function(value) if isinstance(value, np.ndarray) else within
+            within = value.select_pixels(selected) if isinstance(value, Pixels) else value
+            arrays[name] = select(value, selected) if isinstance(value, np.ndarray) else within
         return replace(self, **arrays)
 
     def replace_pixels(self, selected: Mask | Whole, record: Self) -> None:
@@ -107,16 +104,9 @@ class Survey(Pixels):
     @classmethod
     def empty(cls, bands: int, pixels: int) -> Self:
         """Survey of pixels that tell nothing."""
-        none = np.full((bands, pixels), np.nan)
-        return cls(
-            scatter=np.zeros((3, bands, bands, pixels)),
-            frames=np.zeros((3, pixels)),
-            ratio=none,
-            null_weights=none.copy(),
-            emissivity=none[0].copy(),
-            noise_variance=none[0].copy(),
-            drift_variance=none[0].copy(),
-        )
+        scatter, frames = np.zeros((3, bands, bands, pixels)), np.zeros((3, pixels))
+        vectors, numbers = np.full((2, bands, pixels), np.nan), np.full((3, pixels), np.nan)
+        return cls(scatter, frames, *vectors, *numbers)
 
 
 @dataclass(frozen=True)
@@ -129,7 +119,7 @@ class Tile:
     noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
-    pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
+    pattern: tuple[float, ...] = ()  # residual fixed pattern of each band [K], empty without
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
@@ -169,14 +159,11 @@ class Tile:
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
-        arrays: dict[str, Any] = {
-            name: None if getattr(self, name) is None else select(getattr(self, name), selected)
-            for name in ("emissivity", "emissivity_covariance", "division")
-        }
+        names = "signals", "emissivity", "emissivity_covariance", "division"
+        present = {name: vars(self)[name] for name in names if vars(self)[name] is not None}
+        arrays: dict[str, Any] = {name: select(present[name], selected) for name in present}
         material = None if self.material is None else self.material.select_pixels(selected)
-        signals = select(self.signals, selected)
-        shape = (1, signals.shape[2])
-        return replace(self, signals=signals, shape=shape, material=material, **arrays)
+        return replace(self, shape=(1, arrays["signals"].shape[2]), material=material, **arrays)
 
 
 @dataclass(frozen=True)
@@ -208,35 +195,20 @@ class Estimate(Pixels):
     ) -> "Estimate":
         """Estimate without standard deviations; NaN for quantities that are not passed."""
         missing = np.full_like(object_temperature, np.nan)
-        no_emissivity = np.full((len(tile.curves), status.size), np.nan)
-        return cls(
-            object_temperature=object_temperature,
-            object_temperature_std=missing,
-            background_temperature=(
-                missing if background_temperature is None else background_temperature
-            ),
-            background_temperature_std=missing,
-            emissivity=no_emissivity if emissivity is None else emissivity,
-            emissivity_std=no_emissivity,
-            status=status,
-        )
+        std = np.full((len(tile.curves), status.size), np.nan)
+        background = missing if background_temperature is None else background_temperature
+        value = std if emissivity is None else emissivity
+        return cls(object_temperature, missing, background, missing, value, std, status)
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
-        undefined = {
-            "object_temperature": no_object,
-            "emissivity": no_emissivity,
-            "background_temperature": no_background,
-        }
-        covariance = self.emissivity_covariance
-        if covariance is not None:
-            covariance = np.where(no_emissivity, np.nan, covariance)
+        where = {"object": no_object, "emissivity": no_emissivity, "background": no_background}
         arrays: dict[str, Any] = {
-            name + ending: np.where(where, np.nan, getattr(self, name + ending))
-            for name, where in undefined.items()
-            for ending in ("", "_std")
+            name: np.where(where[name.split("_")[0]], np.nan, value)
+            for name, value in vars(self).items()
+            if name.split("_")[0] in where and value is not None
         }
-        return replace(self, emissivity_covariance=covariance, **arrays)
+        return replace(self, **arrays)
 
     def replace_scatter(self, order: int, selected: Mask, scatter: Array, frames: Array) -> None:
         """Replace a scatter of a sound survey, and its degrees of freedom (pixel), in place."""
@@ -246,30 +218,23 @@ class Estimate(Pixels):
             self.survey.frames[order, selected] = np.where(sound, frames, 0.0)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
-        """
-        Flag temperatures outside the calibrated range of a response, and values without a number.
+        """Flag temperatures outside the calibrated range of a response, and missing values.
 
         Samples without a useful standard deviation become NaN. No bit is set for variables that are
         `not_estimated`, or NaN in all samples of a pixel with another bit.
         """
         values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
-        for field in fields(self):
-            name = field.name
-            if name in ("status", "survey", "division", *not_estimated) or name.endswith(
-                ("_std", "_covariance")
-            ):
-                continue
-            if getattr(self, name) is None:
-                continue
+        for name in ("object_temperature", "background_temperature", *_MAPS):
             value, std = getattr(self, name), getattr(self, f"{name}_std")
+            if value is None or name in not_estimated:
+                continue
             precise = (std < USELESS) | (f"{name}_std" in not_estimated)
             lost = ~((np.abs(value) < USELESS) & precise)
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
-            values[name], values[f"{name}_std"] = (
-                np.where(lost, np.nan, array) for array in (value, std)
-            )
+            values[name] = np.where(lost, np.nan, value)
+            values[f"{name}_std"] = np.where(lost, np.nan, std)
             if name.endswith("temperature"):
                 beyond |= np.any(out_of_range(value, std, curve), axis=0)
         status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
@@ -282,6 +247,9 @@ def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
     return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
+Section = tuple[Mask, Mask, Tile]  # frames (time), pixels (pixel), and the tile of these
+
+
 @dataclass(frozen=True)
 class Cut:
     """A window of the image, its data quality, and a tile by set of frames."""
@@ -290,7 +258,7 @@ class Cut:
     places: Whole  # numbers of the pixels in the image (pixel)
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
-    parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
+    parts: list[Section]
 
 
 def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
@@ -309,34 +277,10 @@ def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
     return int(getattr(settings, "batch", fitting))
 
 
-def generator(seed: int, window: Window) -> np.random.Generator:
-    """Make the random generator of a tile, independent of all others of this seed."""
-    key = (window[0].start, window[1].start)
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
-
-
 def numbers(window: Window, width: int) -> Whole:
     """Numbers (pixel) of a window's pixels in an image of so many columns."""
     lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] * width
     return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
-
-
-def _wanted(
-    every: Iterator[Window], width: int, wanted: Mask | None
-) -> Iterator[tuple[Window, slice | Whole, Whole]]:
-    """Yield windows, which of their pixels are wanted, of the image (pixel), and their numbers."""
-    for window in every:
-        places = numbers(window, width)
-        selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        if places[selected].size:
-            yield window, selected, places[selected]
-
-
-def _picked(view: xr.Dataset, selected: Whole) -> xr.Dataset:
-    """Some pixels of a part of a capture, as one row."""
-    places = np.divmod(selected[np.newaxis], view.sizes["x"])
-    rows, columns = (xr.DataArray(place, dims=("y", "x")) for place in places)
-    return view.drop_vars(("y", "x"), errors="ignore").isel(y=rows, x=columns)
 
 
 def cut(
@@ -348,39 +292,41 @@ def cut(
     """
     displacement, method = inputs.displacement, inputs.method
     load, source = _loader(inputs, rows)
-    width, time = inputs.capture.sizes["x"], inputs.capture["time"].values.astype(np.float64)
+    width, frames = inputs.capture.sizes["x"], inputs.capture.sizes["time"]
     most = largest(method, inputs.settings, inputs.capture)
-    size = most if displacement is None else max(width, _TOGETHER // time.size)
+    size = most if displacement is None else max(width, _TOGETHER // frames)
     size = (source.stop - source.start) * width if method.whole_image else size
-    segment = None
-    if "segment" in inputs.capture:
-        segment = inputs.capture["segment"].values.astype(np.intp)
     # Read each window, judge its samples, and group its pixels by their valid frames.
-    for window, selected, places in _wanted(windows(rows, width, size), width, wanted):
+    for window in windows(rows, width, size):
+        places = numbers(window, width)
+        selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
+        places = places[selected]
+        if places.size == 0:
+            continue
         counts, usable, valid, status, gain = _sampled(inputs, load, source, window, selected)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        tile = _tile(inputs, counts, time, window, segment, selected)
-        needed = displacement is None or wanted is not None
-        division = _unpacked(inputs.division[:, places], time.size)
-        tile = replace(tile, surveyed=needed, division=division)
-        if material is not None:
-            tile = replace(tile, material=material.select_pixels(places))
+        packed = inputs.division[:, places]
+        division = np.unpackbits(packed, axis=0, count=frames).view(bool) if packed.any() else None
+        tile = replace(
+            _tile(inputs, counts, window, selected),
+            surveyed=displacement is None or wanted is not None,
+            division=division,
+            material=None if material is None else material.select_pixels(places),
+        )
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0], selected)
-        sections = []
-        for frames, pixels in sets:  # of which there may be many, each of few pixels
+        sections = list[Section]()
+        for used, pixels in sets:  # of which there may be many, each of few pixels
             whole = method.whole_image or np.all(pixels)
-            piece = tile if whole else tile.select_pixels(pixels)
-            sections.append(
-                (frames, pixels, piece if np.all(frames) else piece.select_frames(frames))
-            )
-        if displacement is not None:
-            sections = [
-                piece for section in sections for piece in of_one_noise(*section, gain, most)
-            ]
+            section = tile if whole else tile.select_pixels(pixels)
+            section = section if np.all(used) else section.select_frames(used)
+            groups = iter([(used, pixels, section)])
+            if displacement is not None:
+                groups = of_one_noise(used, pixels, section, gain, most)
+            sections.extend(groups)
         yield Cut(window, places, status, valid, sections)
 
 
@@ -395,8 +341,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     counts, usable, _, status, gain = _sampled(inputs, load, source, window, slice(None))
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
-    time = inputs.capture["time"].values
-    signals = _tile(inputs, counts, time, window, None, slice(None)).signals
+    signals = _tile(inputs, counts, window, slice(None)).signals
     signals = signals if frames.all() else signals[:, frames]  # no copy: a row may be large
     return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
@@ -424,27 +369,18 @@ def _sampled(
     block, grains = load()
     rows = slice(window[0].start - source.start, window[0].stop - source.start)
     view = block.isel(y=rows, x=window[1])
-    view = view if isinstance(selected, slice) else _picked(view, selected)
+    if not isinstance(selected, slice):  # as one row
+        places = np.divmod(selected[np.newaxis], view.sizes["x"])
+        y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)
+        view = view.drop_vars(("y", "x"), errors="ignore").isel(y=y, x=x)
     counts, valid, status = quality.read(view, fewest, grains)
     counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
     return counts, usable, valid, status, np.ones((2, status.size))
 
 
-def _unpacked(division: npt.NDArray[np.uint8], frames: int) -> Mask | None:
-    """Frames with which the pieces of the time begin (time, pixel); None if none are kept."""
-    return np.unpackbits(division, axis=0, count=frames).view(bool) if division.any() else None
-
-
-def _tile(
-    inputs: Inputs,
-    counts: Array,
-    time: Array,
-    window: Window,
-    segment: Whole | None,
-    selected: slice | Whole,
-) -> Tile:
+def _tile(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole) -> Tile:
     """Tile of counts (band, time, pixel) [count], the quietest band first, of some of a window."""
-    bands = inputs.bands
+    bands, place = inputs.bands, (window[0].start, window[1].start)
     curves = tuple(inputs.curves[band] for band in bands)
     emissivity, covariance = (
         None
@@ -462,13 +398,13 @@ def _tile(
         np.divide(signal, curve.reference_slope, out=signal)
     return Tile(
         signals=signals,
-        time=time,
+        time=inputs.capture["time"].values.astype(np.float64),
         curves=curves,
-        noise=tuple(float(inputs.noise[band]) for band in bands),
+        noise=tuple(inputs.noise[bands].tolist()),
         shape=(height, counts.shape[2] // height),
-        rng=generator(inputs.seed, window),
-        pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
-        segment=segment,
+        rng=np.random.default_rng(np.random.SeedSequence(inputs.seed, spawn_key=place)),
+        pattern=tuple(inputs.pattern[bands]),
+        segment=schema.segments(inputs.capture),
         emissivity=emissivity,
         emissivity_covariance=covariance,
     )
@@ -476,7 +412,7 @@ def _tile(
 
 def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
-) -> Iterator[tuple[Mask, Mask, Tile]]:
+) -> Iterator[Section]:
     """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
 
     A residual pattern is independent from pixel to pixel, and is scaled like the noise.
@@ -490,9 +426,6 @@ def of_one_noise(
             group[np.flatnonzero(pixels)[chosen]] = True
             factor = np.exp(np.log(gain[:, group]).mean(axis=1))
             factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
-            single = replace(
-                tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist())
-            )
-            if tile.pattern is not None:
-                single = replace(single, pattern=tuple((factors * tile.pattern).tolist()))
+            noise, pattern = (tuple(factors * stds) for stds in (tile.noise, tile.pattern))
+            single = replace(tile.select_pixels(chosen), noise=noise, pattern=pattern)
             yield frames, group, single

@@ -21,8 +21,7 @@ _GROWTH: Final = 1.5
 _AGREE: Final = 1.5
 # Variance that is stated over that of the noise: the rest is what a window bends [1].
 _BENT: Final = 1.6
-# Half-width from which the polynomial is a parabola, and a line below [frame].
-_PARABOLA: Final = 4
+_PARABOLA: Final = 4  # half-width from which the polynomial is a parabola, and a line below [frame]
 
 
 @kernels.compiled

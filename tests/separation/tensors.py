@@ -41,7 +41,8 @@ def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> 
         return torch.tensor(values, device=device) if isinstance(values, np.ndarray) else values
 
     model = pixel.Model(*map(tensor, fused.share(tile, functions, drift)))
-    material = {} if tile.material is None else dict(vars(tile.material.each(tensor)))
+    material = {} if tile.material is None else vars(tile.material)
+    material = {name: tensor(values) for name, values in material.items()}
     signals = tensor(tile.signals)
     work = _steps(model, material, signals, signals)
     result = {name: getattr(work, name) for name in Solution.__dataclass_fields__}
@@ -208,7 +209,7 @@ def _scatter(model: Model, signals: Tensor) -> tuple[Tensor, Tensor]:
 
 def _less_noise(model: Model, scatter: Tensor, order: Tensor) -> tuple[Tensor, Tensor]:
     """Scatter less noise (3, band, band, pixel) at the orders of a survey, and its freedom."""
-    rapid = reflection_ratio.rapid_orders(len(scatter))
+    rapid = np.array([max(1, len(scatter) - reflection_ratio.FEWER), len(scatter)])
     orders = torch.stack([order, *(torch.full_like(order, int(one)) for one in rapid)])
     free = model.functions.shape[1] - model.steps - orders
     unit = torch.eye(scatter.shape[-1], device=scatter.device)[..., None]

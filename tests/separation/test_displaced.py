@@ -156,9 +156,8 @@ def test_the_object_of_both_places_solves_the_equations() -> None:
         (following.size, pixels),
     )
     first = np.full(pixels, 0.9)
-    equations = Equations(
-        first, shares, there, onward, places[:loose], following, places[[loose]], bends
-    )
+    ways = places[:loose], following, places[[loose]]
+    equations = Equations(first, shares, there, onward, ways, bends)
     target = shares[0][:, np.newaxis] * object_[:-1] + shares[1][:, np.newaxis] * beyond
     change = first[loose] * (object_[loose + 1] - object_[loose])[np.newaxis]
     solution = equations.solve(target, np.zeros((pixels, frames)), change)

@@ -1,5 +1,6 @@
 """Compiled steps and the same steps on tensors: the same bits and values."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,8 @@ import xarray as xr
 from captures import emissivity_of
 
 from dbthermal import separation, simulation
-from dbthermal._arrays import Mask
-from dbthermal._smooth import Subspace
-from dbthermal.separation import SubspaceSettings as Settings
-from dbthermal.separation._subspace import method
+from dbthermal._smooth import Subspace, Whole
+from dbthermal.separation._subspace import fused
 from dbthermal.separation._subspace.fused import Solution
 from dbthermal.separation._tiles import Tile
 
@@ -33,18 +32,18 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-def on_tensors(tile: Tile, functions: Subspace, settings: Settings) -> Solution:
-    """Steps 1 to 4 on tensors."""
-    return tensors.solve("cpu", tile, functions, settings.background_drift)
-
-
-def divided_on_tensors(
-    tile: Tile, first: Mask, functions: Subspace, settings: Settings
+def on_tensors(
+    tile: Tile,
+    functions: Subspace,
+    drift: float,
+    divided: Iterable[tuple[Whole, Subspace]] | None = None,
 ) -> Solution:
-    """The same in pieces of time, pixels of the same pieces together."""
-    groups, every = zip(*method._parts(tile, first, functions), strict=True)
+    """Steps 1 to 4 on tensors; in pieces of time, pixels of the same pieces together."""
+    if divided is None:
+        return tensors.solve("cpu", tile, functions, drift)
+    groups, every = zip(*divided, strict=True)
     per_pixel = [
-        on_tensors(tile.select_pixels(places), pieces, settings)
+        tensors.solve("cpu", tile.select_pixels(places), pieces, drift)
         for places, pieces in zip(groups, every, strict=True)
     ]
     order = np.argsort(np.concatenate(groups))
@@ -76,8 +75,7 @@ def test_a_capture_on_tensors(case: str, monkeypatch: pytest.MonkeyPatch) -> Non
     capture = capture.assign(added)
     options["mask"] = xr.DataArray(mask, dims=("time", "y", "x"))
     one = separation.solve(capture, rig.response(), **options)
-    monkeypatch.setattr(method, "_solve", on_tensors)
-    monkeypatch.setattr(method, "_divided", divided_on_tensors)
+    monkeypatch.setattr(fused, "solve", on_tensors)
     other = separation.solve(capture, rig.response(), **options)
     np.testing.assert_array_equal(other["status"], one["status"])
     assert int(one["object_temperature"].notnull().any("time").sum()) >= 5

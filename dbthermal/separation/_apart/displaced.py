@@ -9,6 +9,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar
 
@@ -33,13 +34,11 @@ _UNSOLVED: Final = 1e-2
 # A place so far outside of the image is still at its border, as a shift that is known may be off by
 # so much [pixel].
 _OUTSIDE: Final = 0.2
-# Weight of pixels without a value that the others may take over [1].
-_LOST_WEIGHT: Final = 0.25
+_LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that the others may take over [1]
 # Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
-# Weight below which a pixel's flags do not count [1].
-_NO_WEIGHT: Final = 1e-3
+_NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
 # Memory of samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
 
@@ -78,11 +77,6 @@ class Displacement:
             return rows
         return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
 
-    @property
-    def moves(self) -> bool:
-        """Some reflection is seen at another place."""
-        return bool(self.resample.nnz > self.resample.shape[0])
-
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the pixels of some rows of the source, for those of some rows."""
         width = self.shape[1]
@@ -93,13 +87,10 @@ class Displacement:
         return csr_array((self.resample.data[entries], columns, start - start[0]), shape=shape)
 
 
-def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
+def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacement:
     """Check a field of the reflections' shift, see `solve`, against the capture, and invert it."""
     label = "the reflection shift"
-    if not isinstance(field, xr.Dataset):
-        raise TypeError(
-            f"Invalid reflection_shift of type {type(field).__name__}. Must be a Dataset."
-        )
+    schema.require(field, xr.Dataset, "reflection_shift")
     schema.check(field, "reflection_shift")
     names = [str(name) for name in corrected["band"].values]
     _check_bands(field, names, names[reference])
@@ -205,10 +196,9 @@ def paired(
     The source is read if they are not kept; only those of a small capture are.
     """
     films, key = displacement.read, (rows.start, rows.stop)
-    every, chosen = (
-        (*key, None),
-        (*key, None if isinstance(selected, slice) else selected.tobytes()),
-    )
+    every = chosen = (*key, b"")
+    if not isinstance(selected, slice):
+        chosen = (*key, selected.tobytes())
     if chosen not in films:
         reading = films.get(every)
         if reading is None:
@@ -219,9 +209,8 @@ def paired(
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, reading = 1.0, tuple(select(film, selected) for film in reading)
-        size, held = (
-            sum(film.nbytes for film in group) for group in (reading, chain(*films.values()))
-        )
+        groups = reading, chain(*films.values())
+        size, held = (sum(film.nbytes for film in group) for group in groups)
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
             return reading
         films[chosen] = reading
@@ -237,17 +226,15 @@ def read(
     fewest: int,
     grains: list[samples.Grain],
 ) -> tuple[Array, Mask, Bits, Array]:
-    """
-    Read some rows of the reference band, and what the others show of the same reflections.
+    """Read some rows of the reference band, and what the others show of the same reflections.
 
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
     `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
-    first = block.isel(
-        band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
-    )
+    inner = slice(rows.start - source.start, rows.stop - source.start)
+    first = block.isel(band=[reference], y=inner)
     weights = displacement.weights(rows, needed)
     used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
@@ -280,13 +267,9 @@ def read(
     good = ~quality.unusable(flags)
     if "noise_factor" in block and np.any(block["noise_factor"][second_bands] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
-        key = (rows.start, rows.stop, source.start, source.stop)
-        gain *= displacement.once(
-            key,
-            lambda: samples.resampled_noise(
-                seen[:, :, good], counts[second_bands], gain, displacement.shape[1]
-            ),
-        )
+        key, films = (rows.start, rows.stop, source.start, source.stop), counts[second_bands]
+        measure = partial(samples.resampled_noise, stated=gain, width=displacement.shape[1])
+        gain *= displacement.once(key, lambda: measure(seen[:, :, good], films))
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 
@@ -301,8 +284,7 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
-    """
-    Weights without the bad pixels, whose part the others take over; a plane stays one.
+    """Weights without the bad pixels, whose part the others take over; a plane stays one.
 
     Where that part is large the weights stay as they are.
     """

@@ -1,6 +1,6 @@
 """Equations that couple the object signals at both cameras' places, of all pixels; see `joint`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Final
 
@@ -26,18 +26,14 @@ from dbthermal.separation._subspace.reflection_ratio import (
     null_combination,
     ratio_variance,
 )
-from dbthermal.separation._tiles import Material
+from dbthermal.separation._tiles import Mask, Material, Whole
 
 Floats = npt.NDArray[np.floating[Any]]
-Mask = npt.NDArray[np.bool_]
-Whole = npt.NDArray[np.intp]
 
-# Share of an error that a step may leave.
-_LARGEST: Final = 0.95
+_LARGEST: Final = 0.95  # share of an error that a step may leave
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
 _MARGIN: Final = 0.02
-# Degree of the polynomial that the bend between two responses is.
-_DEGREE: Final = 4
+_DEGREE: Final = 4  # degree of the polynomial that the bend between two responses is
 
 
 @dataclass(frozen=True)
@@ -48,30 +44,25 @@ class Equations:
     shares: Floats  # c of eq. 6 (band, pixel) [1]
     there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
     onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
-    forward: Whole  # pixels solved for x(r)
-    backward: Whole  # pixels solved for x(p)
-    loose: Whole  # solved pixels without such neighbours
+    ways: tuple[Whole, ...]  # pixels solved for x(r), for x(p), and without such neighbours
     bends: Floats  # coefficients of u_m(x) - u_1(x) of u_1(x) (band - 1, degree + 1), rising
 
     @cached_property
     def solved(self) -> Whole:
         """Pixels that are solved."""
-        return np.sort(np.concatenate([self.forward, self.backward, self.loose]))
+        return np.sort(np.concatenate(self.ways))
 
     @cached_property
     def packed(self) -> "Equations":
         """Return the equations of the solved pixels alone, numbered anew."""
-        places, number = self.solved, np.zeros(self.first.size, dtype=np.intp)
-        number[places] = np.arange(places.size)
-        return Equations(
+        places = self.solved
+        return replace(
+            self,
             first=self.first[places],
             shares=np.ascontiguousarray(self.shares[:, places]),
             there=self.there[places][:, places],
             onward=self.onward[:, places],
-            forward=number[self.forward],
-            backward=number[self.backward],
-            loose=number[self.loose],
-            bends=self.bends,
+            ways=tuple(np.searchsorted(places, pixels) for pixels in self.ways),
         )
 
     def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -87,23 +78,18 @@ class Equations:
         return result
 
     def solve(self, target: Floats, start: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
-        """
-        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
+        """Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
         """
         way, place = np.zeros((2, self.first.size), dtype=np.intp)
-        for number, pixels in (
-            (relaxation.BACKWARD, self.backward),
-            (relaxation.LOOSE, self.loose),
-        ):
+        for number, pixels in enumerate(self.ways):
             way[pixels], place[pixels] = number, np.arange(pixels.size)
-        there, onward = (
-            (part.indptr, part.indices, part.data) for part in (self.there, self.onward)
-        )
+        matrices = self.there, self.onward
+        there, onward = ((part.indptr, part.indices, part.data) for part in matrices)
         beyond = np.ascontiguousarray((self.onward @ self.shares[1:].T).T)
-        moved = np.asarray(change / self.first[self.loose, np.newaxis], np.float32)
+        moved = np.asarray(change / self.first[self.ways[relaxation.LOOSE], np.newaxis], np.float32)
         terms = relaxation.Terms(self.shares, self.bends, way, place, there, onward, beyond, moved)
         target, signal = (np.array(film, np.float32, order="C") for film in (target, start))
         at_p, step = np.empty_like(signal), np.zeros(len(signal), np.float32)
@@ -148,10 +134,9 @@ def of_ratio(inputs: Inputs, material: Material) -> Floats:
     """Variance (pixel) [1] of the first weight by that of a material's ratios, 0 without one."""
     noise = inputs.noise[inputs.bands]
     std = np.sqrt(ratio_variance(material.ratio, material.inverse_energy, noise))
-    change = [
-        null_combination(ratio, noise)[0][0] for ratio in (material.ratio, material.ratio + std)
-    ]
-    return np.asarray(np.nan_to_num((change[1] - change[0]) ** 2))
+    ratios = material.ratio, material.ratio + std
+    before, after = (null_combination(ratio, noise)[0][0] for ratio in ratios)
+    return np.asarray(np.nan_to_num((after - before) ** 2))
 
 
 def coefficients(inputs: Inputs, emissivity: Floats, solved: Mask) -> Floats:
@@ -180,9 +165,7 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
         shares=shares,
         there=csr_array(diags_array(linked.astype(np.float32)) @ at_p.astype(np.float32)),
         onward=csr_array(onward[backward].astype(np.float32)),
-        forward=np.flatnonzero(linked & strong),
-        backward=backward,
-        loose=np.flatnonzero(solved & ~linked),
+        ways=(np.flatnonzero(linked & strong), backward, np.flatnonzero(solved & ~linked)),
         bends=bends(tuple(inputs.curves[band] for band in inputs.bands)),
     )
 
@@ -275,7 +258,7 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
 
     A sample that is no measurement is 0, an outlier of the regression.
     """
-    capture, reference = inputs.capture, inputs.bands[0]
+    capture, reference, width = inputs.capture, inputs.bands[0], inputs.capture.sizes["x"]
     counts = capture["counts"].isel(band=reference, time=frames).values
     counts = np.where(schema.measured(counts), counts, np.nan).reshape(frames.size, -1)
     curve, functions = inputs.curves[reference], smooth_functions(capture)
@@ -284,15 +267,13 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
     if functions.steps:
         of_camera = functions.functions - functions.object_part
         for rows in inputs.blocks:
-            pixels = np.arange(rows.start, rows.stop)[:, np.newaxis] * capture.sizes["x"]
-            pixels = (pixels + np.arange(capture.sizes["x"])).ravel()
+            pixels = np.arange(rows.start * width, rows.stop * width)
             steps[:, pixels] = of_camera[frames] @ (functions.functions.T @ _film(inputs, pixels))
     return first, steps
 
 
 def change(inputs: Inputs, loose: Whole) -> Change:
-    """
-    Change of the reference band's signal to p of loose pixels, smoothed over time.
+    """Change of the reference band's signal to p of loose pixels, smoothed over time.
 
     So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
     no part in it.
@@ -342,6 +323,5 @@ def _film(inputs: Inputs, pixels: Whole) -> Floats:
 def smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
     """Smooth functions of the frames of a capture, with the steps of the camera."""
     time = capture["time"].values[frames].astype(np.float64)
-    segment = capture["segment"].values[frames].astype(np.intp) if "segment" in capture else None
     order = min(HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=segment)
+    return smooth.subspace(time, order, segment=schema.segments(capture)[frames])

@@ -32,20 +32,19 @@ from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours, relaxation
-from dbthermal.separation._apart.equations import Floats, Mask, Whole
+from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
-from dbthermal.separation._tiles import USELESS, Material
+from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
+_OBJECT: Final = ("object_temperature", "object_temperature_std")
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20
 _SETTLED: Final = 1e-3
-# Change of the object [K] below which its emissivity is not told.
-_LEAST_CHANGE: Final = 0.1
-# Frames that are solved together.
-_FRAMES: Final = 8
+_LEAST_CHANGE: Final = 0.1  # change of the object [K] below which its emissivity is not told
+_FRAMES: Final = 8  # frames that are solved together
 # Frames from which it is told whether the object's gradient matters, and the share of the object's
 # deviation from which it does, in more than a few of the samples.
 _LOOKED_AT: Final = 32
@@ -82,10 +81,7 @@ class Frames:
         film that is one of them. Where they are off by more than a share of its deviation, in more
         than a few of the samples, the object changes rapidly.
         """
-        film, std = (
-            result[name].values.reshape(result.sizes["time"], -1)
-            for name in ("object_temperature", "object_temperature_std")
-        )
+        film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
         functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
         count = _NODES * functions.shape[1]
@@ -97,10 +93,6 @@ class Frames:
         if nodes.size == time.size or not _most(off) < _NO_MATTER:
             return cls(every, None)
         return cls(nodes, weights)
-
-    def parts(self) -> list[slice]:
-        """Nodes that are solved together."""
-        return [slice(at, at + _FRAMES) for at in range(0, self.nodes.size, _FRAMES)]
 
 
 def _most(values: Floats) -> float:
@@ -160,10 +152,8 @@ class Joint:
         near = distance_transform_edt(lost, return_distances=False, return_indices=True)
         curves = np.nan_to_num(curves[:, near[0], near[1]])
         # A reflection resampled off by dd: dq = sum_m w_m (1 - e_m) grad(y) . dd, smoothed in time.
-        weight = (
-            (1.0 - self.emissivity[1:]) * system.weights(self.inputs, self.emissivity)[1:]
-        ).sum(0)
-        off = np.nan_to_num(weight * displacement.std).reshape(2, *status.shape)
+        weights = (1.0 - self.emissivity) * system.weights(self.inputs, self.emissivity)
+        off = np.nan_to_num(weights[1:].sum(0) * displacement.std).reshape(2, *status.shape)
         slopes = [
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component
             for axis, component in zip((1, 2), off, strict=True)
@@ -193,8 +183,7 @@ def solve(
     before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
-    """
-    Solve the equations of all pixels, from a result that takes x(p) for x(r).
+    """Solve the equations of all pixels, from a result that takes x(p) for x(r).
 
     Or from one of inputs with the difference of a solution `before`. Of an object that changes
     smoothly the combination without background is that of the `maps`, at the ratios of a material,
@@ -208,7 +197,7 @@ def solve(
         places, sampled = equations.solved, looked_at(result.sizes["time"])
         if pooled and frames.smooth:
             sampled = frames.nodes
-        change = system.change(inputs, equations.loose)
+        change = system.change(inputs, equations.ways[relaxation.LOOSE])
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)
         else:
@@ -250,7 +239,7 @@ def solve(
             at_r, at_p, _ = objects_at(sampled, equations, at_r)
         solutions = [(slice(None), (at_r, at_p, step))]
         if sampled is not frames.nodes:
-            groups = frames.parts()
+            groups = [slice(at, at + _FRAMES) for at in range(0, frames.nodes.size, _FRAMES)]
             results = threads.map(lambda nodes: objects_at(frames.nodes[nodes], equations), groups)
             solutions = list(zip(groups, results, strict=True))
         signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
@@ -328,10 +317,7 @@ def _by_film(
 ) -> tuple[Target, Floats]:
     """Combination that an object of a result has by its shares, and its deviation (solved) [K]."""
     frames, places = result.sizes["time"], equations.solved
-    film, stds = (
-        result[name].values.reshape(frames, -1)
-        for name in ("object_temperature", "object_temperature_std")
-    )
+    film, stds = (result[name].values.reshape(frames, -1) for name in _OBJECT)
     stds = stds[looked_at(frames)][:, places]
     # In units of the deviation or, of a method without one, of the noise.
     stds = np.where(np.isfinite(stds), stds, inputs.noise.min())
@@ -390,8 +376,7 @@ def _emissivities(
 def _emission(
     places: tuple[Floats, Floats], band: tuple[Floats, Floats], emissivity: Floats, noise: float
 ) -> tuple[Floats, Floats, Mask]:
-    """
-    Emissivity of the first band as its slope over the object, its variance, and where it is told.
+    """Emissivity of the first band as its slope over the object, its variance, and where it holds.
 
     Of the object's signals at both places (solved, frame), and those of the band and the steps of
     the camera in it (frame, solved).
@@ -399,7 +384,9 @@ def _emission(
     signal = places[0].T.astype(np.float64)
     line = regression.lines(signal, np.asarray(band[0], np.float64), noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
-    steep = np.maximum(_slope(*places), 1.0)
+    centred = places[0] - places[0].mean(axis=1, keepdims=True)
+    slope = (centred * places[1]).sum(axis=1) / (centred**2).sum(axis=1)
+    steep = np.where(np.isfinite(slope) & (slope > 1.0), slope, 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
     by_steps = (line.kernel(signal) * band[1]).sum(axis=0)
     variance = (line.variance + by_steps**2) / steep**2
@@ -407,19 +394,11 @@ def _emission(
     return emissivity + (line.slope - emissivity) / steep, variance, sound
 
 
-def _slope(abscissa: Floats, ordinate: Floats) -> Floats:
-    """Slope (pixel) of signals (pixel, frame) over others."""
-    abscissa = abscissa - abscissa.mean(axis=1, keepdims=True)
-    slope = (abscissa * ordinate).sum(axis=1) / (abscissa**2).sum(axis=1)
-    return np.where(np.isfinite(slope), slope, 1.0)
-
-
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _factor(
     inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
 ) -> Floats:
-    """
-    Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
+    """Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 
     The `std` (2, pixel) [K] is that of a pixel alone, and of its target through the emissivity; the
     `variance` (loose) [K^2] that of the change.
@@ -453,11 +432,7 @@ def _factor(
     sized, power = size[:, 0] > 0, equations.spread(power)
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
-    energy, total = (
-        convolve(
-            np.where(settled, values, 0.0).reshape(displacement.shape), np.ones((3, 3))
-        ).ravel()
-        for values in (power, size[:, 0] ** 2)
-    )
+    powers = np.where(settled, [power, size[:, 0] ** 2], 0.0).reshape(2, *displacement.shape)
+    energy, total = convolve(powers, np.ones((1, 3, 3))).reshape(2, -1)
     factor = np.divide(energy, total, out=np.full_like(energy, np.nan), where=settled)
     return np.where(sized, factor, 1.0)

@@ -23,7 +23,7 @@ from dbthermal._arrays import Array
 from dbthermal._samples import neighbour_mean
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
-from dbthermal.separation._apart.equations import Floats, Mask
+from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
@@ -31,7 +31,7 @@ from dbthermal.separation._pooling.ratios import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
-from dbthermal.separation._tiles import Material, Survey
+from dbthermal.separation._tiles import Mask, Material, Survey
 
 BLUR: Final = 1.0
 """Deviation of the blur of the bands whose ratios are compared [pixel]."""
@@ -53,8 +53,7 @@ _AROUND: Final = 0.125
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
-    """
-    Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
+    """Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
 
     Their variance is times the reduced chi-square about the mean of those around. A pixel whose
     model does not hold takes that mean, with the variance of the ratios around beside their mean.
@@ -75,20 +74,12 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     chi = neighbour_mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
     surrounded = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
     doubtful = moving & ~sound & surrounded
-    variance = np.where(
-        doubtful, neighbour_mean((ratio - mean) ** 2, weight, _WIDE), variance * np.maximum(chi, 1)
-    )
+    between = neighbour_mean((ratio - mean) ** 2, weight, _WIDE)
+    variance = np.where(doubtful, between, variance * np.maximum(chi, 1))
     ratio = np.where(doubtful, mean, np.where(sound, ratio, np.nan)).reshape(len(noise), -1)
     inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
     none = np.full(status.size, np.nan)
-    return Material(
-        ratio=ratio,
-        inverse_energy=inverse.mean(axis=0),
-        emissivity=none,
-        noise_variance=none,
-        drift_variance=none,
-        spread=np.zeros(status.size),
-    )
+    return Material(ratio, inverse.mean(axis=0), none, none, none, np.zeros(status.size))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -111,9 +102,8 @@ def materials(
     for blur, scatter in scatters.items():
         size = 1 + 2 * int(np.ceil(TAIL * blur))
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
-        places = np.flatnonzero(
-            pool.select(np.where(inner.ravel() & scatter.usable, inputs.labels, -1))
-        )
+        selected = pool.select(np.where(inner.ravel() & scatter.usable, inputs.labels, -1))
+        places = np.flatnonzero(selected)
         if places.size:  # else all materials are too narrow
             image = Image(inputs.labels, places, shape[1])
             survey = _survey(scatter, per_pixel, noise, places)
@@ -139,7 +129,8 @@ def _survey(
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
     sound = ((status & _BROKEN) == 0) & ~scatters.apart[places]
-    scatter = np.where(sound, scatters.whitened(noise)[..., places], 0.0)
+    scale = scatters.noise[:, places] / noise[:, np.newaxis]  # whitened by the noise of samples
+    scatter = np.where(sound, scatters.scatter[..., places] * scale * scale[:, np.newaxis], 0.0)
     frames = np.where(sound, scatters.freedom[places], 0.0)
     return Survey(
         scatter=np.stack([scatter] * 3),
@@ -208,8 +199,7 @@ def emissivities(inputs: Inputs, result: xr.Dataset) -> Floats:
 def shared(
     value: Floats, variance: Floats, sound: Mask, shape: tuple[int, ...]
 ) -> tuple[Floats, Floats]:
-    """
-    Values (pixel) [1] that lean on those around, the more the less they are known; and variances.
+    """Values (pixel) [1] that lean on their neighbours, the more the less certain; and variances.
 
     The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
     The variances are times the reduced chi-square about the median of those around, for a slow

@@ -20,6 +20,7 @@ from numpy.polynomial import Polynomial
 from scipy.ndimage import correlate1d
 
 from dbthermal import _smooth as smooth
+from dbthermal import schema
 from dbthermal._arrays import Array, Mask, release
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
@@ -35,8 +36,7 @@ TAIL: Final = 3.0
 # Functions of the rapid changes, pixels that make them, and degree of the responses' polynomials.
 _PLANES, _SAMPLE = 128, 1024
 _DEGREE: Final = 7
-# Share of a neighbourhood without which a blurred pixel is none [1].
-_LEAST_SHARE: Final = 1e-3
+_LEAST_SHARE: Final = 1e-3  # share of a neighbourhood without which a blurred pixel is none [1]
 # Deviations of noise across the axis of the ratios from which the bands are apart.
 _APART: Final = 8.0
 _TINY: Final = float(np.finfo(np.float64).tiny)
@@ -55,16 +55,12 @@ class Scatters:
     @np.errstate(invalid="ignore", divide="ignore")
     def ratio(self) -> Array:
         """Reflection ratios (band, pixel) [1]: the principal axis."""
-        axis = np.linalg.eigh(np.moveaxis(self.scatter, -1, 0))[1][..., -1].T * self.noise
-        return np.asarray(axis / axis[0])
+        return reflection_ratio.principal_ratio(np.moveaxis(self.scatter, -1, 0), self.noise)
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def variance(self, ratio: Array) -> Array:
         """Variance (band, pixel) [1] of ratios (eq. 4); infinite where nothing is reflected."""
-        whitened = ratio / self.noise
-        length = (whitened**2).sum(axis=0)
-        energy = np.einsum("bp,bcp,cp->p", whitened, self.scatter, whitened) / length**2
-        inverse = reflection_ratio.inverse_energy(np.maximum(energy, 0.0), length, self.freedom)
+        inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)
         return np.asarray(inverse * (self.noise**2 + (ratio * self.noise[0]) ** 2))
 
     @property
@@ -74,11 +70,6 @@ class Scatters:
         whole = np.moveaxis(self.scatter, -1, 0)
         across = trace - np.linalg.eigvalsh(whole)[:, -1]
         return np.asarray(across > _APART * np.sqrt(2.0 * (bands - 1) * self.freedom))
-
-    def whitened(self, noise: Array) -> Array:
-        """Scatter (band, band, pixel) [1] whitened by another noise (band) [K]."""
-        scale = self.noise / noise[:, np.newaxis]
-        return np.asarray(self.scatter * scale * scale[:, np.newaxis])
 
 
 @dataclass(frozen=True)
@@ -144,7 +135,7 @@ def project(
     straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
-    noise[1] = (inputs.noise[bands] / _interpolated(inputs)[bands])[:, np.newaxis, np.newaxis]
+    noise[1] = (inputs.noise / schema.noise_factor(inputs.capture))[bands, None, None]
     response = _response(tuple(inputs.curves[band] for band in bands))
     film = result["object_temperature"].values.reshape(len(rapid), -1)
 
@@ -202,18 +193,12 @@ def _polynomial_at(series: Array, place: float) -> float:
 
 
 @compiled
-def _emitted(response: Response, temperature: float) -> float:
-    """Signal of a blackbody in the first band less the reference [K]."""
-    place = (temperature - response.middle) / response.half
-    return float(_polynomial_at(response.series, place))
-
-
-@compiled
 def _emit(film: npt.NDArray[np.float32], response: Response, emitted: Any) -> None:
-    """Signals (time, pixel) [K] of blackbodies in the first band, in place."""
+    """Signals (time, pixel) [K] of blackbodies in the first band less the reference, in place."""
     for t in range(film.shape[0]):
         for p in range(film.shape[1]):
-            emitted[t, p] = _emitted(response, film[t, p])
+            place = (film[t, p] - response.middle) / response.half
+            emitted[t, p] = _polynomial_at(response.series, place)
 
 
 @compiled
@@ -263,13 +248,6 @@ def _response(curves: tuple[Curve, ...]) -> Response:
     series = np.asarray(Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef, np.float64)
     bends = system.bends(curves).astype(np.float64)
     return Response(series, 0.5 * (low + high), 0.5 * (high - low), bends)
-
-
-def _interpolated(inputs: Inputs) -> Array:
-    """Noise (band) [1] over that before a registration interpolated it."""
-    capture = inputs.capture
-    whole = np.ones(capture.sizes["band"])
-    return np.asarray(capture["noise_factor"].values if "noise_factor" in capture else whole)
 
 
 def _functions(inputs: Inputs) -> Array:

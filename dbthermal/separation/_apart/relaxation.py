@@ -18,8 +18,7 @@ CONVERGED: Final = 1e-3
 Rows: TypeAlias = tuple[Whole, Whole, Floats]
 """Starts of the rows, columns and values of a sparse matrix."""
 
-# By which equation a pixel is solved.
-FORWARD, BACKWARD, LOOSE = range(3)
+FORWARD, BACKWARD, LOOSE = range(3)  # by which equation a pixel is solved
 
 
 class Terms(NamedTuple):

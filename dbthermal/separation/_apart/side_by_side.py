@@ -21,10 +21,8 @@ from dbthermal.separation._tiles import Material
 Each: TypeAlias = Callable[[Inputs, Material | None], object]
 """Separates each pixel alone, into the result."""
 
-# Turns of the materials and the object of each camera's own place.
-_TURNS: Final = 2
-# What a displacement keeps of the pixels alone.
-_OBJECTS: Final = "objects"
+_TURNS: Final = 2  # turns of the materials and the object of each camera's own place
+_OBJECTS: Final = "objects"  # what a displacement keeps of the pixels alone
 
 
 def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Executor) -> None:
@@ -35,7 +33,8 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
     inputs.division[:] = 0  # it holds what each camera sees to rise
     material, blur, maps, objects = None, 0.0, None, None
     frames = joint.Frames.of(result)
-    if inputs.method.pools and displacement.moves:
+    moves = displacement.resample.nnz > displacement.resample.shape[0]  # reflections, somewhere
+    if inputs.method.pools and moves:
         if not frames.smooth:  # what one camera sees to rise the other sees at another time
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)

@@ -158,10 +158,8 @@ def filled(
     result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, context: Beside, workers: int
 ) -> xr.Dataset:
     """Complete a result in place, see `complete`."""
-    shared: dict[str, Any] = {
-        "pool": context.materials,
-        "reflection_shift": context.reflection_shift,
-    }
+    shared: dict[str, Any] = {"pool": context.materials}
+    shared["reflection_shift"] = context.reflection_shift
     kind = str(result.attrs.get("response_kind", "exact"))
     inputs = check(corrected, response, _METHOD, response_kind=kind, **shared)
     measured = result
@@ -237,9 +235,8 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: sli
     places = np.flatnonzero(pixels) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
         wanted = np.arange(start, min(start + tiles.PIXELS, places.size))
-        _complete_pixels(
-            scene, completed, tile.select_pixels(wanted), valid[:, wanted], places[wanted]
-        )
+        section = tile.select_pixels(wanted), valid[:, wanted], places[wanted]
+        _complete_pixels(scene, completed, *section)
     release()
 
 
@@ -260,18 +257,16 @@ def _complete_pixels(
         if not chosen.any():
             continue
         block = tile.select_pixels(chosen)
-        static, variance = scenes.solve_statics(
-            scene, block, valid[:, chosen], source, places[chosen]
-        )
+        where = source, places[chosen]
+        static, variance = scenes.solve_statics(scene, block, valid[:, chosen], *where)
         if source == scenes.MATERIAL:
             kept = ~scenes.contradicted(scene, static, places[chosen])
             sources[chosen] = np.where(kept, source, scenes.PRIOR)
             chosen = sources == source
             static, block = static.select_pixels(kept), block.select_pixels(kept)
             variance = variance[kept]
-        values = scenes.solve(
-            scene, block, valid[:, chosen], static, variance, measured[..., chosen]
-        )
+        constants = static, variance, measured[..., chosen]
+        values = scenes.solve(scene, block, valid[:, chosen], *constants)
         _fill(scene, completed, places[chosen], values, source)
 
 
@@ -285,14 +280,9 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
         names = (name, f"{name}_std")
         new = [values[key][order] if name in MAPS else values[key] for key in names]
         limits = (curve.lowest, curve.highest) if name == FILMS[0] else (-np.inf, np.inf)
-        _take(
-            *(completed[key].values for key in names),
-            *(np.asfortranarray(key) for key in new),
-            np.stack([y, x], axis=-1),
-            limits,
-            filled,
-            beyond,
-        )
+        films = (completed[key].values for key in names)
+        arrays = (np.asfortranarray(array) for array in new)
+        _take(*films, *arrays, np.stack([y, x], axis=-1), limits, filled, beyond)
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)

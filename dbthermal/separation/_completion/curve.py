@@ -78,9 +78,8 @@ def curve(
         inverse, right = gram / variance, moment / variance
         # Of a constant, quadratic and cubic part of variance p^2 is told nothing:
         # H - H b b^T H / (1 / p^2 + b^T H b).
-        for shape, deviation in zip(
-            _SHAPES, (offset[m - 1], bends[m - 1], bends[m - 1]), strict=True
-        ):
+        deviations = offset[m - 1], bends[m - 1], bends[m - 1]
+        for shape, deviation in zip(_SHAPES, deviations, strict=True):
             row = np.einsum("ijp,j->ip", inverse, shape)
             share = deviation**2 / (1.0 + deviation**2 * (shape @ row))
             right = right - row * (share * (shape @ right))

@@ -38,8 +38,7 @@ _WORSE: Final = 0.04
 _STEPS, _SETTLED = 8, 0.02
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
-# Where nothing bounds the fluctuation of the background: its variance [K^2].
-_VAGUE: Final = 1e6
+_VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
 
 
 @dataclass(frozen=True)
@@ -89,12 +88,9 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     arrays = (grid, prior.mean, prior.covariance, levels, *vars(data).values())
     share, means = np.empty((pixels, points)), np.empty((pixels, 2, size))
     spreads = np.empty((pixels, 2, size, size))
-    _moments(
-        frames.response_tables(tile),
-        np.log(prior.weight),
-        tuple(np.ascontiguousarray(np.moveaxis(array, -1, 0)) for array in arrays),
-        (share, means, spreads),
-    )
+    knowledge = tuple(np.ascontiguousarray(np.moveaxis(array, -1, 0)) for array in arrays)
+    tables, weight = frames.response_tables(tile), np.log(prior.weight)
+    _moments(tables, weight, knowledge, (share, means, spreads))
     (plain, mean), (covariance, spread) = (
         np.ascontiguousarray(np.moveaxis(array, 0, -1)) for array in (means, spreads)
     )
@@ -153,7 +149,7 @@ def _moments(
     for p in range(len(grids)):
         mean, covariance = means[p], covariances[p]
         if p == 0 or np.any(mean != means[p - 1]) or np.any(covariance != covariances[p - 1]):
-            _condition(mean, covariance, weight, grids[p], density, normal, whole)
+            _condition((weight, mean, covariance), grids[p], density, normal, whole)
         # About the best values at each point of the grid, with the components taken as one, by
         # the method of Gauss and Newton.
         for g in range(points):
@@ -180,19 +176,13 @@ def _moments(
 
 @compiled
 def _condition(
-    mean: Array,
-    covariance: Array,
-    weight: Array,
-    grid: Array,
-    density: Array,
-    normal: Array,
-    whole: Array,
+    prior: tuple[Array, Array, Array], grid: Array, density: Array, normal: Array, whole: Array
 ) -> None:
     """Log-density of the first emissivity, and mean and precision of the others at it, in place.
 
     The others are taken as independent given the first.
     """
-    last = grid.size - 1
+    (weight, mean, covariance), last = prior, grid.size - 1
     for g in range(grid.size):
         low, high = max(g - 1, 0), min(g + 1, last)
         log, off = density[g], grid[g] - mean[:, 0]
@@ -239,21 +229,15 @@ def _quadratic(
     Near (e_1, e_m, c): value; slopes with e_m, with c; curvatures with e_m, both, c.
     """
     nodes, informations, linears = curve
-    signal, emitted, rate, base, of_e, of_c = (
-        spare[0],
-        spare[1],
-        spare[2],
-        np.empty(4),
-        np.empty(4),
-        np.empty(4),
-    )
+    signal, emitted, rate = spare[0], spare[1], spare[2]
+    base, of_e, of_c = np.empty(4), np.empty(4), np.empty(4)
     for g in range(len(place)):
         c = signal[5 * g + 4] = place[g, -1]
         for i in range(4):
             signal[5 * g + i] = c + (nodes[i] - c) / place[g, 0]
     for m in range(len(linears)):
         information, linear = informations[m], linears[m]
-        other_band(tables[0], tables[1 + m], signal, emitted, rate, spare[3], spare[4])
+        other_band((tables[0], tables[1 + m]), signal, emitted, rate, spare[3:])
         for g in range(len(place)):
             e = place[g, 1 + m] = min(max(place[g, 1 + m], _BOUNDS[0]), _BOUNDS[1])
             # The model at the nodes, base + of_e e_m + of_c c.

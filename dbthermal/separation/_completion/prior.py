@@ -54,9 +54,8 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
     if isinstance(prior, str):
         known = emissivity.embedded_table()["emissivity"]
         if prior not in known["material"]:
-            raise ValueError(
-                f"Unknown prior '{prior}'. Must be one of {known['material'].values.tolist()}."
-            )
+            names = known["material"].values.tolist()
+            raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
         prior = known.sel(material=prior)
     std: xr.DataArray | None = None
     if isinstance(prior, xr.Dataset):

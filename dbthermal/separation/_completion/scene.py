@@ -44,8 +44,7 @@ _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 # Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
-# Precision of a level that a pixel does not show [1/K^2].
-_NOTHING: Final = 1e-9
+_NOTHING: Final = 1e-9  # precision of a level that a pixel does not show [1/K^2]
 
 Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
@@ -87,7 +86,7 @@ class Scene:
             noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
             shape=(1, valid.shape[1]),
             rng=np.random.default_rng(0),
-            pattern=None if inputs.pattern is None else tuple(inputs.pattern[inputs.bands]),
+            pattern=tuple(inputs.pattern[inputs.bands]),
         ), valid
 
     def sample(self) -> Sample:
@@ -118,7 +117,7 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
         covariance[..., wanted] = spread[..., np.newaxis]
         source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
-    pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
+    pattern = inputs.pattern[bands]
     curve = inputs.curves[bands[0]]
     return Scene(
         inputs=inputs,
@@ -212,12 +211,10 @@ def solve(
         signal, left = windows.smooth(statics.signal, statics.white, valid, tile.time)
         background, spread = statics.background, statics.background_variance
         if (selected := np.isfinite(measured[0]).any(axis=0)).any():
-            part, samples = (
-                static.select_pixels(selected),
-                (measured[..., selected], valid[:, selected]),
-            )
-            of_selected = part.emissivity, part.level, variance[selected], part.covariance
-            behind = frames.background(tile.select_pixels(selected), *samples, *of_selected)
+            moments, block = static.select_pixels(selected), tile.select_pixels(selected)
+            constants = moments.emissivity, moments.level, variance[selected], moments.covariance
+            samples = measured[..., selected], valid[:, selected]
+            behind = frames.background(block, *samples, *constants)
             seen = np.isfinite(behind).all(axis=0)
             for film, estimate in zip((background, spread), behind, strict=True):
                 film[:, selected] = np.where(seen, estimate, film[:, selected])

@@ -19,16 +19,14 @@ from dbthermal._arrays import Array, Mask, release
 from dbthermal.noise import MAD
 from dbthermal.separation._pooling.region_merging import Labels
 
-# Rows of a capture that are read at a time.
-_ROWS: Final = 64
+_ROWS: Final = 64  # rows of a capture that are read at a time
 # Standard deviation of the Gaussian window of the edge statistic, and distance of the windows'
 # centres from the pixel, to both sides [pixel].
 _BLUR: Final = 1.0
 _REACH: Final = 1
 # Edge strength [standard deviation] that a path longer by one pixel is worth.
 _COMPACTNESS: Final = 0.5
-# Share of the largest weight below which a window holds nothing [1].
-_EMPTY: Final = 1e-3
+_EMPTY: Final = 1e-3  # share of the largest weight below which a window holds nothing [1]
 
 
 def mean_signals(
@@ -76,17 +74,15 @@ def mean_signals(
 
 
 def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tuple[Array, Array]:
-    r"""
-    Reflection in the differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
+    r"""Reflection in differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
 
     The median is the background at rest, which makes no edges. 0 without a background estimate:
     that is where nothing moved; and of other pixels than those (y, x).
     """
-    share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * (
-        1.0 - result["emissivity"].values[bands[0]]
-    )
+    dark = 1.0 - result["emissivity"].values[bands[0]]
+    share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * dark
     films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
     frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
     for row in np.flatnonzero(of.any(axis=1)):
@@ -145,9 +141,8 @@ def superpixels(strength: Array, valid: Mask, spacing: int) -> Labels:
     rows, columns = (np.arange(min(spacing // 2, n - 1), n, spacing) for n in strength.shape)
     markers = np.zeros(strength.shape, dtype=np.intp)
     markers[np.ix_(rows, columns)] = 1 + np.arange(rows.size * columns.size).reshape(rows.size, -1)
-    flooded = segmentation.watershed(
-        strength, markers * valid, mask=valid, compactness=_COMPACTNESS
-    )
+    grown = {"markers": markers * valid, "mask": valid, "compactness": _COMPACTNESS}
+    flooded = segmentation.watershed(strength, **grown)
     return connected(np.where(valid, 1 + flooded, 0))
 
 

@@ -30,16 +30,12 @@ Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 DEGREE: Final = 4
 """Highest degree."""
 
-# Pixels for each coefficient, at least.
-_ENOUGH: Final = 4
-# Pixels in a square, about, of which the sum is looked at.
-_TOGETHER: Final = 16
+_ENOUGH: Final = 4  # pixels for each coefficient, at least
+_TOGETHER: Final = 16  # pixels in a square, about, of which the sum is looked at
 # Condition number of the normal equations from which a degree is not determined.
 _SINGULAR: Final = 1e8
-# Highest degree beside a step at a border.
-_SMOOTH: Final = 3
-# Deviations from which there is a spread, and at which a step must be visible.
-_SIGMAS: Final = 3.0
+_SMOOTH: Final = 3  # highest degree beside a step at a border
+_SIGMAS: Final = 3.0  # deviations from which there is a spread, and at which a step must be visible
 # Chance at which what is left of noise alone is taken for more [1].
 _CHANCE: Final = 0.01
 _TINY: Final = float(np.finfo(np.float64).tiny)
@@ -125,12 +121,8 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = _powers(asked, measured, more)
     left, side = Left(residual, cost), round(np.sqrt(_TOGETHER * asked[0].size / pixels))
-    return Gradient(
-        chosen,
-        value,
-        np.einsum("pi,ij,pj->p", at, covariance, at),
-        (left, left.over_squares(measured, max(side, 1))),
-    )
+    lefts = left, left.over_squares(measured, max(side, 1))
+    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
 
 
 def spreads(fits: list[Gradient]) -> list[float]:

@@ -61,12 +61,8 @@ _VAGUE: Final = 0.3
 _SMALLEST: Final = 16
 # Square of the deviations by which a ratio tells two materials apart.
 _TELLING: Final = 9.0
-_NEEDED: Final = (
-    "status",
-    *map(
-        "".join, product(("reflection_ratio", "emissivity", "background_temperature"), ("", "_std"))
-    ),
-)
+_VALUES: Final = ("reflection_ratio", "emissivity", "background_temperature")
+_NEEDED: Final = ("status", *map("".join, product(_VALUES, ("", "_std"))))
 _UNUSABLE: Final = Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL
 
 
@@ -226,6 +222,7 @@ def joined(
     merged.join_alike(pairs, _RESOLUTION)
     # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
     maps, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
+    reach = _SPACINGS[0]
     while grown:
         grown = False
         for pair in pairs:
@@ -233,18 +230,14 @@ def joined(
             if first == second:
                 continue
             # Around where the two cells touch.
-            window = tuple(
-                slice(
-                    max(0, max(a.start, b.start) - _SPACINGS[0]), min(a.stop, b.stop) + _SPACINGS[0]
-                )
-                for a, b in zip(*(boxes[cell - 1] for cell in pair), strict=True)
-            )
+            sides = zip(*(boxes[cell - 1] for cell in pair), strict=True)
+            ends = [(max(a.start, b.start), min(a.stop, b.stop)) for a, b in sides]
+            window = tuple(slice(max(0, low - reach), high + reach) for low, high in ends)
             roots = merged.roots()[cells[window]]
-            sides = roots == first, roots == second
-            ratios, feature_pair = (array.window(window) for array in maps)
-            if region_merging.alike(*sides, ratios, feature_pair) and region_merging.continuous(
-                *sides, feature_pair, _RESOLUTION, _SPACINGS[0]
-            ):
+            regions = roots == first, roots == second
+            ratios, both = (array.window(window) for array in maps)
+            same = region_merging.alike(*regions, ratios, both)
+            if same and region_merging.continuous(*regions, both, _RESOLUTION, reach):
                 merged.join(first, second)
                 grown = True
     return _labelled(cells, merged, per_pixel)
@@ -280,13 +273,10 @@ def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
     """Ratios of all bands but the reference; and these with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
-        result[name].values.astype(np.float64)
-        for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
+        result[name].values[bands].astype(np.float64) for name in _NEEDED[1:5]
     )
-    second_bands, first = bands[1:], bands[:1]
-    variances = ratio_std[second_bands] ** 2, emissivity_std[first] ** 2
-    features = _both(ratio[second_bands], variances[0], emissivity[first], variances[1])
-    return Features(*(array[: len(second_bands)] for array in vars(features).values())), features
+    features = _both(ratio[1:], ratio_std[1:] ** 2, emissivity[:1], emissivity_std[:1] ** 2)
+    return Features(*(array[:-1] for array in vars(features).values())), features
 
 
 def _both(ratio: Array, variance: Array, emissivity: Array, of_emissivity: Array) -> Features:
@@ -332,9 +322,8 @@ def _links(
         pixels = np.concatenate([first, second])
         least = _LEAST_STEP * np.abs(np.mean(change.ravel()[pixels]))
         where = np.divmod(pixels, cells.shape[1])
-        steps[index] = step(
-            where, values[:, pixels], noise[:, pixels].mean(axis=1), first.size, least
-        )
+        variance = noise[:, pixels].mean(axis=1)
+        steps[index] = step(where, values[:, pixels], variance, first.size, least)
     unbroken = steps < chdtri(len(emitted), _STEP_RATE)
     return pairs[unbroken], steps[unbroken]
 

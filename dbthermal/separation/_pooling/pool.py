@@ -29,8 +29,7 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 
 # Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
-# Rounds of leaving out pixels that are not of the material.
-_ROUNDS: Final = 6
+_ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
 # Share of the pixels from which those with an emissivity of their own speak for a material [1].
 _MAJORITY: Final = 0.5
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
@@ -38,8 +37,7 @@ _REACH: Final = 2
 _SINGLE: Final = 3
 # Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
 _HARDLY: Final = 0.5
-# Share of gray pixels from which their material is [1].
-_MOSTLY: Final = 0.5
+_MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of those around [1].
 _MORE: Final = 4.0
 _MORE_AROUND: Final = 1.5
@@ -72,19 +70,15 @@ def materials(
     image = Image(labels, places, inputs.capture.sizes["x"])
     material = estimate(image, labels[places], per_pixel, noise, stated)
     count = int(labels.max()) + 1
-    sound, valid = (
-        total(labels[places], 1.0 * values, count)
-        for values in (per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity))
-    )
+    conditions = per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity)
+    sound, valid = (total(labels[places], 1.0 * holds, count) for holds in conditions)
     asked = (valid <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
     if stated is not None or not np.any(asked):
         return material
     selected[places] = asked
     # The emissivity is a guess, of constant objects alone.
-    more = survey(inputs, replace(material, noise_variance=unknown), selected).select_pixels(
-        selected
-    )
-    per_pixel.replace_pixels(asked, more)
+    surveys = survey(inputs, replace(material, noise_variance=unknown), selected)
+    per_pixel.replace_pixels(asked, surveys.select_pixels(selected))
     return estimate(image, labels[places], per_pixel, noise, stated)
 
 
@@ -164,14 +158,16 @@ def _common(
         return common, used
     common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit=1)
     for degree in range(2, _ROUNDS + 2):
-        local = common.at(image.surveyed)
+        local = common.select_pixels(image.surveyed)
         used = np.where(uneven[labels], labels, used)
         for _ in range(_ROUNDS):
             outliers = most & ratios.outliers(used, ratio_set, local, survey, noise)
             if not np.any(outliers):
                 break
             used = np.where(outliers, -1, used)
-        even = ratios.scaled(survey, ratio_set.ratio[:, labels] / local.ratio)
+        change = ratio_set.ratio[:, labels] / local.ratio
+        factor = np.where(np.isfinite(change), change, 1.0)
+        even = replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
         ratio_set = ratios.estimate(used, uneven.size - 1, even, noise)
         seen, limit = np.where(most, used, -1), min(degree, gradients.DEGREE)
         common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit)
@@ -187,9 +183,8 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     value = survey.emissivity * (1.0 - product) / (1.0 - survey.emissivity * product)
     valid = (labels >= 0) & np.isfinite(value)
     where = np.where(valid, labels, -1)
-    value, noise, drift = (
-        np.where(valid, term, 0.0) for term in (value, survey.noise_variance, survey.drift_variance)
-    )
+    terms = value, survey.noise_variance, survey.drift_variance
+    value, noise, drift = (np.where(valid, term, 0.0) for term in terms)
     # Weights 1 / (var + median var): no pixel outweighs all others by a small variance.
     typical = np.median(noise[valid]) if np.any(valid) else np.nan
     weight = np.where(valid, 1.0 / (noise + typical), 0.0)
@@ -203,7 +198,8 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     expected = total(where, weight**2 * noise, count) / whole**2
     # Neighbours mirror the same people: var(mean) = sum_s (sum_i w (e - mean))^2 n / (n - 1) of n
     # squares s (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13).
-    squares = image.squares(_SQUARE)
+    rows, columns = np.divmod(image.surveyed, image.width)
+    squares = rows // _SQUARE * (image.width // _SQUARE + 1) + columns // _SQUARE
     groups = np.where(valid, where + count * squares, -1)
     sums = total(groups, weight * (value - mean[where]), count * (1 + int(squares.max())))
     sums = sums.reshape(-1, count)
@@ -275,14 +271,9 @@ def hold(
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
         stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
-    gray, gray_alone, still = (
-        (result["status"].values & np.uint32(flag)) != 0
-        for result, flag in (
-            (pooled, Status.GRAY),
-            (per_pixel, Status.GRAY),
-            (per_pixel, Status.NO_BACKGROUND_MOTION),
-        )
-    )
+    flags = np.uint32(Status.GRAY), np.uint32(Status.NO_BACKGROUND_MOTION)
+    gray = (pooled["status"].values & flags[0]) != 0
+    gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
     stay |= _share(labels.values, gray) > _MOSTLY
     common, single = sound & valid & ~stay, per_pixel["object_temperature_std"].values
     if not apart:
@@ -291,31 +282,24 @@ def hold(
     square, variance = np.zeros((2, *common.shape))
     every = slice(None, None, max(1, len(single) // _FRAMES))
     for row, columns in enumerate(sound & valid):
-        value, lone, std = (
-            film[every, row, columns].astype(np.float64) for film in (*films, single)
-        )
+        samples = (film[every, row, columns] for film in (*films, single))
+        value, lone, std = (sample.astype(np.float64) for sample in samples)
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
     local = np.where(common, _neighbour_mean(square, common), 0.0)
     more = common & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
-    constant = np.where(
-        valid & ~sound, _neighbour_mean(square * variance, common | (stay & sound)), 0.0
-    )
+    around = _neighbour_mean(square * variance, common | (stay & sound))
+    constant = np.where(valid & ~sound, around, 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
-    maps = [
-        (pooled[name].values, variable.values)
-        for name, variable in per_pixel.items()
-        if "x" in variable.dims
-    ]
+    names = [name for name, variable in per_pixel.items() if "x" in variable.dims]
+    maps = [(pooled[name].values, per_pixel[name].values) for name in names]
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
         columns, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
-        added = (
-            factor[row, columns] * np.nan_to_num(single[:, row, columns]) ** 2
-            + constant[row, columns]
-        )
+        added = factor[row, columns] * np.nan_to_num(single[:, row, columns]) ** 2
+        added += constant[row, columns]
         film[:, row, columns] = np.sqrt(film[:, row, columns] ** 2 + added)
         for target, variable in maps:
             target[..., row, alike] = variable[..., row, alike]
@@ -337,7 +321,5 @@ def _border(labels: Array) -> Mask:
 
 def _neighbour_mean(values: Array, counted: Mask) -> Array:
     """Mean (y, x) of the known pixels around."""
-    sums = [
-        gaussian_filter(array, _AROUND) for array in (np.where(counted, values, 0.0), counted * 1.0)
-    ]
-    return np.asarray(sums[0] / np.maximum(sums[1], _SOME))
+    sums = gaussian_filter(np.where(counted, values, 0.0), _AROUND)
+    return np.asarray(sums / np.maximum(gaussian_filter(counted * 1.0, _AROUND), _SOME))

@@ -1,6 +1,6 @@
 """Reflection ratios of each material, from the scatters of its pixels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -9,10 +9,9 @@ from dbthermal._arrays import Array, Mask
 from dbthermal.separation._inputs import Labels
 from dbthermal.separation._pooling import gradients
 from dbthermal.separation._subspace import reflection_ratio
-from dbthermal.separation._tiles import Survey
+from dbthermal.separation._tiles import Pixels, Survey
 
-# Deviations beyond which a pixel is not of the material.
-_OUTLIER_SIGMAS: Final = 4.0
+_OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
 # Deviations beyond which the order of the pixels is too small for their material.
 _ORDER_SIGMAS: Final = 3.0
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
@@ -32,11 +31,6 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def squares(self, side: int) -> Labels:
-        """Numbers (surveyed,) of the squares of the image that the surveyed pixels are in."""
-        rows, columns = np.divmod(self.surveyed, self.width)
-        return np.asarray(rows // side * (self.width // side + 1) + columns // side)
-
     def gradient(
         self, label: int, known: Labels, cost: gradients.Cost, limit: int = gradients.DEGREE
     ) -> gradients.Gradient:
@@ -47,31 +41,18 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Common:
+class Common(Pixels):
     """Ratios of each pixel by its material."""
 
     ratio: Array  # (band, pixel) [1]
     variance: Array  # of them, common to neighbours (pixel) [1/K^2]
     spread: Array  # of single pixels about them (pixel) [1/K^2]
 
-    def at(self, pixels: Labels) -> "Common":
-        """Ratios of some pixels."""
-        return Common(self.ratio[:, pixels], self.variance[pixels], self.spread[pixels])
-
 
 def total(labels: Labels, values: Array, count: int) -> Array:
     """Sum of values (pixel) over each material."""
     labelled = labels >= 0
     return np.asarray(np.bincount(labels[labelled], values[labelled], count), dtype=np.float64)
-
-
-def _inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) -> Array:
-    """Variance [1/K^2] of ratios (band, n) that stand on a whitened scatter (band, band, n)."""
-    # With v = kappa / s, the energy in the first band is S = v^T C v / |v|^4.
-    whitened = ratio / noise[:, np.newaxis]
-    length = (whitened**2).sum(axis=0)
-    energy = np.einsum("bn,bcn,cn->n", whitened, scatter, whitened) / length**2
-    return reflection_ratio.inverse_energy(energy, length, freedom)
 
 
 @dataclass(frozen=True)
@@ -111,12 +92,8 @@ def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Ar
     """
     energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
     inverse = np.where(frames > 0, 1.0 / energy, 0.0)
-    weight = (
-        inverse
-        * (total(labels, np.where(frames > 0, 1.0, 0.0), count) / total(labels, inverse, count))[
-            labels
-        ]
-    )
+    number = total(labels, np.where(frames > 0, 1.0, 0.0), count)
+    weight = inverse * (number / total(labels, inverse, count))[labels]
     return scatter * weight, frames * weight
 
 
@@ -135,7 +112,7 @@ def _at_order(
     unit = whitened / np.sqrt((whitened**2).sum(axis=0))
     along = np.einsum("bm,bcm,cm->m", unit, summed, unit)
     informed &= along > np.maximum(_ENERGY_SIGMAS * np.sqrt(2.0 * freedom), _LEAST_ENERGY * freedom)
-    variance = _inverse_energy(summed, ratio, noise, freedom)
+    variance = reflection_ratio.inverse_energy(summed, ratio, noise, freedom)
     return np.where(informed, ratio, np.nan), np.where(informed, variance, np.nan)
 
 
@@ -171,11 +148,9 @@ def outliers(
         frames = np.where(rapid, survey.frames[order], survey.frames[0])
         whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
         pixel_ratio = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
-        inverse = _inverse_energy(scatter, pixel_ratio, noise, frames)
-        std = np.sqrt(reflection_ratio.ratio_variance(pixel_ratio, inverse + common.spread, noise))[
-            1:
-        ]
-        score = np.max(np.abs(pixel_ratio - common.ratio)[1:] / std, axis=0)
+        inverse = reflection_ratio.inverse_energy(scatter, pixel_ratio, noise, frames)
+        variance = reflection_ratio.ratio_variance(pixel_ratio, inverse + common.spread, noise)
+        score = np.max((np.abs(pixel_ratio - common.ratio) / np.sqrt(variance))[1:], axis=0)
         score = np.where(labels >= 0, np.nan_to_num(score), 0.0)
         farthest = np.zeros(len(material.rapid))
         np.maximum.at(farthest, labels, score)
@@ -183,12 +158,6 @@ def outliers(
         result |= distant & ~reflection_ratio.agrees(whole, axis)
     informed = np.isfinite(material.variance[labels])
     return np.asarray(result & informed & (survey.frames[0] > 0) & (labels >= 0))
-
-
-def scaled(survey: Survey, change: Array) -> Survey:
-    """Survey with the rapid changes of each pixel times a factor (band, pixel), where known."""
-    factor = np.where(np.isfinite(change), change, 1.0)
-    return replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
 
 
 def graded(
@@ -220,9 +189,8 @@ def graded(
         seen = np.einsum("bi,bcp,cj->ijp", axes, scatters, axes)
         asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
         for number, across in enumerate(axes.T[1:], 1):
-            cost = gradients.Cost(
-                seen[0, 0] - seen[number, number], seen[number, 0], seen[0, 0] + frames[pixels]
-            )
+            square, variances = seen[0, 0] - seen[number, number], seen[0, 0] + frames[pixels]
+            cost = gradients.Cost(square, seen[number, 0], variances)
             gradient = image.gradient(label, pixels, cost, limit)
             if gradient.degree > 0:
                 vector = vector + gradient.value * across[:, np.newaxis]

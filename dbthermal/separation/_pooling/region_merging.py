@@ -151,21 +151,15 @@ class Regions:
                 if now > before:
                     heapq.heappush(queue, (now, first, second))
                     continue
-                self._merge(first, second)
+                self.join(first, second)
                 joined = True
-
-    def join(self, region: int, neighbour: int) -> None:
-        """Join the regions of two cells."""
-        first, second = self.root(region), self.root(neighbour)
-        if first != second:
-            self._merge(first, second)
 
     def join_in_order(self, pairs: Labels, order: Array) -> None:
         """Join neighbours (pair, 2) by rising order (pair,), unless their features disagree."""
         for index in np.argsort(order, kind="stable"):
             first, second = (self.root(int(cell)) for cell in pairs[index])
             if first != second and self._compare_one(first, second)[0] <= 1.0:
-                self._merge(first, second)
+                self.join(first, second)
 
     def pooled(self, regions: Labels) -> tuple[Array, Array, Mask]:
         """Means of regions, by their roots, variances, and valid ones: (feature, *shape)."""
@@ -191,7 +185,8 @@ class Regions:
                     resolution = np.sqrt(self._limits[1] * variance) / mean
         return statistic / self._limits[features], resolution
 
-    def _merge(self, first: int, second: int) -> None:
+    def join(self, first: int, second: int) -> None:
+        """Join two regions by their roots."""
         self._parent[second] = first
         for values in (self._total, self._first, self._count):
             values[:, first] += values[:, second]

@@ -63,13 +63,12 @@ class Fit(NamedTuple):
 def camera(inputs: Inputs) -> tuple[Camera, Camera]:
     """Responses and noise of both bands in double and in single precision."""
     quiet, second = inputs.curves
-    pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
     double = Camera(
         *(kernels.table(quiet, second), kernels.table(second, quiet)),
         (quiet.reference_counts, second.reference_counts),
         (quiet.reference_slope, second.reference_slope),
         (float(inputs.noise[0]), float(inputs.noise[1])),
-        (float(pattern[0]), float(pattern[1])),
+        (float(inputs.pattern[0]), float(inputs.pattern[1])),
         *(quiet.lowest, quiet.highest),
     )
     return double, _single(double)

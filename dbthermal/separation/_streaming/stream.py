@@ -36,8 +36,7 @@ _ROWS: Final = 16  # that a thread takes at once
 
 
 class Stream:
-    r"""
-    Live separation of two bands: frames in as they come, temperatures out a fixed time later.
+    r"""Live separation of two bands: frames in as they come, temperatures out a fixed time later.
 
     A history of 64 to 128 samples of each pixel, means of more and more frames, is separated by the
     method "subspace" without its pieces for rapid objects, some rows of the image at a time: it
@@ -271,10 +270,8 @@ class Stream:
         before = np.concatenate([[self._now], times[:-1]])
         bad = ~((times > before) & np.isfinite(times))
         if np.any(bad):
-            place = int(np.argmax(bad))
-            raise ValueError(
-                f"Invalid time {times[place]} s of a frame, after {before[place]} s. Must rise."
-            )
+            now, last = times[bad][0], before[bad][0]
+            raise ValueError(f"Invalid time {now} s of a frame, after {last} s. Must rise.")
         if segment < self._segment:
             raise ValueError(f"Invalid segment {segment} after {self._segment}. Must not fall.")
         if segment > self._segment:  # a mean is of one segment

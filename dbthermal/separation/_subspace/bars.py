@@ -47,8 +47,7 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
 
 @inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    r"""
-    Variance [1] of the slope by a background that walks, and its upper bound.
+    r"""Variance [1] of the slope by a background that walks, and its upper bound.
 
     With the unit coefficients :math:`\xi_j` of the object's curve of norm :math:`|u|`, and the
     energy A of a random walk in the residual's spectrum, the larger of those of two octaves; for
@@ -80,8 +79,7 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
 
 @inlined
 def _linear(model: Model, record: Any, line: Line, limit: float, work: Work) -> float:
-    r"""
-    Variance [1] of the slope by a linear drift of size d, seen with a variance v.
+    r"""Variance [1] of the slope by a linear drift of size d, seen with a variance v.
 
     :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
     Weighted twice, for a large drift takes the weight from the frames that tell it best.
@@ -113,8 +111,7 @@ def _linear(model: Model, record: Any, line: Line, limit: float, work: Work) -> 
 
 @inlined
 def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
-    r"""
-    Variance of the object, in place, and whether the background hardly rests.
+    r"""Variance of the object, in place, and whether the background hardly rests.
 
     By implicit differentiation of eq. 6, :math:`dx/d\epsilon = (dh/d\epsilon - dq/d\epsilon) / h'`
     and :math:`var(x) = var(q) / h'^2`. The object is a ratio with an uncertain denominator: half
@@ -194,8 +191,7 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
 def _covariance(
     model: Model, record: Any, slope_variance: float, work: Work, covariance: Any
 ) -> None:
-    r"""
-    Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
+    r"""Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
 
     :math:`\delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o` and
     :math:`\delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m`, with
@@ -218,8 +214,7 @@ def _covariance(
 
 @inlined
 def _background(model: Model, record: Any, epsilon: float, slope: float, work: Work) -> None:
-    r"""
-    Variance of the background (eq. 10), in place.
+    r"""Variance of the background (eq. 10), in place.
 
     .. math:: \delta y = (y - x) \left( s_1 \delta v_1 - e_1 \epsilon
               + \frac{\delta o}{1 - e_1} \right) - r \, \delta x
@@ -251,8 +246,7 @@ def _background(model: Model, record: Any, epsilon: float, slope: float, work: W
 
 @inlined
 def _pattern(model: Model, work: Work) -> None:
-    r"""
-    Variance of object and background by a residual fixed pattern, added in place.
+    r"""Variance of object and background by a residual fixed pattern, added in place.
 
     An offset :math:`\delta_m` of each band, constant in time, is no slope and no rapid change: the
     emissivities are free of it. With the shares g of the bands in the background,
@@ -309,8 +303,7 @@ def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
 
 @inlined
 def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool]:
-    r"""
-    Autocorrelation, delay of the bands, and whether the residual is noise.
+    r"""Autocorrelation, delay of the bands, and whether the residual is noise.
 
     A band that is a frame late, or early, leaves the difference between two frames in the null
     residual r, which is held against the first band's differences, a matched filter,
@@ -348,17 +341,12 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
     variance = 2.0 / (9.0 * max(count, 1.0))
     mean = at_changes / (null * count) if count > 0 else 1.0
     score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
-    return (
-        correlation * sqrt(LAGS * frames),
-        score,
-        _unexplained(model, record, work, common),
-    )
+    return correlation * sqrt(LAGS * frames), score, _unexplained(model, record, work, common)
 
 
 @inlined
 def _unexplained(model: Model, record: Any, work: Work, common: float) -> bool:
-    r"""
-    Say whether the null residual r [K] is no white noise in some part of time.
+    r"""Say whether the null residual r [K] is no white noise in some part of time.
 
     Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
     object that the smooth functions do not follow. Or blocks differ in its correlation with the

@@ -69,8 +69,7 @@ class Scratch(NamedTuple):
 
 
 def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> tuple[Mask, Array]:
-    """
-    Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
+    """Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
 
     Whether a piece begins with a frame (2, time, pixel), and the cost (2, pixel) (eq. 12). The
     second one is that of the other line, and costs more, infinitely if there is none. The axis of a
@@ -129,8 +128,7 @@ def _joining(most: int, event: Mask) -> joining.Scratch:
 
 @lru_cache(maxsize=4)
 def _tree(times: bytes, events: bytes | None) -> Tree:
-    """
-    Pieces of each level of halving, down to those whose polynomial is any curve.
+    """Pieces of each level of halving, down to those whose polynomial is any curve.
 
     From times [s] and the number of shutter events before each frame. Pieces begin beside events,
     not at them.

@@ -54,8 +54,8 @@ class Solution(Pixels):
     contrast: Array  # variance along the axis over that across it, at the largest order (pixel)
     reduced_chi2: Array  # variance across the axis over the noise's, 1 if the model holds (pixel)
     pooled: Mask  # the material's ratios are used, and the pixel does not contradict them
-    scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at the
-    # `rapid_orders` (3, band, band, pixel) [1]
+    scatter: Array  # noise-whitened, of rapid changes, less noise, at the pixel's order and at
+    # two large ones (3, band, band, pixel) [1]
     emissivity: Array  # (band, pixel) [1]
     emissivity_covariance: Array  # (band, band, pixel) [1]
     epsilon_variance: Array  # of the error of the null combination's ratios (pixel) [1]
@@ -70,8 +70,7 @@ class Solution(Pixels):
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
     def survey(self, sound: Mask, plain: Mask) -> Survey:
-        """
-        Survey of the pixels whose model is sound, with emissivities of those without a flag.
+        """Survey of the pixels whose model is sound, with emissivities of those without a flag.
 
         A selection by the estimate itself would bias the sum over a material.
         """
@@ -190,7 +189,7 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
 
 @inlined
 def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
-    """Scatter less noise at the pixel's order and at `rapid_orders`, in place.
+    """Scatter less noise at the pixel's order and at two large ones, in place.
 
     Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
     emissivity of its material is not asked for its scatter.
@@ -242,12 +241,7 @@ def _return(turned: Any, places: Whole, samples: Any) -> None:
 
 @kernels.entered
 def _separate(
-    model: Model,
-    signals: Array,
-    places: Whole,
-    materials: Array,
-    work: Work,
-    solved: Solved,
+    model: Model, signals: Array, places: Whole, materials: Array, work: Work, solved: Solved
 ) -> None:
     """Steps of some pixels of a tile."""
     samples, outside, pixels = work.inside, work.outside, places.size
@@ -315,15 +309,12 @@ def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
     first = curves[0]
     temperature = first.reference + np.array([-0.5, 0.5])  # [K]
     temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
-    rates = [
-        np.diff(np.log(curve.slope(temperature) / first.slope(temperature)))[0] for curve in curves
-    ]
-    ratios = [curve.slope(temperatures) / first.slope(temperatures) for curve in curves]
-    return {
-        "tables": kernels.rows(curves),
-        "rates": np.array(rates),
-        "gray": np.stack(ratios, axis=1),
-    }
+    middle, ratios = (
+        np.array([curve.slope(kelvin) / first.slope(kelvin) for curve in curves])
+        for kelvin in (temperature, temperatures)
+    )
+    rates = np.diff(np.log(middle), axis=1)[:, 0]
+    return {"tables": kernels.rows(curves), "rates": rates, "gray": ratios.T.copy()}
 
 
 def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
@@ -358,8 +349,7 @@ def solve(
     drift: float,
     divided: Iterable[tuple[Whole, smooth.Subspace]] | None = None,
 ) -> Solution:
-    """
-    Steps 1 to 4, where it matters again on signals with proportional reflections.
+    """Steps 1 to 4, where it matters again on signals with proportional reflections.
 
     With the limit of the background's `drift` [K]. Of all pixels, or in parts that have functions
     of their own, with the same rising ones; one part after another is taken: of a long capture the

@@ -260,8 +260,7 @@ def mean(values: Array) -> float:
 
 @compiled
 def principal(matrix: Array, turned: Array, turns: Array, axis: Array) -> float:
-    """
-    Largest eigenvalue of a symmetric matrix; its vector, of any length, in place.
+    """Largest eigenvalue of a symmetric matrix; its vector, of any length, in place.
 
     Of two rows the vector is the longer of two expressions; of more they are turned in pairs until
     the matrix is diagonal (Jacobi).

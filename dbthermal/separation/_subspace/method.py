@@ -63,13 +63,7 @@ from dbthermal._arrays import Array, select
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._subspace import (
-    clock,
-    division,
-    fused,
-    pieces,
-    reflection_ratio,
-)
+from dbthermal.separation._subspace import division, fused, pieces, reflection_ratio
 from dbthermal.separation._subspace.fused import FILMS, Solution
 from dbthermal.separation._tiles import Estimate, Mask, Tile, Whole
 
@@ -85,8 +79,7 @@ _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_E
 # Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
 # whatever order their bands are.
 _EMITTED: Final = (0.7, 1.3)
-# Last orders of the smooth curve at which its polynomials may be too few.
-_LAST: Final = 6
+_LAST: Final = 6  # last orders of the smooth curve at which its polynomials may be too few
 # Flags of pixels in which rapid changes of the object are looked for.
 _SUSPECT: Final = np.uint32(
     Status.OBJECT_NOT_SMOOTH
@@ -108,8 +101,7 @@ _NUMBERS: Final = (smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
 
 @dataclass(frozen=True)
 class SubspaceSettings:
-    """
-    Options of the method "subspace".
+    """Options of the method "subspace".
 
     Attributes
     ----------
@@ -124,10 +116,8 @@ class SubspaceSettings:
     def __post_init__(self) -> None:
         """Refuse a drift that is negative or not finite."""
         check_fields(self, "subspace")
-        if not 0 <= self.background_drift < np.inf:
-            raise ValueError(
-                f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
-            )
+        if not 0 <= (drift := self.background_drift) < np.inf:
+            raise ValueError(f"Invalid background_drift {drift} K. Must be zero or positive.")
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -139,7 +129,7 @@ def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
 def separate_smooth(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of objects that change smoothly, without pieces of time."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _report(tile, _solve(tile, _functions(tile), settings))
+        return _report(tile, fused.solve(tile, _functions(tile), settings.background_drift))
 
 
 def _functions(tile: Tile) -> smooth.Subspace:
@@ -156,18 +146,12 @@ def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
     return smooth.subspace(time, order, segment=segment)
 
 
-def _solve(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Solution:
-    """Steps 1 to 4."""
-    return fused.solve(tile, functions, settings.background_drift)
-
-
 def _report(tile: Tile, solution: Solution) -> Estimate:
     """Values, standard deviations and flags; NaN, in the films in place, where undefined."""
     flags = _flags(tile, solution)
     still = flags[Status.NO_BACKGROUND_MOTION]
-    ambiguous = flags[Status.ROLES_MAY_BE_SWAPPED] & (
-        solution.constant | flags[Status.NONPHYSICAL_EMISSIVITY]
-    )
+    ambiguous = solution.constant | flags[Status.NONPHYSICAL_EMISSIVITY]
+    ambiguous &= flags[Status.ROLES_MAY_BE_SWAPPED]
     undefined = still | flags[Status.GRAY] | ambiguous
     unidentified = undefined | solution.constant
     no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
@@ -265,11 +249,9 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
 def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
     noise = np.array(tile.noise)
-    solution = _solve(tile, functions, settings)
+    solution = fused.solve(tile, functions, settings.background_drift)
     used = solution.order + functions.steps
-    asked = pieces.asked(
-        solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
-    )
+    asked = pieces.asked(solution.sums, tile.time, solution.null_variance, used)
     asked |= solution.order > functions.orders - _LAST
     result = _report(tile, solution)
     suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
@@ -328,9 +310,8 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
         parts = _parts(tile, first[:, surveyed], functions, number)
         estimate.replace_scatter(place, surveyed, *pieces.outside(straight, tile.noise, parts))
-    jumping = divided & pieces.sudden(
-        estimate.object_temperature, _AS_GIVEN * estimate.object_temperature_std, tile.time
-    )
+    std = _AS_GIVEN * estimate.object_temperature_std
+    jumping = divided & pieces.sudden(estimate.object_temperature, std, tile.time)
     status = estimate.status | status_bits({Status.OBJECT_JUMP: jumping})
     return replace(estimate, status=status, division=first)
 
@@ -354,11 +335,8 @@ def _parts(
     for place, begins in enumerate(first.T):
         alike.setdefault(begins.tobytes(), []).append(place)
     for places in map(np.array, alike.values()):
-        begins, rising = first[:, places[0]], functions.rising
-        yield (
-            places,
-            smooth.piecewise(tile.time, begins, rising, segment=tile.segment, number=number),
-        )
+        begins = tile.time, first[:, places[0]], functions.rising
+        yield places, smooth.piecewise(*begins, segment=tile.segment, number=number)
 
 
 def _divided(
@@ -372,7 +350,7 @@ METHOD: Final = Method(
     separate,
     settings=SubspaceSettings,
     minimum_frames=32,
-    check_clock=clock.check,
+    check_clock=pieces.check_clock,
     pools=True,
     any_bands=True,
     compiled=True,

@@ -22,8 +22,7 @@ FUNCTIONS: Final = 4
 COST: Final = 2.5
 # Functions by whose cost pieces must be better than a smooth curve to be asked for.
 _MARGIN: Final = 3.0
-# Levels of the pieces that are enough to see that pieces are better.
-_COARSE: Final = 4
+_COARSE: Final = 4  # levels of the pieces that are enough to see that pieces are better
 # Halvings after which the pieces give the axes to start from.
 STARTS: Final = (0, 2, 3, 4, 5)
 ROUNDS: Final = 4
@@ -32,8 +31,7 @@ AXES: Final = 4
 # Costs that differ by less are the same but for rounding: of two divisions the finer one is taken,
 # whose pieces may be joined, and of two ways to join pieces that of the longest.
 TIE: Final = 1e-6
-# Standard deviations between two axes that are told apart.
-APART: Final = 6.0
+APART: Final = 6.0  # standard deviations between two axes that are told apart
 
 # Time in which a sudden step is so large a share of the object's change [s].
 _AROUND: Final = 1.0
@@ -43,6 +41,14 @@ _MOST: Final = 2.0 / 3.0
 _PARTS: Final = 24
 _RETURNED: Final = 1.7
 
+# Gain of the information criterion by the numbers of the frames, in units of a function's cost:
+# in the median over many pixels, and what is added for one by chance.
+_GAIN: Final = 0.5
+_CHANCE: Final = 6.0
+_SIGMAS: Final = 3.0
+# Excess of the reduced chi-square over the times, at least so many times that over the numbers.
+_EXCESS: Final = 5.0
+
 
 @lru_cache(maxsize=16)
 def blocks(frames: int) -> Whole:
@@ -51,14 +57,13 @@ def blocks(frames: int) -> Whole:
     return np.round(np.linspace(0, frames, 2**levels + 1)).astype(np.intp)
 
 
-def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Whole) -> Mask:
-    """
-    Pixels whose smooth curve is described shorter in pieces.
+def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
+    """Pixels whose smooth curve is described shorter in pieces.
 
-    Of the sums (block, pixel) [K] over `blocks` of a null residual and of the curve taken from it,
-    with noise of a variance (pixel) [K^2] and the number of functions used (pixel).
+    Of the sums (2, block, pixel) [K] over `blocks` of a null residual and of the curve taken from
+    it, with noise of a variance (pixel) [K^2] and the number of functions used (pixel).
     """
-    edges = blocks(len(time))
+    (residual, curve), edges = sums, blocks(len(time))
     levels = int(np.log2(len(residual)))
     length = np.diff(edges)[:, np.newaxis]
     # Means in units of their noise, about as many frames in each; with the curve and without.
@@ -69,9 +74,9 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     least = halves = cost = np.full((2, 1), np.inf)
     for level in range(levels - 2, -1, -1):
         # Energy outside the functions of each piece of this level, and their cost.
-        sums = mean.reshape(1 << level, -1, mean.shape[1])
-        held = smooth.polynomial_basis(places.reshape(len(sums), -1), FUNCTIONS).mT @ sums
-        energy = np.einsum("itp,itp->ip", sums, sums) - np.einsum("ijp,ijp->ip", held, held)
+        means = mean.reshape(1 << level, -1, mean.shape[1])
+        held = smooth.polynomial_basis(places.reshape(len(means), -1), FUNCTIONS).mT @ means
+        energy = np.einsum("itp,itp->ip", means, means) - np.einsum("ijp,ijp->ip", held, held)
         cost = energy + COST * FUNCTIONS
         halves = least[::2] + least[1::2] if level < levels - 2 else np.full_like(cost, np.inf)
         least = np.minimum(halves, cost)
@@ -111,8 +116,7 @@ def _outside(
 
 
 def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
-    """
-    Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
+    """Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
 
     Object and background change more than two bands along two lines: of the whitened signals all
     but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
@@ -127,8 +131,7 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
-    """
-    Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
+    """Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
 
     Of the functions that the lowest information criterion selects, and one more; across a known
     `axis` (2, pixel) where it is not NaN.
@@ -159,8 +162,7 @@ def _order(null_energy: Array, frames: int) -> Whole:
 
 
 def returning(signal: Array) -> Mask:
-    """
-    Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
+    """Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
 
     Of means over parts of the capture: their total variation over their range is 1 for a change
     that stays, 2 for one that comes and goes.
@@ -172,8 +174,7 @@ def returning(signal: Array) -> Mask:
 
 
 def sudden(curve: Array, std: Array, time: Array) -> Mask:
-    """
-    Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
+    """Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
 
     By more than most of its change within a second, and beyond its standard deviations; not over a
     pause of the frames.
@@ -190,3 +191,38 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]
     result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * change_around), axis=0)
     return np.asarray(result)
+
+
+def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None) -> None:
+    r"""Refuse times [s] over which slow changes are not smooth, but smooth in the frames' numbers.
+
+    So are those at which frames arrived in bursts, and those of a clock that was set. Of signals
+    (band, time, pixel) [K], quietest band first, with `noise` (band) [K], the energy E across the
+    axis is compared, pixel by pixel, by :math:`N \ln(E_{time} / E_{number})`. Where it is as large
+    in both, the object does not change smoothly, or its changes are too small to tell.
+    """
+    frames, white = time.size, plane(signals, noise)[0]
+    any_axis = np.full((2, white.shape[2]), np.nan)
+    order = min(reflection_ratio.HIGHEST_ORDER, frames // 4)
+    chi2 = []
+    for clock in (time, np.arange(frames, dtype=np.float64)):
+        functions = smooth.subspace(clock, order, segment=segment)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            energy, used = null_energy(white, functions, any_axis)
+            chi2.append(energy / (frames - used))
+    good = (chi2[0] > 0) & (chi2[1] > 0)
+    if not np.any(good):
+        return
+    over_times, over_numbers = (float(np.median(part[good])) for part in chi2)
+    gain = frames * np.log(chi2[0][good] / chi2[1][good]) / np.log(frames)
+    gained = np.median(gain) > _GAIN + _CHANCE / np.sqrt(gain.size)
+    # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
+    chance = _SIGMAS * np.sqrt(2.0 / (frames * gain.size))
+    if gained and over_times - 1.0 > _EXCESS * max(over_numbers - 1.0 - chance, 0.0):
+        steps = np.diff(time)
+        raise ValueError(
+            f"Invalid 'time' of the capture, in steps of {steps.min():.3g} to {steps.max():.3g} s: "
+            "slow changes are not smooth over these times (reduced chi-square "
+            f"{over_times:.3f}), but over the numbers of the frames ({over_numbers:.3f}). Must be "
+            "times of exposure, not of arrival, of a clock that is not set meanwhile."
+        )

@@ -110,8 +110,7 @@ class Line(NamedTuple):
 
 @inlined
 def ratios(model: Model, work: Work, record: Any) -> None:
-    r"""
-    Step 1; coefficients, ratios and null combination in place, and how well they are known.
+    r"""Step 1; coefficients, ratios and null combination in place, and how well they are known.
 
     The order is that of the lowest Bayesian information criterion (Schwarz 1978,
     doi:10.1214/aos/1176344136) of the energy across the axis, **plus one**: a part of the object's
@@ -236,8 +235,7 @@ def _order(work: Work, pooled: float, frames: int) -> int:
 
 @inlined
 def may_be_gray(model: Model, record: Any, work: Work) -> bool:
-    r"""
-    Say whether equal emissivities are not excluded by the signals as they are.
+    r"""Say whether equal emissivities are not excluded by the signals as they are.
 
     All that changes in a gray body changes the bands in proportion to the slopes of their
     responses, :math:`\dot z_m = (1 - e) \, u_m'(y) \, \dot y`: before a background warmer than
@@ -417,8 +415,7 @@ def background(model: Model, work: Work) -> None:
 
 @inlined
 def _bend(model: Model, work: Work, outside: float) -> None:
-    r"""
-    Part of the reflections that the responses bend apart (eq. 11), in place.
+    r"""Part of the reflections that the responses bend apart (eq. 11), in place.
 
     :math:`(1 - e_m) \, (u_m(y) - u_1(y))`: taken from band m, it leaves the same signal
     :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and

@@ -12,13 +12,14 @@ import numpy as np
 from scipy.special import chdtri, ndtr
 
 from dbthermal._arrays import quotient
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Mask
 
 LOWEST_ORDER: Final = 3
 HIGHEST_ORDER: Final = 14
 """Smallest and largest smooth subspace that the data may choose (number of functions)."""
 
-# Functions by which the two largest orders differ that the ratios of a material are compared at.
+# Functions by which the two large orders differ that the ratios of a material are compared at. What
+# the order of a pixel leaves of its object, unseen in its noise, adds up over a material's pixels.
 FEWER: Final = 4
 
 TEMPERATURES: Final = 9
@@ -32,25 +33,14 @@ GRAY_CHANCE: Final = 1e-4
 TINY: Final = float(np.finfo(np.float64).tiny)
 
 
-def rapid_orders(orders: int) -> Whole:
-    """
-    Two large orders (2,): that of all functions, and before it of a few less.
-
-    What the order of one pixel leaves of its object, unseen in its noise, adds up over the pixels
-    of a material.
-    """
-    return np.array([max(1, orders - FEWER), orders])
-
-
 def principal_ratio(scatter: Array, noise: Array) -> Array:
     """Ratios (band, pixel) [1] of a whitened scatter (pixel, band, band): its principal axis."""
-    axis = np.linalg.eigh(scatter)[1][..., -1].T * noise[:, np.newaxis]
-    return axis / axis[0]
+    axis = np.linalg.eigh(scatter)[1][..., -1].T * noise.reshape(len(noise), -1)
+    return np.asarray(axis / axis[0])
 
 
 def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
-    r"""
-    Weights (band, pixel) of the bands that cancel the background, and their noise variance (pixel).
+    r"""Weights (band, pixel) of bands that cancel the background, and noise variance (pixel).
 
     Least variance with :math:`\sum w_m = 1`, :math:`\sum w_m \kappa_m = 0` (eq. 5); for two bands
     :math:`w = (-\kappa_2, 1) / (1 - \kappa_2)`.
@@ -65,13 +55,16 @@ def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
     return orthogonal * variance / noise[:, np.newaxis], variance
 
 
-def inverse_energy(energy: Array, length: Array, freedom: Array | float) -> Array:
-    """
-    Inverse of the background's effective energy: sigma^2 of `pixel.ratios` [1/K^2].
+def inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) -> Array:
+    """Inverse of the background's effective energy: sigma^2 of `pixel.ratios` (pixel) [1/K^2].
 
-    Of the energy S in the first band [K^2], the squared length of the whitened ratios [1/K^2], and
-    the degrees of freedom. Infinite where the energy is not positive.
+    Of ratios (band, pixel) that stand on a whitened scatter (band, band, pixel) of white noise of
+    so many degrees of freedom. Infinite where the energy is not positive.
     """
+    # With v = kappa / s, the energy in the first band is S = v^T C v / |v|^4.
+    whitened = ratio / noise.reshape(len(noise), -1)
+    length = (whitened**2).sum(axis=0)
+    energy = np.einsum("bp,bcp,cp->p", whitened, scatter, whitened) / length**2
     return np.asarray(quotient(energy + freedom / length, energy**2 * (energy > 0), np.inf))
 
 
@@ -93,8 +86,7 @@ def _ratio_error(ratio: Array, noise: Array) -> Array:
 
 
 def agrees(scatter: Array, axis: Array) -> Mask:
-    """
-    Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
+    """Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
 
     Of a background along the unit vector v and white noise, the part across v is not correlated
     with that along it: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.

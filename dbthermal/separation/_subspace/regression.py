@@ -29,8 +29,7 @@ _GUESSES: Final = 60  # of the value of a rank, at most
 
 @compiled
 def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
-    """
-    Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
+    """Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
 
     By interpolation between the numbers of values below two others. The bits of such numbers, as
     whole numbers, are in the same order, and NaN above all.
@@ -122,8 +121,7 @@ _moments, _reweighted = _of(np.float32)
 
 @compiled
 def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
-    """
-    Slope and intercept of the best of three starts: all points, those above, those below the line.
+    """Slope and intercept of the best of three starts: all points, those above, those below a line.
 
     Disturbances of a resting background lie mostly on one side of it, and one of the halves is
     then nearly free of it. Each start closes in on the densest half of the points by a scale that
@@ -167,8 +165,7 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 def regress(
     x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, again: int
 ) -> tuple[float, float, float, float]:
-    r"""
-    Robust line, with Tukey's bisquare weights: slope, its variance, scale, energy of the abscissa.
+    r"""Robust line of Tukey's bisquare weights: slope, its variance, scale, energy of abscissa.
 
     Iteratively reweighted least squares (Beaton and Tukey 1974, doi:10.1080/00401706.1974.10489171)
     with :math:`w = (1 - (r / c s)^2)^2` inside :math:`c s` and 0 outside. The scale s is the

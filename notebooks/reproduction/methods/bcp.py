@@ -27,8 +27,9 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from dbthermal import planck
 from dbthermal.response import require_range
 from dbthermal.separation import Method
-from dbthermal.separation._inputs import check_fields, require
+from dbthermal.separation._inputs import check_fields
 from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
+from reproduction.methods.naive import require
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,12 @@ from dbthermal import mixing, planck
 from dbthermal.schema import Status
 from dbthermal.separation import Method
 from dbthermal.separation import _calibrated as calibrated
-from dbthermal.separation._inputs import check_fields, require
+from dbthermal.separation._inputs import check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
 from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Tile
 from reproduction.methods import dbvt_objective as objective
+from reproduction.methods.naive import require
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5

@@ -14,7 +14,7 @@ through the Schur complement of the border (Triggs et al. 2000, doi:10.1007/3-54
 """
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import expit, logit
@@ -22,7 +22,7 @@ from scipy.special import expit, logit
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
 from dbthermal.separation import Method
-from dbthermal.separation._inputs import check_fields, require
+from dbthermal.separation._inputs import check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import WITHOUT_STD, Array, Estimate, Mask, Pixels, Tile
 
@@ -34,6 +34,13 @@ _DAMPING: Final = (1e-8, 1e12)
 _EASIER, _HARDER = 0.2, 8.0
 # A step that changes a logit by more is not taken: it would end where the logit's slope is nil.
 _LONGEST: Final = 3.0
+
+
+def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> None:
+    """Refuse a setting of a method for which a rule does not hold."""
+    if not holds:
+        value = getattr(settings, name)
+        raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
 
 
 @dataclass(frozen=True)

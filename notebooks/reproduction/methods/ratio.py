@@ -24,9 +24,10 @@ from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import Method
-from dbthermal.separation._inputs import check_fields, require
+from dbthermal.separation._inputs import check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import WITHOUT_BACKGROUND, Array, Estimate, Tile
+from reproduction.methods.naive import require
 
 KINDS: Final = ("wide", "narrow")
 # Knots of the table of ln R, in which 1/T is nearly straight: the spline is within 1 uK.
