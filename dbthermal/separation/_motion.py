@@ -32,15 +32,17 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading, Whole, smooth_functions
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
-_COMMON, _APART = 3.0, 0.1  # prior deviations [pixel] of a motion that the bands share, or do not
+# Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
+_COMMON, _APART, _TURN = 3.0, 0.1, 1.0
 # Square of a motion over its variance by a jackknife of windows, from which it is undone. Slow: see
 # below. Rapid motion, median over the frames: at most 2 without any, 9 to 28 of 0.3 pixel.
 _SURE, _SHAKEN = 10.0, 5.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
-# Of rapid motion: pixels of a window at most and around it [pixel], steps at most, the longest
-# [pixel], and their rms that ends them [pixel].
-_SIDE, _AROUND, _TURNS, _STEP, _SETTLED = 32, 6, 6, 2.0, 0.02
+# Of rapid motion: side of a window, least and most, and what is read around it [pixel]; samples of
+# a band at most; number of steps, the longest, and their rms that ends them [pixel].
+_SIDES, _AROUND, _SAMPLES = (8, 32), 6, 2**24
+_TURNS, _STEP, _SETTLED = 6, 2.0, 0.02
 _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
 # Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
 # counts half.
@@ -179,10 +181,8 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
     # The motion of lost frames lies between those before and after.
-    places = np.flatnonzero(frames)
-    for band, axis in product(range(len(bands)), range(2)):
-        course = np.interp(np.arange(frames.size), places, path[band, :, axis])
-        motion[bands[band], :, axis] = course
+    every, places = np.arange(frames.size), np.flatnonzero(frames)
+    motion[bands] = np.apply_along_axis(lambda course: np.interp(every, places, course), 1, path)
     return motion
 
 
@@ -192,10 +192,10 @@ def _solved(form: Array, force: Array) -> Array:
 
 def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Window]:
     """Yield windows of the image, of some frames (time), without gaps."""
-    good = good_pixels(inputs)
-    sides = []
+    good, sides = good_pixels(inputs), []
+    longest = np.sqrt(_SAMPLES / np.count_nonzero(frames)) / _WINDOWS - 2 * _AROUND
     for size in good.shape:
-        side = max(1, min(_SIDE, size // _WINDOWS))
+        side = max(1, min(int(np.clip(longest, *_SIDES)), size // _WINDOWS))
         starts = np.linspace(0, size - side, min(_WINDOWS, size)).astype(int)
         sides.append([slice(start, start + side) for start in starts])
     for y, x in product(*sides):
@@ -288,9 +288,9 @@ def _slow(inputs: Inputs, misfit: Misfit) -> Array:
         form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
         form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
         # Solve with a prior, and without each window of the image in turn: a jackknife.
-        whole = form.sum(axis=0) + np.eye(form.shape[1]) / _COMMON**2
-        steps = np.linalg.solve(whole, force.sum(axis=0))
-        less = np.linalg.solve(whole - form, (force.sum(axis=0) - force)[..., np.newaxis])[..., 0]
+        whole = form.sum(axis=0) + np.eye(form.shape[1]) / _TURN**2
+        steps = _solved(whole, force.sum(axis=0))
+        less = _solved(whole - form, force.sum(axis=0) - force)
         variance = np.var(less, axis=0) * (len(less) - 1)
         # What does not change in time is no motion.
         score, path = np.zeros((2, *wanted.shape))
