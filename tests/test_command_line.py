@@ -552,6 +552,7 @@ plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
+demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid 1 files: which are of the second camera
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif

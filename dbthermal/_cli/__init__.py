@@ -86,8 +86,7 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     """Paths that a command reads, which must exist, and writes, which must be free."""
     arguments = vars(options).items()
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
-    written = ("output", "folder")
-    targets = [value for name, value in arguments if name.endswith(written) and value]
+    targets = [value for name, value in arguments if name.endswith(("output", "folder")) and value]
     end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
     for path in sources:
         if not path.exists():
@@ -100,7 +99,8 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
         if path.exists() and not getattr(options, "overwrite", path.is_dir()):
-            raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+            rule = "new, or --overwrite" if "overwrite" in options else "new, or a folder"
+            raise FileExistsError(f"There is something at '{path}'. Must be {rule}.")
         if "output" in options and not path.name.endswith(end):
             raise ValueError(f"Invalid output '{path}'. Must end in '{end}'.")
     return sources, targets
