@@ -36,7 +36,7 @@ from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 _COMMON, _APART, _TURN = 3.0, 0.1, 1.0
 # Square of a motion over its variance by a jackknife of windows, from which it is undone. Slow: see
 # below. Rapid motion, median over the frames: at most 2 without any, 9 to 28 of 0.3 pixel.
-_SURE, _SHAKEN = 10.0, 5.0
+_SURE, _SHAKEN = 20.0, 5.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
 # Of rapid motion: side of a window, least and most, and what is read around it [pixel]; samples of
@@ -52,8 +52,8 @@ _HALF: Final = 4.0
 _DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
 _MANY: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. By
-# the square above a drift of one pixel shows 34 or more, 31 plain scenes at most 9; 30 of 24x32
-# pixels, with half the windows, up to 93, but of less than 0.06 pixel.
+# the square above a drift of one pixel shows 78 or more, a filter wheel 10, 31 plain scenes at most
+# 9; 30 of 24x32 pixels, with half the windows, up to 93, but of less than 0.06 pixel.
 _DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
 
 
