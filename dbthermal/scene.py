@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import xarray as xr
 
-from dbthermal import _rows, store
+from dbthermal import _rows, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk, release
 from dbthermal.alignment import _joint as joint
@@ -132,13 +132,13 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         return store.open_dataset(target)
     # Correct each camera, register the views, and synchronise the bands.
     lazy = made_on_disk()
-    corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
-    names = [str(name) for name in corrected["band"].values]
+    names = [str(name) for name in schema.check(capture, "capture")["band"].values]
     check_stated(names, **separating)
+    corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
         aligning = {**aligning, "transform": register(corrected, model=registration)}
-    curves = responses.curves(response, names)
-    response, _ = decide_noise(corrected, response, curves)  # of which all steps know the quietest
+    # All steps take one noise, and with it one reference band.
+    response, _ = decide_noise(corrected, response, responses.curves(response, names))
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     del corrected
     result = separate(aligned, response, **{"reflection_shift": field, **separating})

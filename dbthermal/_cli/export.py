@@ -147,9 +147,9 @@ def _shown(options: argparse.Namespace, stages: str) -> list[xr.Dataset]:
     if len(options.shown) > 2:
         label = f"{len(options.shown)} stores beside '{options.result}'"
         raise ValueError(f"Invalid {label}. Must be its capture, and the cameras' response.")
-    beside = dict(zip(("capture", "response"), options.shown, strict=False))
-    kinds = {name: {"capture": "corrected|capture"}.get(name, name) for name in beside}
-    return staged(argparse.Namespace(result=options.result, **beside), result=stages, **kinds)
+    sources = dict(zip(("capture", "response"), options.shown, strict=False))
+    kinds = {name: {"capture": "corrected|capture"}.get(name, name) for name in sources}
+    return staged(argparse.Namespace(result=options.result, **sources), result=stages, **kinds)
 
 
 def report(options: argparse.Namespace) -> dict[str, Any]:

@@ -20,8 +20,8 @@ _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
     """Means (y, x, ...) over squares of pixels, in memory of their own."""
     rows, columns = (size // factor * factor for size in image.shape[:2])
-    parts = [image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)]
-    return np.asarray(sum(parts[1:], parts[0]) * image.dtype.type(factor**-2))
+    corners = [image[i:rows:factor, j:columns:factor] for i, j in np.ndindex(factor, factor)]
+    return np.asarray(sum(corners[1:], corners[0]) * image.dtype.type(factor**-2))
 
 
 def blurred(image: Image, width: float) -> Image:
@@ -39,12 +39,12 @@ def splines(movie: Movie, width: float) -> Movie:
 
     A B-spline blurs as well: so these are blurred by less, and no filter undoes it.
     """
-    part = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
-    return np.pad(part, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
+    smooth = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
+    return np.pad(smooth, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
 
 
-def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | None = None) -> Array:
-    """Sums over planes (other, y, x, pair) of the products of signals at places (2, y, x).
+def products(movie: Movie, movies: list[Movie], places: Array, rate: Movie | None = None) -> Array:
+    """Sums over planes (movie, y, x, pair) of the products of signals at places (2, y, x).
 
     Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
     with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
@@ -52,15 +52,15 @@ def products(movie: Movie, others: list[Movie], places: Array, rate: Movie | Non
     """
     shape, planes = places.shape[1:], movie.shape[2]
     count = 4 if rate is None else 5
-    result = np.zeros((len(others), *shape, count * (count + 1) // 2))
+    result = np.zeros((len(movies), *shape, count * (count + 1) // 2))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
         signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
-        for other, out in zip(others, result, strict=True):
+        for second, out in zip(movies, result, strict=True):
             sums = out[rows].reshape(-1, out.shape[2])
-            _sum_pairs(signals, other[rows].reshape(-1, planes), sums)
+            _sum_pairs(signals, second[rows].reshape(-1, planes), sums)
     return result
 
 
@@ -81,8 +81,8 @@ def normal_equations(sums: Array, noise: Array) -> Array:
     size = np.maximum(size, np.finfo(np.float64).tiny)
     ratio = full[..., :1, 4:] / size
     tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
-    rest = ratio * (full[..., 4:, 1:4] - ratio * cross)
-    return np.concatenate([tensor, rest], axis=-2)
+    force = ratio * (full[..., 4:, 1:4] - ratio * cross)
+    return np.concatenate([tensor, force], axis=-2)
 
 
 @compiled
@@ -95,10 +95,10 @@ def _blurred(movie: Any, weights: Any) -> Any:
         for i in range(weights.size):
             # A place beyond an end is mirrored, as often as needed.
             near = (place + i - reach) % (2 * size)
-            part = movie[line, min(near, 2 * size - 1 - near)]
+            source = movie[line, min(near, 2 * size - 1 - near)]
             weight = weights[i]
             for t in range(planes):
-                out[t] += weight * part[t]
+                out[t] += weight * source[t]
     return result
 
 

@@ -169,11 +169,8 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
             for place, ratio in enumerate(ratios, 1)
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
-        whole = form.sum(axis=0) + precision
-        steps = _solved(whole, force.sum(axis=0))
-        # Is there any? Without each window of the image in turn, a jackknife.
-        less = _solved(whole - form, force.sum(axis=0) - force)
-        variance = np.var(less, axis=0) * (len(less) - 1)
+        # Is there any?
+        steps, variance = _jackknife(form, force, precision)
         if turn == 0 and not np.any(np.median(quotient(steps**2, variance, 0.0), axis=0) > _SHAKEN):
             return motion
         steps = np.swapaxes(steps.reshape(-1, len(bands), 2), 0, 1)
@@ -190,6 +187,13 @@ def _solved(form: Array, force: Array) -> Array:
     return np.asarray(np.linalg.solve(form, force[..., np.newaxis])[..., 0])
 
 
+def _jackknife(form: Array, force: Array, prior: Array) -> tuple[Array, Array]:
+    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife."""
+    whole, total = form.sum(axis=0) + prior, force.sum(axis=0)
+    reduced = _solved(whole - form, total - force)
+    return _solved(whole, total), np.var(reduced, axis=0) * (len(reduced) - 1)
+
+
 def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Window]:
     """Yield windows of the image, of some frames (time), without gaps."""
     good, sides = good_pixels(inputs), []
@@ -199,16 +203,16 @@ def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Win
         starts = np.linspace(0, size - side, min(_WINDOWS, size)).astype(int)
         sides.append([slice(start, start + side) for start in starts])
     for y, x in product(*sides):
-        around = tuple(slice(max(0, it.start - _AROUND), it.stop + _AROUND) for it in (y, x))
+        margin = tuple(slice(max(0, it.start - _AROUND), it.stop + _AROUND) for it in (y, x))
         used = np.zeros(good.shape, dtype=bool)
         used[y, x] = good[y, x]
-        counts = films.values[..., around[0], around[1]][inputs.bands][:, frames]
+        counts = films.values[..., margin[0], margin[1]][inputs.bands][:, frames]
         signals = np.empty(counts.shape)
         for signal, film, band in zip(signals, counts, inputs.bands, strict=True):
             for frame, image in zip(signal, inputs.curves[band].linearise(film), strict=True):
-                valid = good[around] & np.isfinite(image)
+                valid = good[margin] & np.isfinite(image)
                 frame[:] = without_gaps(image - inputs.curves[band].reference, valid)
-        yield _Window(signals, used[around])
+        yield _Window(signals, used[margin])
 
 
 def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
@@ -266,14 +270,13 @@ def _equations(
             pull -= pull @ basis @ basis.T
             forces.append(np.einsum("tj,ajt->ta", course, pull))
         form, force = np.array(forms), np.array(forces)
-        ridge = np.eye(form.shape[-1]) / _COMMON**2
-        steps = _solved(form.sum(axis=0) + ridge, force.sum(axis=0))
+        steps = _solved(form.sum(axis=0) + np.eye(form.shape[-1]) / _COMMON**2, force.sum(axis=0))
         moved = np.einsum("ta,tj->taj", steps, course).reshape(len(steps), -1)
         energies = []
         for null, slope in combinations:
             explained = moved @ slope.reshape(moved.shape[1], -1)
-            left = null - explained + basis @ (basis.T @ explained)
-            energies.append(np.mean(left**2, axis=0))
+            remainder = null - explained + basis @ (basis.T @ explained)
+            energies.append(np.mean(remainder**2, axis=0))
     return form, force, energies
 
 
@@ -287,11 +290,7 @@ def _slow(inputs: Inputs, misfit: Misfit) -> Array:
     for place, band in enumerate(inputs.bands[1:]) if windows else ():
         form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
         form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
-        # Solve with a prior, and without each window of the image in turn: a jackknife.
-        whole = form.sum(axis=0) + np.eye(form.shape[1]) / _TURN**2
-        steps = _solved(whole, force.sum(axis=0))
-        less = _solved(whole - form, force.sum(axis=0) - force)
-        variance = np.var(less, axis=0) * (len(less) - 1)
+        steps, variance = _jackknife(form, force, np.eye(form.shape[1]) / _TURN**2)
         # What does not change in time is no motion.
         score, path = np.zeros((2, *wanted.shape))
         score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps
