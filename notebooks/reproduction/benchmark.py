@@ -183,17 +183,18 @@ def peak_memory() -> float:
 
 
 def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
-    """Yield the head of a table and a row for each call."""
-    times = ("us per pixel", "640x512 frames/s on two cores, computed", "the same, measured")
-    yield ("call", "cameras", *times, "peak memory", "error", "intervals that hold")
+    """Yield the head of a table and a row for each call; whole frames only if measured."""
+    whole = any(np.isfinite(call.frame_rate) for call in calls.values())
+    measured_heads = ("frames/s, measured by wall clock", "peak memory") if whole else ()
+    times = ("µs per pixel", "frames/s, computed", *measured_heads)
+    yield ("call", "cameras", *times, "error", "95 % intervals that contain the truth")
     for (function, cameras), call in calls.items():
         rate = 2 * FRAMES / (call.pixel * math.prod(WHOLE))
-        whole = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"]
+        cells = [f"{call.frame_rate:.2g}", f"{1e-9 * call.peak:.1f} GB"] if whole else []
         if not np.isfinite(call.frame_rate):
-            whole = ["", ""]
+            cells = [""] * len(cells)
         errors = (f"{call.rmse:.3f} K", f"{100 * call.cover:.1f} %")
-        cost = (f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *whole)
-        yield (f"`{function}`", cameras, *cost, *errors)
+        yield (f"`{function}`", cameras, f"{1e6 * call.pixel:.0f}", f"{rate:.2g}", *cells, *errors)
 
 
 @lru_cache
@@ -270,23 +271,24 @@ def machine() -> str:
 MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the default call -->")
 """Marks around the default call's figures in docs/benchmarks.md."""
 
-DEFAULT_CALL: Final = """A simulated plate of glass is heated while people walk by: {rows}x{columns}
-pixels, {frames} frames, two bands. `separation.separate` is the default call. `solve` works pixel
-by pixel; for displaced cameras its time does not include the search for the reflection shift. Times
-are processor times of one thread, after a first call that compiles. Errors are medians over the
-unflagged pixels; 95 % intervals hold if they contain the truth. Measured frames/s are by wall clock
-for one capture with two threads.
+DEFAULT_CALL: Final = """The scene is a plate of glass that is heated while people walk by:
+{rows}x{columns} pixels, {frames} frames, two bands. `separation.separate` is the default call;
+`solve` works pixel by pixel. "Displaced" cameras see a reflection in different pixels: `solve` then
+needs the reflection shift, and the search for the shift is not in its time.
 
-{machine}.
-Load average at the start: {busy:.1f}; on a loaded computer, wall-clock times are too long.
+The first call, which compiles, is not counted. Time per pixel is processor time of one thread.
+Frames per second are computed from this time, for two cores and 640x512 pixels. "Error" is that of
+the object temperature (RMSE of a pixel, median over the unflagged pixels). The last column is the
+share of the 95 % intervals that contain the true temperature. Load average at the start:
+{busy:.1f}.
 
 {table}
 """
 
 HEAD: Final = """# Benchmarks
 
-Made by `make bench` on {machine}.
-Load average at the start: {busy:.1f}. All captures are simulated.
+Processor time and accuracy, measured by `make bench` on simulated captures. The computer:
+{machine}.
 
 ## The default call
 
@@ -294,9 +296,11 @@ Load average at the start: {busy:.1f}. All captures are simulated.
 
 ## Every method
 
-Processor time of one thread, for {frames} frames of two bands and the largest number of pixels that
-takes less than {longest:.0f} s. The time per sample is that of the shortest and the longest capture
-of {few} pixels. The last column compares 3 and 4 bands with two, for {pixels} pixels.
+Processor time of one thread, for {frames} frames of two bands. Each method separates as many pixels
+as it can in less than {longest:.0f} s (column "pixels"). `subspace` is the method of `solve`. Its
+time per pixel is shorter than in the table above, because time per pixel falls with the number of
+pixels ({scene} above). Times for 3 and for 4 bands are multiples of the time for two bands, with
+{pixels} pixels; "none": the method takes two bands only. Load average at the start: {busy:.1f}.
 
 {methods}
 """
@@ -307,31 +311,34 @@ def default_figures(calls: Calls, busy: float) -> str:
     height, width = SHAPE
     size = {"rows": height, "columns": width, "frames": FRAMES}
     rows = numbers.table(default_rows(calls))
-    return DEFAULT_CALL.format(**size, machine=machine(), busy=busy, table=rows)
+    return DEFAULT_CALL.format(**size, busy=busy, table=rows)
 
 
 def table(default: str, times: Times, busy: float) -> str:
     """All that was measured, in Markdown: the default call's figures first."""
     enclosed = f"{MARKS[0]}\n\n{default}\n{MARKS[1]}"
     text = {"machine": machine(), "default_call": enclosed, "methods": methods(times)}
-    return HEAD.format(busy=busy, longest=SHORT, few=FEW, **text, **USUAL)
+    return HEAD.format(busy=busy, longest=SHORT, scene=math.prod(SHAPE), **text, **USUAL)
 
 
 def methods(times: Times) -> str:
-    """Table of the methods' times, by pixel, by sample and by band."""
-    costs = ("us per pixel", "relative to `subspace`", "pixels", "ns per sample", "frames")
-    lines: list[tuple[str, ...]] = [("method", *costs, "3, 4 bands relative to 2")]
+    """Table of the methods' times by pixel and by band, and a line by the number of frames."""
+    head = ("method", "µs per pixel", "relative to `subspace`", "pixels", "3, 4 bands")
+    lines: list[tuple[str, ...]] = [head]
     of_pixels = {method: times[method, "pixels"] for method in outside.METHODS}
     cost = {method: found[max(found)] / max(found) for method, found in of_pixels.items()}
     for method, seconds in cost.items():
-        frames, bands = times[method, "frames"], times[method, "bands"]
-        ends = [min(frames), max(frames)]
-        samples = " to ".join(f"{1e9 * frames[n] / n / FEW:.0f}" for n in ends)
+        bands, size = times[method, "bands"], str(max(of_pixels[method]))
         more = ", ".join(f"{bands[n] / bands[2]:.1f}" for n in sorted(bands) if n > 2) or "none"
-        size, span = str(max(of_pixels[method])), " to ".join(map(str, ends))
-        of_pixel = (f"{1e6 * seconds:.0f}", f"{seconds / cost['subspace']:.2g}", size)
-        lines.append((f"`{method}`", *of_pixel, samples, span, more))
-    return numbers.table(lines)
+        relative = format(float(f"{seconds / cost['subspace']:.2g}"), "g")
+        lines.append((f"`{method}`", f"{1e6 * seconds:.0f}", relative, size, more))
+    samples = times["subspace", "frames"].items()
+    return (
+        f"{numbers.table(lines)}\n\nProcessor time of `subspace` in ns per sample (both bands of a "
+        f"pixel in a frame), for {FEW} pixels, by the number of frames: "
+        + ", ".join(f"{n}: {1e9 * seconds / n / FEW:.0f}" for n, seconds in samples)
+        + "."
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -340,6 +347,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--default-call", action="store_true", help="measure nothing else")
     parser.add_argument("--write", action="store_true", help="write docs/benchmarks.md, too")
     chosen = parser.parse_args(arguments)
+    page = paths.root() / "docs" / "benchmarks.md"
+    if chosen.default_call and chosen.write and machine() not in page.read_text(encoding="utf-8"):
+        parser.error("The page is of another computer or version. Must be measured as a whole.")
     busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
     folder.mkdir(parents=True, exist_ok=True)
     calls: Calls = {}
@@ -348,7 +358,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             calls[name] = call
             print(*name, call, flush=True)
     text = default = default_figures(calls, busy)
-    page = paths.root() / "docs" / "benchmarks.md"
     if not chosen.default_call:
         text = table(default, all_series(), busy)
         if chosen.write:

@@ -1,5 +1,6 @@
 """The benchmark's tables: costs are those of the times that were measured."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,16 +17,20 @@ def test_the_table_says_what_was_measured() -> None:
         times[method, "bands"] = {2: 1.0, 3: 1.5}
     text = benchmark.table("the default call", times, 0.5)
     assert verify.enclosed(text, benchmark.MARKS, "the default call", "the page") == text
-    assert "| `calibrated` | 2 | 2 | 2048 | 100 to 1000 | 100 to 1000 | 1.5 |" in text
+    assert "| `calibrated` | 2 | 2 | 2048 | 1.5 |" in text
+    assert text.endswith("by the number of frames: 100: 100, 1000: 1000.\n")
 
 
 def test_the_default_call_is_on_its_pages() -> None:
-    """Its figures stand first in docs/benchmarks.md, between their marks."""
+    """Its figures stand first in docs/benchmarks.md, between their marks; memory if measured."""
     call = benchmark.Call(pixel=7e-5, rmse=0.0312, cover=0.951, frame_rate=31.0, peak=4.2e9)
     calls = {("separate", "one place"): call}
     text = benchmark.default_figures(calls, 0.5)
     line = "| `separate` | one place | 70 | 31 | 31 | 4.2 GB | 0.031 K | 95.1 % |"
     assert line in text.splitlines()
+    unmeasured = replace(call, frame_rate=float("nan"), peak=float("nan"))
+    text = benchmark.default_figures({("separate", "one place"): unmeasured}, 0.5)
+    assert "| `separate` | one place | 70 | 31 | 0.031 K | 95.1 % |" in text.splitlines()
     page = (paths.root() / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     assert text in verify.enclosed(page, benchmark.MARKS, text, "docs/benchmarks.md")
 
