@@ -87,8 +87,8 @@ class Row:
     def verdict(self, numbers: Numbers) -> str:
         """Verdict on ours against the paper's.
 
-        "agrees", "better", "worse" or "differs", of a twin with a note that says so, since theirs
-        cannot be checked; "not measured"; or the row's note.
+        "agrees", "smaller error", "larger error" or "differs", on a twin with a note that says so,
+        since the authors' cannot be checked; "not measured"; or the row's note.
         """
         values = self.ours(numbers)
         if len(values) < len(self.names):
@@ -113,10 +113,10 @@ class Row:
             ours, theirs = abs(ours - self.reference), abs(theirs - self.reference)
         if abs(ours - theirs) <= max(self.within, _AGREES * theirs):
             return "agrees"
-        return "better" if ours < theirs else "worse"
+        return "smaller error" if ours < theirs else "larger error"
 
 
-COLUMNS: Final = ("in the paper", "quantity", "paper", "here", "measured on", "verdict")
+COLUMNS: Final = ("in the paper", "quantity", "paper", "project", "measured on", "comparison")
 """Columns of the table."""
 
 
@@ -147,7 +147,7 @@ def rows() -> tuple[Row, ...]:
 
 def _terms() -> Iterator[Row]:
     for term, value in REDUCTIONS.items():
-        names, quantity = (f"{term}: reduction [%]",), f"error removed by adding the {term} term"
+        names, quantity = (f"{term}: reduction [%]",), f"error that the {term} term removes"
         yield Row("Table 1", quantity, "06_optimiser", names, value, "%", "value", 10.0)
 
 
@@ -176,9 +176,7 @@ def _scenes() -> Iterator[Row]:
         for method, error in errors.items():
             quantity = f"{shown}: error at the thermocouple, {_ROLES.get(method, method)}"
             names = (f"{scene}: error of {method} [%]",)
-            judged = "error" if method in _ROLES else "no"
-            ours = ("08_twins", names, error, "%")
-            yield Row("Fig. 6", quantity, *ours, judged, note="another scene, not compared")
+            yield Row("Fig. 6", quantity, "08_twins", names, error, "%", "error")
 
 
 _ROLES: Final = {"subspace": "emissivities unknown", "calibrated": "emissivities calibrated"}
@@ -242,7 +240,7 @@ _LAST: Final = (
     ),
     Row(
         "Fig. 5",
-        "share of a finger print found as emission, of a finger's reflection found as reflection",
+        "share of a fingerprint that is found as emission, of a finger's reflection as reflection",
         "08_twins",
         tuple(f"{name}: share found [1]" for name in ("fingerprint", "fingers")),
         labels=("print", "reflection"),
@@ -261,7 +259,7 @@ _LAST: Final = (
     ),
     Row(
         "Fig. 7",
-        "residual of the Sakuma-Hattori curve and of a line, 0 to 75 \N{DEGREE SIGN}C",
+        "residual of the Sakuma-Hattori curve and of the paper's line, 0 to 75 \N{DEGREE SIGN}C",
         "01_calibration",
         ("residual_8-14_K", "linear_residual_8-14_K"),
         unit="K",
@@ -271,7 +269,7 @@ _LAST: Final = (
     ),
     Row(
         "Fig. 8",
-        "error removed by adding the noise term, at the highest noise",
+        "error that the noise term removes, at the highest noise",
         "06_optimiser",
         ("noise: reduction at the highest noise [%]",),
         unit="%",

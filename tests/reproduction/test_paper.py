@@ -22,14 +22,14 @@ def verdict(numbers: dict[str, float], names: tuple[str, ...], **rule: Any) -> s
 @pytest.mark.parametrize(
     ("ours", "rule", "expected"),
     [
-        (0.5, {"judged": "error"}, "better"),
+        (0.5, {"judged": "error"}, "smaller error"),
         (0.95, {"judged": "error"}, "agrees"),
         (1.05, {"judged": "error"}, "agrees"),
-        (1.2, {"judged": "error"}, "worse"),
+        (1.2, {"judged": "error"}, "larger error"),
         (1.2, {"judged": "value", "within": 0.25}, "agrees"),
         (1.2, {"judged": "value", "within": 0.1}, "differs"),
-        (0.7, {"judged": "distance", "reference": 0.8}, "better"),  # 0.1 away, the paper 0.2
-        (0.5, {"judged": "distance", "reference": 0.8}, "worse"),
+        (0.7, {"judged": "distance", "reference": 0.8}, "smaller error"),  # 0.1 away, the paper 0.2
+        (0.5, {"judged": "distance", "reference": 0.8}, "larger error"),
         (0.99, {"judged": "distance", "reference": 0.8, "within": 0.02}, "agrees"),
         (0.5, {"judged": "no"}, "no number published"),
     ],
