@@ -54,12 +54,12 @@ _KINDS: Final[dict[str, Any]] = {
     "point": kelvin_or_path,
 }
 _ARGUMENTS: Final = """
-files path+             a file for each camera, or a list for each with '+' between; or a store
+files path+             a file for each camera, or lists with '+' between the cameras; or a store
 session path            YAML file, see dbthermal.instruments.session
 folder path             new folder for the output
 capture path            store of a capture
 correction path?        store of gain and offset
---corrected-by-camera flag  instead of a correction: the cameras correct gain and offset
+--corrected-by-camera flag  instead of a correction, if the cameras correct gain and offset
 response path           store of the cameras' response
 result path             store of a result
 shown path*             capture and response of this result, to be shown beside it
@@ -69,43 +69,43 @@ materials name*         names as listed by 'data'; all by default
 --dry-run flag          only list what would be read and written, with sizes
 --json flag             print the summary as JSON
 --traceback flag        show where an error was raised
---bands name+           names of the bands: 8-14 9.5
+--bands name+           names of the bands, such as 8-14 9.5
 --unit name             unit of the numbers in TIFF, raw files and arrays ('count')
---clock number+         frame rate [Hz], or a rate for each camera; FLIR's files have times
+--clock number+         frame rate [Hz], or a rate for each camera; not needed for FLIR's files
 --shape n2          rows and columns of raw files [pixel]
 --byte-order little|big byte order of raw files
 --header n=0        length of the header of raw files [byte]
 --frame-header n=0  length of the header of each frame of raw files [byte]
 --simulated flag        label the files, and all results made from them, as simulated
---variable name         name of an array in a file with several, or of a result's variable
---offset number+        start of each further camera minus the first's [s]; else by dates or images
+--variable name         array to take from a file with several; or variable of a result
+--offset number+        start of each further camera after the first [s]; else by dates or images
 --simulate flag         use emulated devices
 --side-by-side flag     cameras side by side instead of one optical path
---at point+&            blackbody temperature, as 20C or 293.15K, and its files; repeat it
+--at point+&            blackbody temperature, as 20C or 293.15K, and its files; one --at for each
 --blackbody path        instead of --at: a store of all temperatures
 --sweep name2           instead of --at: folder and session of a sweep by 'record'
 --maker path            instead of --at: a capture of FLIR files, for the maker's constants
---frames n+         N: first N frames; A B: frames A up to B (of a blackbody: the first 64)
+--frames n+         N: first N frames; A B: frames A to B - 1 (all; of a blackbody the first 64)
 --every n=1         take every N-th frame
---rows n2           take rows Y0 up to Y1 of the image
---blackbody-accuracy number  standard deviation of the common error of temperatures [K] (0.1)
---blackbody-emissivity number  emissivity of the blackbody, which reflects the room (0.97)
---room-temperature temperature  temperature of this room, such as 22C
+--rows n2           take rows Y0 to Y1 - 1 of the image
+--blackbody-accuracy number  standard deviation of the error of all temperatures [K] (0.1)
+--blackbody-emissivity number  emissivity of the blackbody (0.97)
+--room-temperature temperature  temperature of the room that the blackbody reflects (22C)
 --offset-std number+    drift of each camera's level since the sweep [K] (0.5)
---gain-std number+      error of each camera's gain (0.01)
+--gain-std number+      relative error of each camera's gain (0.01)
 --pattern-std number+   drift of single pixels of each camera since the sweep [K] (0.1)
---background-ratio-std number  deviation of reflections from gray (0.02)
+--background-ratio-std number  relative deviation of the reflections from gray (0.02)
 --correction-output path   store for gain and offset; the blackbody must fill the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal time constant of the pixels [s]
---register none|translation|affine|homography   transform of the views (homography); none: same view
+--register none|translation|affine|homography transform of the views (homography); none: same view
 --search n=5        largest delay between the cameras that is searched [frame]
 --reference name        band whose frames keep their times
---correction path       store of gain and offset, to do all steps from a raw capture
+--correction path       store of gain and offset: all steps, from a raw capture
 --method name           a single method, pixel by pixel: {methods}
 --emissivity number+    emissivity of each band, for the method 'calibrated'
 --surroundings temperature   temperature of the reflected surroundings, such as 22C
---outdoors flag         the sky is reflected, which is not gray: wider error bars
+--outdoors flag         the scene reflects the sky, which is not gray: wider error bars
 --background-ratio number2  ratio of reflected changes, second band to first, and its deviation
 --prior name            material of pixels that cannot be measured, as listed by 'data'
 --workers n=2       number of threads
@@ -117,8 +117,8 @@ materials name*         names as listed by 'data'; all by default
 --rate number=10        frame rate [Hz]
 --span number=25        rise of the object's temperature [K]
 --amplitude number=3    height of the reflected changes [K]
---pixel n2&         row and column of a curve; may be repeated
---region n4&        rows Y0 up to Y1, columns X0 up to X1 of a curve; may be repeated
+--pixel n2&         curve of row Y and column X; may be repeated
+--region n4&        curve of rows Y0 to Y1 - 1, columns X0 to X1 - 1; may be repeated
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
@@ -151,7 +151,7 @@ try-it
 try-it --side-by-side
 
 info files.info files {_FORM}
-describe a store or recording; of a result: temperature, uncertainty, share measured
+describe a store or recording; for a result temperature, uncertainty, share of measured pixels
 result.zarr
 video.seq
 a.tif --clock 30
