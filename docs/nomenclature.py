@@ -10,7 +10,8 @@ _PREFACE: Final = """# Nomenclature
 
 Variables at each stage of the data stream. This page is made from `dbthermal.schema` by
 `python docs/nomenclature.py > docs/nomenclature.md`. Temperatures are in kelvin, other units are
-SI; `count` is the unit of the detector's signal. A variable in italics is optional."""
+SI; `count` is the unit of the detector's signal. A variable in italics is optional. "std" is short
+for standard deviation."""
 
 
 def nomenclature() -> str:
