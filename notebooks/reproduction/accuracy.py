@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from textwrap import fill
 from typing import Final
 
 from reproduction.numbers import table
@@ -195,7 +196,7 @@ def markdown(numbers: Numbers) -> str:
 
 def _part(title: str, lines: str) -> str:
     """Heading, sentences and table."""
-    return "\n\n".join([f"## {title}", *([_NOTES[title]] if title in _NOTES else []), lines])
+    return "\n\n".join([f"## {title}", *filter(None, [fill(_NOTES.get(title, ""), 100)]), lines])
 
 
 def figure_6(numbers: Numbers) -> str:
