@@ -274,8 +274,8 @@ MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the def
 DEFAULT_CALL: Final = """The scene is a plate of glass that is heated while people walk by:
 {rows}x{columns} pixels, {frames} frames, two bands. `separation.separate` is the default call;
 `solve` works pixel by pixel. "Displaced" cameras see a reflection in different pixels: `solve` then
-needs the reflection shift, and the search for the shift is not in its time. It couples neighbouring
-pixels then, which takes time and reduces the error.
+needs the reflection shift, and the search for the shift is not in its time. `solve` then couples
+neighbouring pixels, which takes time and reduces the error.
 
 The first call, which compiles, is not counted. Time per pixel is processor time of one thread.
 Frames per second are computed from this time, for two cores and 640x512 pixels. "Error" is that of
