@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 from scipy.interpolate import interp1d
-from scipy.ndimage import gaussian_filter, shift
+from scipy.ndimage import affine_transform, gaussian_filter
 from scipy.special import expit
 
 from dbthermal import response as responses
@@ -35,6 +35,8 @@ class World:
     blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
     roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
     shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
+    turn: float = 0.0  # of the cameras together about their axis, as they shake [degree]
+    sway: float = 0.0  # of their distance, as a share of it [1]
     drift: Pair = (0.0, 0.0)  # of the cameras' pointing along the rows, over the capture [pixel]
     detail: float = 0.0  # of the emissivity [1]
     fabric: Pair | None = None  # emissivities of every second person [1]
@@ -84,7 +86,7 @@ def people(rng: np.random.Generator, world: World, number: int) -> Iterator[tupl
 
 
 def paths(rng: np.random.Generator, sizes: Pair) -> Array:
-    """Motion (camera, time, axis) [pixel]; cameras of one size move together."""
+    """Motion (camera, time, 2) of 1, correlated in time; cameras of the same size move together."""
     memory = np.exp(-1.0 / RATE / 0.15)
     steps = rng.normal(0.0, 1.0, (2, FRAMES, 2))
     for frame in range(1, FRAMES):
@@ -93,9 +95,15 @@ def paths(rng: np.random.Generator, sizes: Pair) -> Array:
     return np.asarray(steps * np.reshape(sizes, (2, 1, 1)))
 
 
-def moved(image: Array, step: Array) -> Array:
-    """Image at a place [pixel], between its pixels by cubic splines."""
-    return np.asarray(shift(image, step, order=3, mode="nearest")) if np.any(step) else image
+def moved(image: Array, step: Array, turn: float = 0.0, sway: float = 0.0) -> Array:
+    """Image at a place [pixel], turned [rad] and enlarged [1], between its pixels by splines."""
+    if not (np.any(step) or turn or sway):
+        return image
+    cosine, sine = np.cos(turn) / (1.0 + sway), np.sin(turn) / (1.0 + sway)
+    matrix = np.array([[cosine, -sine], [sine, cosine]])
+    middle = 0.5 * (np.array(image.shape) - 1.0)
+    offset = middle - matrix @ (middle + step)
+    return np.asarray(affine_transform(image, matrix, offset, order=3, mode="nearest"))
 
 
 def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
@@ -121,6 +129,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     # What it mirrors, and what is behind it.
     before, beyond = list(people(rng, world, 6)), list(people(rng, world, 4))
     motion = paths(rng, world.shake)
+    held = [np.deg2rad(world.turn), world.sway] * paths(np.random.default_rng([seed, 2]), (1, 1))[0]
     motion[..., 1] += np.outer(world.drift, time / time[-1] - 0.5)
     times = np.stack([time, (time + world.lag) * (1.0 + world.fast)])
     if world.jitter:
@@ -150,7 +159,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
             front = gaussian_filter(views[0][frame], world.roughness[band])
             image = share * curve.counts(warm) + (1.0 - share - clear) * front
             image = gaussian_filter(image + clear * views[1][frame], world.blur[band])
-            film[band, frame] = moved(image, motion[band, frame])[inside, inside] + noise[frame]
+            film[band, frame] = moved(image, motion[band, frame], *held[frame])[inside, inside]
+            film[band, frame] += noise[frame]
     coordinates = {
         "band": list(RIG.bands),
         "time": ("time", time, {"units": "s"}),

@@ -5,6 +5,7 @@ gradient of its mean:
 
 .. math:: r(t) = \sum_b w_b \, s_b(t) \cdot \nabla \bar z_b
 
+where an image is displaced, turned and enlarged as a whole, s(x) = d + A (x - m) about its middle.
 Rapid motion is told frame by frame from what smooth functions of time leave of the combination, at
 the ratio with which each pixel leaves least: Gauss-Newton steps over windows of the image, with a
 prior for s, as cameras on one support move alike. Slow motion the object takes up: the deviations
@@ -21,8 +22,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import binary_erosion
-from scipy.ndimage import shift as shifted
+from scipy.ndimage import binary_erosion, map_coordinates
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, empty, quotient, release
@@ -32,6 +32,9 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading, Whole, smooth_functions
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
+# Parameters of a motion [pixel]: down and right; and a turn and a growth, as they displace what is
+# at the rms distance from the middle, so that the mean square along an axis is half their squares.
+_PARAMETERS: Final = 4
 # Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
 _COMMON, _APART, _TURN = 3.0, 0.1, 1.0
 # Square of a motion over its variance by a jackknife of windows, from which it is undone. Slow: see
@@ -62,13 +65,13 @@ class Stabilised:
     """A capture whose frames lie on one another."""
 
     capture: xr.Dataset
-    motion: Array  # of each band's image (band, time, axis) [pixel]
-    slow: Array  # expected motion that is left (axis) [pixel]
+    motion: Array  # of each band's image (band, time, parameter) [pixel]
+    slow: Array  # expected motion that is left (parameter) [pixel]
 
     def sentence(self, *, undone: bool) -> str:
         """Sentence on how far the image of each band moved."""
         sizes = ", ".join(
-            f"'{band}' {np.sqrt(np.mean(path**2)):.2f}"
+            f"'{band}' {_size(path):.2f}"
             for band, path in zip(self.capture["band"].values, self.motion, strict=True)
         )
         outcome = "was undone" if undone else "could not be undone: intervals may be too small"
@@ -80,8 +83,42 @@ class Stabilised:
         sound = np.isfinite(film).any(axis=0)
         mean = np.full(sound.shape, np.nan)
         mean[sound] = curve.signal(np.nanmean(film[:, sound], axis=0, dtype=np.float64))
-        slopes = _gradients(without_gaps(np.nan_to_num(mean), sound))
-        return np.asarray(np.hypot(slopes[0] * self.slow[0], slopes[1] * self.slow[1]))
+        slopes = _along(_gradients(without_gaps(np.nan_to_num(mean), sound)), _places(mean.shape))
+        return np.asarray(np.sqrt(np.einsum("ayx,a->yx", slopes**2, self.slow**2)))
+
+
+def _size(path: Array) -> float:
+    """Root mean square along an axis [pixel], over the image, of a motion (time, parameter)."""
+    return float(np.sqrt(np.mean(np.sum(path**2, axis=-1)) / 2.0))
+
+
+def _places(shape: tuple[int, ...]) -> Array:
+    """Places (axis, y, x) from the image's middle, over their rms distance from it."""
+    middle = 0.5 * (np.reshape(shape, (2, 1, 1)) - 1.0)
+    places = np.indices(shape) - middle
+    return np.asarray(places / np.sqrt(np.mean(np.sum(places**2, axis=0)) or 1.0))
+
+
+def _along(slopes: Array, places: Array) -> Array:
+    """Changes (parameter, ..., pixel) by a motion, of slopes (axis, ..., pixel) at places."""
+    (down, right), (y, x) = slopes, places
+    return np.stack([down, right, down * x - right * y, down * y + right * x])
+
+
+def _sources(step: Array, places: Array) -> Array:
+    """Where (axis, y, x) [pixel] in an image that moved by a step (parameter) its pixels went from.
+
+    Those of the window of the places, in it.
+    """
+    down, right, turn, growth = step
+    y, x = places
+    moved = np.stack([down + turn * x + growth * y, right - turn * y + growth * x])
+    return np.asarray(np.indices(y.shape) - moved)
+
+
+def _resampled(image: Array, sources: Array) -> Array:
+    """Image at places (axis, y, x) [pixel], between its pixels by cubic splines."""
+    return np.asarray(map_coordinates(image, sources, order=3, mode="nearest"))
 
 
 def _gradients(images: Array) -> Array:
@@ -100,33 +137,31 @@ def stabilise(
 ) -> Stabilised | None:
     """Move each frame back by the cameras' motion, beside one found before; None without motion."""
     shape, status = corrected["counts"].shape, result["status"].values
-    steps, slow = np.zeros((*shape[:2], 2)), np.zeros(2)
+    steps, slow = np.zeros((*shape[:2], _PARAMETERS)), np.zeros(_PARAMETERS)
     disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
     if before is None and (disturbed or misfit.common(status == 0)):
         steps = _rapid(corrected, inputs)
         slow = _expected(inputs, steps.mean(axis=0))
-    steps = steps + _slow(inputs, misfit)
+    steps[..., :2] += _slow(inputs, misfit)
     motion = steps if before is None else steps + before
-    if not np.any(steps) or np.sqrt(np.mean(motion**2, axis=(1, 2)).max()) < _LEAST:
+    if not np.any(steps) or max(map(_size, motion)) < _LEAST:
         return None
     counts, good = empty(shape, np.float32), good_pixels(inputs)
-    y, x = np.ogrid[: shape[2], : shape[3]]
-    middle = 0.5 * (np.array(shape[2:]) - 1.0)
+    places, last = _places(shape[2:]), np.reshape(shape[2:], (2, 1, 1)) - 1.0
     for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
-        for frame, image, (down, right) in zip(film, moved, path, strict=True):
-            valid = good & np.isfinite(image)
-            whole = shifted(without_gaps(image, valid), (down, right), order=3, mode="nearest")
+        for frame, image, step in zip(film, moved, path, strict=True):
+            valid, sources = good & np.isfinite(image), _sources(step, places)
+            whole = _resampled(without_gaps(image, valid), sources)
             frame[:] = np.where(valid, whole, image)
             # What was outside of the image was not seen.
-            outside = np.abs(y - down - middle[0]) > middle[0] + _LEAST
-            outside = outside | (np.abs(x - right - middle[1]) > middle[1] + _LEAST)
+            outside = np.any((sources < -_LEAST) | (sources > last + _LEAST), axis=0)
             frame[outside & good] = np.nan
         release()
     return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion, slow)
 
 
 def _expected(inputs: Inputs, path: Array) -> Array:
-    """Motion (axis) [pixel] in the smooth functions, by that (time, axis) in the next octave."""
+    """Motion [pixel] in the smooth functions, by a path (time, ...) in the next octave."""
     time = inputs.capture["time"].values.astype(np.float64)
     order = min(HIGHEST_ORDER, time.size // 4)
     octave = smooth.polynomial_basis(time, 2 * order)[:, order:]
@@ -138,19 +173,20 @@ class _Window(NamedTuple):
 
     films: Array  # signals (band, frame, y, x) [K]
     used: Mask  # pixels of the window itself, without a flag (y, x)
+    places: Array  # of `_places` (axis, y, x)
 
 
 class _Changes(NamedTuple):
     """What smooth functions of time leave in the pixels of a window, and their gradients."""
 
     rapid: Array  # (band, frame, pixel) [K]
-    slopes: Array  # of the slow image (band, axis, function, pixel) [K / pixel]
+    slopes: Array  # of the slow image (band, parameter, function, pixel) [K / pixel]
 
 
 def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
-    """Motion (band, time, axis) [pixel] of images that move rapidly; zero without any."""
+    """Motion (band, time, parameter) [pixel] of images that move rapidly; zero without any."""
     films, bands = corrected["counts"], inputs.bands
-    motion = np.zeros((*films.shape[:2], 2))
+    motion = np.zeros((*films.shape[:2], _PARAMETERS))
     seen = [[np.isfinite(image).any() for image in film] for film in films.values]
     frames = np.asarray(np.all(seen, axis=0))
     if np.count_nonzero(frames) < inputs.method.minimum_frames:
@@ -158,8 +194,8 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
     windows = list(_windows(films, inputs, frames))
     basis = smooth_functions(inputs, frames)
     prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
-    precision = np.kron(np.linalg.inv(prior), np.eye(2))
-    path = np.zeros((len(bands), len(basis), 2))
+    precision = np.kron(np.linalg.inv(prior), np.eye(_PARAMETERS))
+    path = np.zeros((len(bands), len(basis), _PARAMETERS))
     for turn in range(_TURNS):
         changes = [_changes(window, path, basis) for window in windows]
         if turn < _SEARCHED:  # motion hides the ratios until most of it is undone
@@ -170,10 +206,11 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
         # Is there any?
-        steps, variance = _jackknife(form, force, precision)
+        before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
+        steps, variance = _jackknife(form, force, precision, before)
         if turn == 0 and not np.any(np.median(quotient(steps**2, variance, 0.0), axis=0) > _SHAKEN):
             return motion
-        steps = np.swapaxes(steps.reshape(-1, len(bands), 2), 0, 1)
+        steps = np.swapaxes(steps.reshape(-1, len(bands), _PARAMETERS), 0, 1)
         path += np.clip(steps, -_STEP, _STEP)
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
@@ -187,9 +224,12 @@ def _solved(form: Array, force: Array) -> Array:
     return np.asarray(np.linalg.solve(form, force[..., np.newaxis])[..., 0])
 
 
-def _jackknife(form: Array, force: Array, prior: Array) -> tuple[Array, Array]:
-    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife."""
-    whole, total = form.sum(axis=0) + prior, force.sum(axis=0)
+def _jackknife(form: Array, force: Array, prior: Array, before: Array) -> tuple[Array, Array]:
+    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife.
+
+    The prior is on the sum of the solution and what was solved before.
+    """
+    whole, total = form.sum(axis=0) + prior, force.sum(axis=0) - before @ prior
     reduced = _solved(whole - form, total - force)
     return _solved(whole, total), np.var(reduced, axis=0) * (len(reduced) - 1)
 
@@ -197,6 +237,7 @@ def _jackknife(form: Array, force: Array, prior: Array) -> tuple[Array, Array]:
 def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Window]:
     """Yield windows of the image, of some frames (time), without gaps."""
     good, sides = good_pixels(inputs), []
+    places = _places(good.shape)
     longest = np.sqrt(_SAMPLES / np.count_nonzero(frames)) / _WINDOWS - 2 * _AROUND
     for size in good.shape:
         side = max(1, min(int(np.clip(longest, *_SIDES)), size // _WINDOWS))
@@ -212,19 +253,21 @@ def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Win
             for frame, image in zip(signal, inputs.curves[band].linearise(film), strict=True):
                 valid = good[margin] & np.isfinite(image)
                 frame[:] = without_gaps(image - inputs.curves[band].reference, valid)
-        yield _Window(signals, used[margin])
+        yield _Window(signals, used[margin], places[:, *margin])
 
 
 def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
-    """Rapid changes of a window whose frames are moved by a path (band, frame, axis) [pixel]."""
+    """Rapid changes of a window whose frames are moved by a path (band, frame, ...) [pixel]."""
     films = window.films
     if path.any():
         films = np.empty_like(films)
         for place in np.ndindex(path.shape[:2]):
-            shifted(window.films[place], path[place], films[place], order=3, mode="nearest")
+            sources = _sources(path[place], window.places)
+            films[place] = _resampled(window.films[place], sources)
     maps = np.einsum("tj,btyx->bjyx", basis[:, :_SLOW], films)
     signals = films[:, :, window.used]
-    slopes = np.swapaxes(_gradients(maps), 0, 1)[..., window.used]
+    slopes = _along(_gradients(maps)[..., window.used], window.places[:, window.used])
+    slopes = np.swapaxes(slopes, 0, 1)
     return _Changes(signals - basis @ (basis.T @ signals), slopes)
 
 
@@ -258,7 +301,7 @@ def _equations(
         null = rapid[place] / ratio - rapid[0]
         deviation = np.sqrt((noise[place] / ratio) ** 2 + noise[0] ** 2)
         slope = slopes * (weights / deviation)[:, np.newaxis, np.newaxis]
-        combinations.append((null / deviation, slope.reshape(2 * len(noise), _SLOW, -1)))
+        combinations.append((null / deviation, slope.reshape(-1, _SLOW, slope.shape[-1])))
     energies = [np.mean(null**2, axis=0) for null, _ in combinations]
     for _ in range(repeats):
         forms, forces = list[Array](), list[Array]()
@@ -290,7 +333,9 @@ def _slow(inputs: Inputs, misfit: Misfit) -> Array:
     for place, band in enumerate(inputs.bands[1:]) if windows else ():
         form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
         form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
-        steps, variance = _jackknife(form, force, np.eye(form.shape[1]) / _TURN**2)
+        steps, variance = _jackknife(
+            form, force, np.eye(form.shape[1]) / _TURN**2, np.zeros(form.shape[1])
+        )
         # What does not change in time is no motion.
         score, path = np.zeros((2, *wanted.shape))
         score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps

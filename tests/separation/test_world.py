@@ -41,6 +41,13 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "jitter": (World(jitter=0.025, rate=9.0), "", ""),
     "clocks apart": (World(fast=5e-4), "", ""),
     "held in hand": (World(shake=(1.0, 1.0), detail=DETAIL), "image moved", ""),
+    "turned": (World(turn=0.6, detail=DETAIL), "image moved", "fine detail"),
+    "nearer and farther": (World(sway=0.01, detail=DETAIL), "image moved", "fine detail"),
+    "held in hand, turned": (
+        World(shake=(1.0, 1.0), turn=0.6, sway=0.005, detail=DETAIL),
+        "image moved",
+        "",
+    ),
     "held in hand, far": (World(shake=(2.0, 2.0)), "image moved", ""),
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }

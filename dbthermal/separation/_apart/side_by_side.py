@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Final, TypeAlias
 
+import numpy as np
 import xarray as xr
 
 from dbthermal.separation._apart import joint, neighbours, planes
@@ -21,7 +22,10 @@ from dbthermal.separation._tiles import Material
 Each: TypeAlias = Callable[[Inputs, Material | None], object]
 """Separates each pixel alone, into the result."""
 
-_TURNS: Final = 2  # turns of the materials and the object of each camera's own place
+# Turns of the materials and the object at each camera's place; and the median change of the
+# emissivities that ends them: of simulated scenes below 0.0026 a second turn changes no error by
+# more than 2 %, of one of 0.008 it makes the error 2.6 times less.
+_TURNS, _SETTLED = 2, 0.003
 _OBJECTS: Final = "objects"  # what a displacement keeps of the pixels alone
 
 
@@ -94,7 +98,10 @@ def pooled(
         if objects is None:  # the object hardly differs between the places
             inputs = replace(inputs, difference=None)
             break
-        shares = objects.emissivity
+        sound = source["status"].values.ravel() == 0
+        changes, shares = np.abs(objects.emissivity - shares)[:, sound], objects.emissivity
+        if sound.any() and np.median(changes) < _SETTLED:
+            break
     if objects is not None:
         inputs = replace(inputs, difference=objects.difference)
     separate_pixels(inputs, material)
