@@ -77,7 +77,7 @@ materials name*         names as listed by 'data'; all by default
 --header n=0        length of the header of raw files [byte]
 --frame-header n=0  length of the header of each frame of raw files [byte]
 --simulated flag        label the files, and all results made from them, as simulated
---variable name         name of an array in a file with several, or of a result's variable
+--variable name&        array of a file with several, repeated for each camera, or of a result
 --offset number+        start of each further camera minus the first's [s]; else by dates or images
 --simulate flag         use emulated devices
 --side-by-side flag     cameras side by side instead of one optical path
