@@ -36,7 +36,7 @@ _DRAWN: Final = (
     "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
 )
 _FOREIGN: Final = {
-    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt"), _EXPORT),
+    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".ptw"), _EXPORT),
     **dict.fromkeys(("film", "picture"), _DRAWN),
     "HDF4": "convert it by h4toh5 and use readers.array",
     **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),

@@ -49,7 +49,7 @@ _PIECES: Final = 2**14  # of less than 1 kB in a file
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 _JITTER: Final = 0.25  # of the times in names of files [frame]
 _DATE: Final = re.compile(
-    r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(?P<unix>1\d{9}\.\d+)$"
+    r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9}\.\d+)$"
 )
 # Names of a digital number, and of units of time.
 _COUNTS: Final = re.compile(
@@ -87,7 +87,7 @@ def numbered(paths: Sequence[Path]) -> Array | None:
         return None
     # Whole multiples of the usual step are frames that are missing; dates are right to a part.
     steps = np.diff(moments if is_dated else table[:, counting[0]])
-    places = np.rint(apart := steps / (np.median(steps) or 1.0))
+    places = np.rint(apart := steps / (np.percentile(steps, 50, method="lower") or 1.0))
     near = np.abs(apart - places).max() < _JITTER and places.min() > 0
     exact = not is_dated and np.array_equal(apart, places)
     gaps = places.max() > _GAP and (exact or (near and places.sum() < 2 * len(paths)))
@@ -96,14 +96,13 @@ def numbered(paths: Sequence[Path]) -> Array | None:
 
 def _moment(stem: str) -> float:
     """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN of others."""
-    match = _DATE.search(stem)
-    if match is None or match.group("unix"):
-        return float(match.group("unix")) if match else np.nan
-    *whole, fraction, _ = match.groups("0")
+    if (match := _DATE.search(stem)) is None:
+        return np.nan
+    *whole, fraction, unix = match.groups("")
     with suppress(ValueError):
         moment = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
         return moment.timestamp() + float(f"0.{fraction}")
-    return np.nan
+    return float(unix or np.nan)
 
 
 @contextmanager

@@ -142,9 +142,6 @@ def spectrum(
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
     attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
-    coordinate = ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)
-    return xr.Dataset(
-        schema.variables("spectrum", {"emissivity": emissivity}),
-        {"wavelength": coordinate},
-        {**attrs, "unphysical_values": unphysical},
-    )
+    axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
+    variables = schema.variables("spectrum", {"emissivity": emissivity})
+    return xr.Dataset(variables, axes, {**attrs, "unphysical_values": unphysical})

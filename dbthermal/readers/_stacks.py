@@ -5,7 +5,9 @@ import logging
 import math
 import re
 from collections.abc import Iterator
+from itertools import groupby
 from logging.handlers import QueueHandler
+from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final, NamedTuple
@@ -32,9 +34,8 @@ _FORM: Final = (
     (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
 # Compressions without loss, and the codec that undoes them.
-_CODECS: Final = {1: "", 32946: "zlib"} | dict(
-    zip((5, 8, 32773, 34925, 50000), ("lzw", "zlib", "packbits", "lzma", "zstd"), strict=True)
-)
+_CODECS: Final = {1: "", 5: "lzw", 8: "zlib", 32946: "zlib", 32773: "packbits", 34925: "lzma"}
+_CODECS.update({50000: "zstd"})
 _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
@@ -127,13 +128,16 @@ def tiff(
     stored = sum(length for page in pages for _, length in page.spans)
     recordings.check_memory(shape, memory, name, stored)
     seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    is_rate = np.ndim(0.0 if clock is None else clock) == 0
-    places = recordings.numbered(paths) if is_rate and shape[0] == len(paths) else None
-    if places is not None:
-        missing = int(places[-1]) + 1 - len(paths)
+    places = recordings.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else None
+    groups = groupby(pages, attrgetter("path"))
+    size, *lengths = (sum(page.images for page in group) for _, group in groups)
+    if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
+        spans = zip(size * places, (size, *lengths), strict=True)
+        numbers = np.concatenate([first + np.arange(length) for first, length in spans])
+        missing = int(numbers[-1]) + 1 - len(numbers)
         rule = "Must be all that were recorded: there are gaps in time in their place"
         sentences.append(f"The numbers of '{name}' leave out {missing} frames. {rule}.")
-        seconds = places * seconds[1]
+        seconds = numbers * seconds[1]
     # Pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
     flat = counts.reshape(-1)
@@ -254,8 +258,9 @@ def _pages(path: Path) -> list[_Page]:
             raise ValueError(f"{label}. Must end within its {size}.")
         return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
     if stated not in {0, 1, len(pages)}:  # 1 of a file to which frames were appended
-        label = f"Truncated TIFF '{path.name}': {len(pages)} pages"
-        raise ValueError(f"{label}. Must be the {stated} that its description states.")
+        state = "Truncated" if len(pages) < stated else "Invalid"
+        rule = f"Must be the {stated} that its description states, of one band"
+        raise ValueError(f"{state} TIFF '{path.name}': {len(pages)} pages. {rule}.")
     return pages
 
 

@@ -92,6 +92,21 @@ def test_numbers_that_are_left_out_are_gaps_in_time(tmp_path: Path) -> None:
     assert_allclose(read(paths[:3])["exposure_time"], [0.0, 0.1, 0.2])  # every second one
 
 
+def test_a_stack_that_is_left_out_is_a_gap_in_time(tmp_path: Path) -> None:
+    """So is a whole stack of a recording in parts; one of two bands is not called truncated."""
+    paths = [tmp_path / f"rec_{number}.tif" for number in (1, 2, 4)]
+    for path, frames in zip(paths, (3, 3, 2), strict=True):
+        write(path, scene(frames) + np.uint16(path.stem[-1]))
+    with pytest.warns(UserWarning, match=r"'rec_1\.tif to rec_4\.tif' leave out 3 frames"):
+        made = read(paths)
+    assert_allclose(made["exposure_time"] * 10.0, [0, 1, 2, 3, 4, 5, 9, 10], atol=1e-9)  # [frame]
+    with tifffile.TiffWriter(tmp_path / "two.tif") as file:
+        for band in (scene(), scene() + np.uint16(1)):
+            file.write(band, photometric="minisblack")
+    with pytest.raises(ValueError, match=r"Invalid TIFF .* 6 pages\. Must be the 3 .* one band"):
+        read(tmp_path / "two.tif")
+
+
 @pytest.mark.parametrize(
     "form",
     [
