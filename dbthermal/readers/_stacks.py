@@ -29,7 +29,7 @@ _FORM: Final = (
     ("is_reduced", "preview", False, "False: a frame, not a smaller copy of one"),
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
-    ("is_tiled", "tiled pages", False, "False: save it in strips"),
+    ("is_tiled", "tiled pages", False, "False: save it in strips, as by tiffcp -s"),
     (262, "photometric interpretation", 1, "1: more counts are whiter"),
     (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
