@@ -77,8 +77,8 @@ materials name*         names as listed by 'data'; all by default
 --header n=0        length of the header of raw files [byte]
 --frame-header n=0  length of the header of each frame of raw files [byte]
 --simulated flag        label the files, and all results made from them, as simulated
---variable name         array to take from a file with several; or variable of a result
---offset number+        start of each further camera after the first [s]; else by dates or images
+--variable name&        array of a file with several, repeated for each camera, or of a result
+--offset number+        start of each further camera minus the first's [s]; else by dates or images
 --simulate flag         use emulated devices
 --side-by-side flag     cameras side by side instead of one optical path
 --at point+&            blackbody temperature, as 20C or 293.15K, and its files; one --at for each

@@ -332,6 +332,11 @@ def test_raw_files_need_their_form(results: Path) -> None:
     for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
         np.testing.assert_array_equal(counts.values, [stack, stack + 1])
+    np.savez(results / "both.npz", wide=stack, narrow=stack + 1)
+    arrays = ["--variable", "narrow", "--variable", "wide", "--offset", "0", *STATED]
+    done(results, "import", "both.npz", "both.npz", *arrays, "-o", "arrays.zarr")
+    counts = store.open_dataset(results / "arrays.zarr")["counts"]
+    np.testing.assert_array_equal(counts.values, [stack + 1, stack])
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
     assert "Missing --byte-order: 'a.raw' does not tell" in line
 
@@ -554,7 +559,7 @@ calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
 demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
-import folder --bands a b --clock 10 -o x.zarr -> Invalid 1 files: which are of the second camera
+import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing.zarr -> No file or folder 'nothing.zarr'
 plan gold --noise 0.03 -> Unknown material 'gold'
@@ -563,7 +568,8 @@ export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
 export result.zarr --pixel 24 0 -o x.csv -> Must lie in the image of 24 x 32
 import a.tif b.tif --bands 8-14 9.5 -o x.zarr -> Missing --clock for 'a.tif', which tells no times
 import a.tif b.tif --bands 8-14 9.5 10.6 -o x.zarr -> --bands of 3 names.* Must be 2, one for each
-import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 rates
+import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 values
+export result.zarr --variable noise --variable status -o x.csv -> variable 'noise status' for .csv
 {ONE} --offset 0 --frames 0 -o x.zarr -> Invalid --frames .* first and end
 {ONE} --offset 0 --frames 300 400 -o x.zarr -> No frame or row of 'a.tif' selected
 {ONE} --offset 0 --every 0 -o x.zarr -> Invalid --every 0

@@ -432,6 +432,9 @@ def test_a_foreign_folder_stays(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="Foreign folder"):
             call()
     assert (foreign / "notes.txt").read_text() == (parts / "precious.txt").read_text() == "precious"
+    (note := tmp_path / "note.zarr").write_text("precious")
+    with pytest.raises(ValueError, match="Foreign file"):
+        store.save(SCENE, note, {})
     with pytest.raises(FileNotFoundError, match="an address"):
         store.save(SCENE, "s3://bucket/a.zarr", {})
     with pytest.raises(ValueError, match="Must be at most 60 letters"):

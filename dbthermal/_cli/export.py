@@ -21,7 +21,7 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     """Command `export`."""
     # The variable, which must be of the kind that the file shows.
     result, suffix = opened(options.result), options.output.suffix
-    options.variable = options.variable or "object_temperature"
+    options.variable, *further = options.variable or ["object_temperature"]
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
     names = sorted(map(str, result.data_vars))
@@ -31,8 +31,8 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
         if not names:
             rule = "Must be a result, as from: dbthermal separate"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
-    if options.variable not in names:
-        kind = f"variable '{options.variable}' for {suffix}"
+    if further or options.variable not in names:
+        kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
         raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}

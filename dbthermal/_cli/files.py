@@ -80,7 +80,7 @@ def kind_of(path: Path, options: argparse.Namespace) -> str:
     if not kinds:
         formats.refuse_text(path)  # a file that is missing has no format
         label = f"Unknown format of '{path.name}', by its first bytes and '{suffix}'"
-        rule = "Must be a recording; bare numbers need --shape and --byte-order"
+        rule = "Must be a recording, or its TIFF; bare numbers need --shape and --byte-order"
         raise ValueError(f"{label}. {rule}.")
     return kinds[0]
 
@@ -114,12 +114,11 @@ def _arguments(
     parameters, stated = signature(reader).parameters, accepted(reader, options)
     if "unit" in parameters:
         stated.setdefault("unit", "count")
-    if options.clock:
-        stated["clock"] = options.clock[min(camera, len(options.clock) - 1)]
+    for name, values in {"clock": options.clock, "name": options.variable}.items():
+        if values and name in parameters:
+            stated[name] = values[min(camera, len(values) - 1)]
     if "shape" in stated:
         stated["shape"] = tuple(options.shape)
-    if "name" in parameters:
-        stated["name"] = options.variable
     for name, parameter in parameters.items():
         required = parameter.kind is Parameter.KEYWORD_ONLY and parameter.default is Parameter.empty
         if required and name not in stated:
@@ -154,9 +153,10 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.D
         raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name all, such as: --bands 8-14 9.5.")
-    if len(options.clock or ()) not in {0, 1, len(cameras)}:
-        label = f"Invalid --clock of {len(options.clock)} rates"
-        raise ValueError(f"{label}. Must be one, or one for each camera.")
+    for name, values in {"clock": options.clock or (), "variable": options.variable or ()}.items():
+        if len(values) not in {0, 1, len(cameras)}:
+            label = f"Invalid --{name} of {len(values)} values"
+            raise ValueError(f"{label}. Must be one, or one for each camera.")
     if number != len(cameras):
         label = f"Invalid --bands of {number} names: {', '.join(options.bands)}"
         raise ValueError(f"{label}. Must be {len(cameras)}, one for each camera, with spaces.")

@@ -264,10 +264,9 @@ def _overlap(places: Array, band: str) -> Mask:
     ends = np.reshape(places.shape[1:], (2, 1, 1)) - 1
     shared = np.mean(np.all((places > -0.5) & (places < ends + 0.5), axis=0))
     if not shared >= _LEAST_OVERLAP:
-        raise ValueError(
-            f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
-            f"Must be at least {_LEAST_OVERLAP:.0%}."
-        )
+        label = f"it shares {shared:.0%} of the image with the first"
+        rule = f"Must be at least {_LEAST_OVERLAP:.0%}, neither mirrored nor turned"
+        raise ValueError(f"Invalid view in band '{band}': {label}. {rule}.")
     pixels = np.indices(places.shape[1:])
     lowest, highest = np.minimum(places, pixels), np.maximum(places, pixels)
     return np.asarray(np.all((lowest >= _MARGIN) & (highest <= ends - _MARGIN), axis=0))
@@ -290,7 +289,7 @@ def _start(pair: list[Array], band: str) -> tuple[float, Array]:
     if not correlation >= _LEAST_CORRELATION:
         raise ValueError(
             f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
-            f"Must be at least {_LEAST_CORRELATION}: the same object, displaced by at most a tenth "
-            "of the image."
+            f"Must be at least {_LEAST_CORRELATION}: the same object, neither mirrored nor turned, "
+            "displaced by at most a tenth of the image."
         )
     return correlation, matrix

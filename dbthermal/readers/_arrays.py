@@ -34,14 +34,13 @@ def array(
 ) -> xr.Dataset:
     """Counts of a NumPy, HDF5, NetCDF, MATLAB or zarr file, or of an array that is opened already.
 
-    The format is that of the first bytes. Pickled objects are never loaded, and nothing is taken
-    from another file. HDF5 and zarr may be without checksums; damage of their values is then not
-    seen, as in any copy. An array that another library has opened may be lazy.
+    Pickled objects are never loaded, and nothing is taken from another file. Damage of HDF5 and
+    zarr without checksums is not seen. An array that another library has opened may be lazy.
 
     Parameters
     ----------
     source : str, Path, array or DataArray
-        Regular file, folder of zarr, or an array with `shape` and `dtype`: (time, y, x), uint16.
+        Regular file, folder of zarr, or an array or list of arrays: (time, y, x), uint16.
         Dims with names must have one of their place: time, t, frame, image; y, row, height; x,
         column, col, width.
     name : str, optional
@@ -57,10 +56,8 @@ def array(
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ImportError
-        If h5py, the extra ``recordings``, is not installed for HDF5, which NetCDF 4 is too.
+    FileNotFoundError, ImportError
+        If there is no file, or the extra ``recordings`` is not installed for HDF5 and NetCDF 4.
     TypeError, ValueError
         If a file is of another format, or damaged; the array is not one of three dimensions and
         uint16, has other dims, is scaled, lacks values, has times that the clock contradicts, or is
@@ -84,6 +81,8 @@ def array(
     with ExitStack() as stack:
         # The array and its times, which are checked before it is read.
         values: Any = source
+        if not (is_file or isinstance(getattr(source, "dtype", None), np.dtype)):
+            values = np.asarray(source)  # of a list, or of another library
         if is_file:
             values, lines = containers.opened(path, name, stack)
         else:

@@ -111,16 +111,14 @@ def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[An
     if not kind:
         rule = "Must be .npy, .npz, HDF5, NetCDF, MATLAB or zarr"
         raise ValueError(f"Invalid '{path.name}': of no format, by its first bytes. {rule}.")
-    form = f"a whole {kind}" if kind in _OPENED else "a whole .npy or .npz"
-    state = "Damaged" if kind in {*_OPENED, "zip"} else "Invalid"
-    stack.enter_context(recordings.damage_named(f"{state} '{path.name}'", form))
+    stack.enter_context(recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"))
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
-    if kind not in _OPENED:
-        return variables.numpy_array(path, name, stack), []
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     arrays = _OPENED[kind](path, stack)
+    shapes = [f"{key} {tuple(array.shape)}" for key, array in arrays.items()]
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
-    name = recordings.array_name([key for key in arrays if arrays[key].ndim == 3], name, path)
+    films = [key for key in arrays if arrays[key].ndim == 3]
+    name = recordings.array_name(films, name, path, shapes)
     return arrays[name], _times_of(arrays, name, arrays[name].shape[0])
 
 
@@ -224,8 +222,6 @@ def _check_pieces(array: Any, path: Path) -> None:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
-    if not any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
-        raise ValueError(f"Invalid folder '{path}', no whole zarr. Must be files: {path}/*.tif.")
     deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
         # Each array by its metadata, of which consolidated ones are a copy that may be old.
@@ -350,5 +346,9 @@ _OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {
     "HDF5": _hdf5,
     "NetCDF": lambda path, _: variables.netcdf_arrays(path),
     "MATLAB 5": lambda path, _: variables.matlab_arrays(path),
+    "NumPy": lambda path, stack: (
+        {path.stem: variables.numpy_array(path, stack.enter_context(path.open("rb")))}
+    ),
+    "zip": variables.numpy_arrays,
 }
 """Format -> function that opens its arrays by name."""

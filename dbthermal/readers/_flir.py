@@ -115,8 +115,7 @@ def flir(
     Raises
     ------
     OSError, ImportError
-        If a file cannot be opened, or an image is compressed and imagecodecs, the extra
-        ``recordings``, is not installed.
+        If a file cannot be opened, or the extra ``recordings`` is not installed for compressed ones.
     TypeError, ValueError
         If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
         differ in size or in the maker's constants; the byte order is unclear or contradicts the
@@ -249,16 +248,13 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     if order != (stated or order) or (decided == "smoothness" and sign < 0):
         counts.byteswap(inplace=True)
         order, sign = "little" if order == "big" else "big", -sign
+    label = "its images are smoother with their bytes swapped"
     if stated and sign < 0:
-        raise ValueError(
-            f"Invalid byte_order '{stated}' for '{name}': its images are smoother with their bytes "
-            "swapped. Must be the other one."
-        )
+        rule = "Must be the other one"
+        raise ValueError(f"Invalid byte_order '{stated}' for '{name}': {label}. {rule}.")
     if not stated and ((sign == 0 and not form.order) or sign < 0):
-        raise ValueError(
-            f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
-            "as smooth. Must be stated: byte_order='little' or 'big'."
-        )
+        rule = "Must be stated: byte_order='little' or 'big'"
+        raise ValueError(f"Unclear byte order in '{name}': {label}, or as smooth. {rule}.")
     return order, decided
 
 
@@ -316,9 +312,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
 def _numbers_agree(numbers: npt.NDArray[np.int64]) -> Mask:
     """Agreement (time) of the numbers (time, [file, image, camera]) of frames.
 
-    Image and camera begin with the same 32 bytes, of which two number the frame. Each may count
-    from a start of its own, or not at all: in a file the two must rise together, or one of them is
-    of another frame.
+    Each may count from a start of its own, or not at all; in a file the two must rise together.
     """
     agree = np.ones(len(numbers), dtype=bool)
     for file in np.unique(numbers[:, 0]):

@@ -36,7 +36,7 @@ _DRAWN: Final = (
     "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
 )
 _FOREIGN: Final = {
-    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt"), _EXPORT),
+    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".ptw"), _EXPORT),
     **dict.fromkeys(("film", "picture"), _DRAWN),
     "HDF4": "convert it by h4toh5 and use readers.array",
     **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
@@ -52,6 +52,9 @@ _TEXT: Final = 512  # bytes at the beginning of a file, without a control charac
 def format_of(path: Path) -> str:
     """Format of a file by its first bytes, empty if unknown; of a folder zarr."""
     if path.is_dir():
+        if not any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
+            rule = f"Must be files: {path}/*.tif"
+            raise ValueError(f"Invalid folder '{path}', no whole zarr. {rule}.")
         return "zarr"
     size = texts.regular_file(path, _LARGEST).stat().st_size
     with path.open("rb") as stream:
@@ -93,7 +96,8 @@ def files(path: Paths, reader: str) -> list[Path]:
     numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
     for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):
         if len(before) == len(after) and after <= before:
-            label = f"Unordered files: the numbers of '{file.name}' do not rise"
+            state = "do not rise" if after != before else "are those of the file before, or none"
+            label = f"Unordered files: the numbers of '{file.name}' {state}"
             rule = "Must rise, not in the order of text, frame1, frame10, frame2"
             raise ValueError(f"{label}. {rule}: $(ls -v frame*.png).")
     for file in paths:

@@ -6,7 +6,8 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 from tokenize import TokenError
@@ -46,6 +47,10 @@ _PACKED: Final = 64
 SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
 _PIECES: Final = 2**14  # of less than 1 kB in a file
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
+_JITTER: Final = 0.25  # of the times in names of files [frame]
+_DATE: Final = re.compile(
+    r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9}\.\d+)$"
+)
 # Names of a digital number, and of units of time.
 _COUNTS: Final = re.compile(
     r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
@@ -76,14 +81,28 @@ def numbered(paths: Sequence[Path]) -> Array | None:
     if len({*map(len, numbers)}) > 1 or len(paths) < 3:
         return None
     table = np.array(numbers, dtype=np.float64)
-    (counting,) = np.nonzero(np.ptp(table, axis=0))
-    if counting.size != 1:  # dates, or parts of a recording
+    moments = np.array([_moment(path.stem) for path in paths])
+    is_dated, counting = np.isfinite(moments).all(), np.flatnonzero(np.ptp(table, axis=0))
+    if not is_dated and counting.size != 1:  # parts of a recording
         return None
-    # Whole multiples of the usual step are frames that are missing.
-    steps = np.diff(table[:, counting[0]])
-    places = steps / np.median(steps)
-    gaps = places.max() > _GAP and bool(np.all(places == np.rint(places)))
+    # Whole multiples of the usual step are frames that are missing; dates are right to a part.
+    steps = np.diff(moments if is_dated else table[:, counting[0]])
+    places = np.rint(apart := steps / (np.percentile(steps, 50, method="lower") or 1.0))
+    near = np.abs(apart - places).max() < _JITTER and places.min() > 0
+    exact = not is_dated and np.array_equal(apart, places)
+    gaps = places.max() > _GAP and (exact or (near and places.sum() < 2 * len(paths)))
     return np.cumsum(np.append(0.0, places)) if gaps else None
+
+
+def _moment(stem: str) -> float:
+    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN of others."""
+    if (match := _DATE.search(stem)) is None:
+        return np.nan
+    *whole, fraction, unix = match.groups("")
+    with suppress(ValueError):
+        moment = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+        return moment.timestamp() + float(f"0.{fraction}")
+    return float(unix or np.nan)
 
 
 @contextmanager
@@ -138,10 +157,7 @@ def check_pieces(number: int, size: int, label: str) -> None:
 
 
 def film(values: Any) -> Counts:
-    """Counts (time, y, x) of an array, also of one on disk: copied some frames at a time.
-
-    Those that come must be of the type and shape that the array declares.
-    """
+    """Counts (time, y, x) of an array, which must be as it declares, copied frames at a time."""
     counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
     for frames in parts(counts):
         block, place = values[frames], counts[frames]
@@ -171,7 +187,7 @@ def _roughness(frame: Counts) -> float:
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
 
-def array_name(names: Collection[str], name: str | None, path: Path) -> str:
+def array_name(names: Collection[str], name: str | None, path: Path, shapes: Sequence[str]) -> str:
     """Name of an array in a file, which may be left out if there is one alone."""
     if name is None and len(names) == 1:
         return next(iter(names))
@@ -179,7 +195,8 @@ def array_name(names: Collection[str], name: str | None, path: Path) -> str:
         return str(name)
     if not names:
         rule = "Must have one; a store of dbthermal that has two bands is a capture as it is"
-        raise ValueError(f"Missing array (time, y, x) in '{path.name}'. {rule}.")
+        label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
+        raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
     wanted = "name of one of the arrays" if name is None else f"array '{name}'"
     raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(names)}.")
 
@@ -187,11 +204,9 @@ def array_name(names: Collection[str], name: str | None, path: Path) -> str:
 def check_unit(unit: str, name: str) -> None:
     """Raise ValueError if the numbers of a file are no counts."""
     if not _COUNTS.fullmatch(str(unit).strip()):
-        raise ValueError(
-            f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
-            "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
-            "counts."
-        )
+        rule = "Must be 'count': object and reflection add up in counts, and no longer in "
+        rule += "temperatures (temperature-linear data). Record or export raw counts"
+        raise ValueError(f"Invalid unit '{unit}' of '{name}'. {rule}.")
 
 
 def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: str) -> Array:
@@ -204,7 +219,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     elif not word:
         scales = [1.0] if clock is None else [1.0, 1e-3, 1e-6, 1e-9]
         step = abs(float(values[-1]) - float(values[0])) / max(len(values) - 1, 1)
-        if clock is None and not _STEPS[0] < step <= _STEPS[1]:
+        if clock is None and not _STEPS[0] < step < _STEPS[1]:  # at 1: numbers of frames?
             label = f"Missing unit of the times of '{name}', which rise by {step:g} a frame"
             raise ValueError(f"{label}. Must be s, ms, us, ns; or state the frame rate by clock=.")
     if not scales:
@@ -213,11 +228,14 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     stated = scales[0] * apart if clock is None else stamps(clock, len(values), name)
     seconds = min((apart * scale for scale in scales), key=lambda s: np.abs(s - stated).max())
     agrees = np.abs(seconds - stated) <= 0.5 * stated[-1] / max(len(stated) - 1, 1)
-    agrees &= np.diff(seconds, prepend=-1.0) > 0
-    if not agrees.all():
-        first = int(np.argmin(agrees))
+    rises = np.diff(seconds, prepend=-1.0) > 0
+    if not np.all(valid := rises if clock is None else rises & agrees):
+        first = int(np.argmin(valid))
         mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
         rule = "Must agree to half a frame, and rise; without clock= those of the file are taken"
+        if not rises[first]:
+            mismatch = f"frame {first} at {seconds[first]:g} s, after {seconds[first - 1]:g} s"
+            rule = "Must rise: correct them, or save the counts without them and state clock="
         raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
     return np.asarray(seconds)
 
@@ -318,9 +336,8 @@ def clocked(counts: Counts, clock: Clock, name: str, *sentences: str, **attrs: s
 def _time_elsewhere(counts: Counts, name: str) -> list[str]:
     """Sentence on counts (time, y, x) whose time may be along another axis.
 
-    Rows and columns of an image are about as rough; time is smoother, or changes faster, for its
-    neighbours share their pattern. Roughness is the mean second difference without its largest
-    quarter, and that of rounding.
+    Rows and columns are about as rough; time is smoother, or changes faster. Roughness is the mean
+    second difference without its largest quarter, and that of rounding.
     """
     sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
     middle = counts[tuple(sides)]

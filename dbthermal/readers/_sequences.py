@@ -102,8 +102,7 @@ def raw(
 def _are_longer(counts: Counts) -> bool:
     """Tell whether numbers of 16 bits are parts of longer ones, whole or floating-point.
 
-    Then neighbours, or every fourth number of some of the four, are much rougher than those of the
-    smoothest of the four. Columns of a camera differ by far less.
+    Then neighbours, or every fourth number, are much rougher than the smoothest of the four.
     """
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:

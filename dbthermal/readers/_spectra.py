@@ -1,10 +1,8 @@
 """Reader of spectra, of the ECOSTRESS library.
 
-A spectrum is a Dataset with `emissivity` (wavelength) [1], wavelength [m] increasing, and in its
-attributes what the library says of the sample (`NOTES`, empty where it is silent), the file's name
-(`source`) and the number of values outside [0, 1] (`unphysical_values`). Those come from the
-calibration of the library's spectrometers and are kept as they are. An emissivity outside
-`schema.EMISSIVITY_LIMITS` is no measurement, but a wrong unit or a damaged file, and is refused.
+Attributes say what the library says of the sample (`NOTES`, empty where it is silent). Values
+outside [0, 1] come from the calibration of the library's spectrometers and are kept as they are.
+Those outside `schema.EMISSIVITY_LIMITS` have a wrong unit, or are damaged, and are refused.
 """
 
 import re
@@ -20,20 +18,11 @@ from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array
 
-NOTES: Final = MappingProxyType(
-    {
-        "name": "Name",
-        "type": "Type",
-        "class": "Class",
-        "subclass": "Subclass",
-        "genus": "Genus",
-        "species": "Species",
-        "particle_size": "Particle Size",
-        "sample_no": "Sample No.",
-        "measurement": "Measurement",
-        "description": "Description",
-    }
+_KEYS: Final = (
+    *("Name", "Type", "Class", "Subclass", "Genus", "Species"),
+    *("Particle Size", "Sample No.", "Measurement", "Description"),
 )
+NOTES: Final = MappingProxyType({k.lower().replace(" ", "_").rstrip("."): k for k in _KEYS})
 """Attribute of a spectrum -> key in the header of an ECOSTRESS file."""
 
 _HEADER_RULES: Final = {
@@ -63,11 +52,9 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
     Raises
     ------
-    OSError
-        If the file cannot be opened.
-    ValueError
-        If it is truncated or longer than declared, is no hemispherical reflectance in percent over
-        micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
+    OSError, ValueError
+        If it cannot be opened, is not as long as declared, is no hemispherical reflectance [%] over
+        micrometres, has an emissivity outside `schema.EMISSIVITY_LIMITS`, or a wavelength outside
         0.001 to 1000 um or out of order.
 
     References
@@ -100,10 +87,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
     for key, value in stated.items():
         declared = header.get(key, "")
         if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
-            raise ValueError(
-                f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'. "
-                "Must be equal."
-            )
+            label = f"{key} is {value:g}, declared '{declared}'"
+            raise ValueError(f"Truncated or altered '{path.name}': {label}. Must be equal.")
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
     return spectrum(wavelength, 1 - reflectance / 100, notes, File(path.name, rows))
 
@@ -157,9 +142,6 @@ def spectrum(
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
     attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
-    coordinate = ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)
-    return xr.Dataset(
-        schema.variables("spectrum", {"emissivity": emissivity}),
-        {"wavelength": coordinate},
-        {**attrs, "unphysical_values": unphysical},
-    )
+    axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
+    variables = schema.variables("spectrum", {"emissivity": emissivity})
+    return xr.Dataset(variables, axes, {**attrs, "unphysical_values": unphysical})

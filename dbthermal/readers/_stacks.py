@@ -5,7 +5,9 @@ import logging
 import math
 import re
 from collections.abc import Iterator
+from itertools import groupby
 from logging.handlers import QueueHandler
+from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final, NamedTuple
@@ -24,16 +26,16 @@ from dbthermal.readers._recording import MEMORY, Clock, Counts
 _FORM: Final = (
     ("bitspersample", "bits of a pixel", 16, "16: counts, not a picture"),
     ("sampleformat", "sample format", 1, "1: whole numbers from 0, counts and no temperatures"),
+    ("is_reduced", "preview", False, "False: a frame, not a smaller copy of one"),
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
-    ("is_tiled", "tiled pages", False, "False: save it in strips"),
+    ("is_tiled", "tiled pages", False, "False: save it in strips, as by tiffcp -s"),
     (262, "photometric interpretation", 1, "1: more counts are whiter"),
     (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
 # Compressions without loss, and the codec that undoes them.
-_CODECS: Final = {1: "", 32946: "zlib"} | dict(
-    zip((5, 8, 32773, 34925, 50000), ("lzw", "zlib", "packbits", "lzma", "zstd"), strict=True)
-)
+_CODECS: Final = {1: "", 5: "lzw", 8: "zlib", 32946: "zlib", 32773: "packbits", 34925: "lzma"}
+_CODECS.update({50000: "zstd"})
 _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
@@ -70,14 +72,13 @@ def tiff(
     Parameters
     ----------
     path : str, Path or sequence
-        Regular file of one page or many, or the files of one recording in the order of time; the
-        numbers in their names must rise.
+        File of one page or many, or the files of one recording, with numbers that rise.
     unit : {"count"}
         Unit of the pixels. Temperatures, also as whole numbers (temperature-linear data), are
         refused: the camera made them with an emissivity, and mixtures add up in counts only.
     clock : float or array_like, optional
-        Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers
-        leave some out have gaps in time there.
+        Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers,
+        or dates, leave some out have gaps in time there.
     memory : float
         Largest memory that the counts may take [byte]; refused before it is taken.
 
@@ -90,22 +91,18 @@ def tiff(
     Raises
     ------
     OSError, ImportError
-        If a file cannot be opened, or tifffile or imagecodecs, the extra ``recordings``, is not
-        installed.
-    ValueError
+        If a file cannot be opened, or the extra ``recordings`` is not installed.
+    TypeError, ValueError
         If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, two
-        bands in one, or axes that are not time, rows, columns; a page is compressed with loss, in
-        tiles, in colours or not of 16 bits, or differs in size; it is mirrored, rotated, scaled
-        (GDAL), or white where it is 0; counts are those of no data, take too much memory or have 8
-        bits; or the clock does not fit, or contradicts the description.
-    TypeError
-        If clock, memory or a header are no numbers.
+        bands in one, or other axes; a page is compressed with loss, in tiles, in colours, not of 16
+        bits, of another size, a preview, mirrored, rotated, scaled (GDAL), or white where it is 0;
+        counts are missing, take too much memory or have 8 bits; or the clock is wrong.
 
     Warns
     -----
     UserWarning
-        If a description has another frame rate, which may be that of playing it, numbers of files
-        are left out, or another axis than the first may be time.
+        If a description has another frame rate, which may be that of playing it, numbers or dates
+        of files are left out, a frame is there twice, or another axis than the first may be time.
 
     Examples
     --------
@@ -131,14 +128,17 @@ def tiff(
     stored = sum(length for page in pages for _, length in page.spans)
     recordings.check_memory(shape, memory, name, stored)
     seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    is_rate = np.ndim(0.0 if clock is None else clock) == 0
-    places = recordings.numbered(paths) if is_rate and shape[0] == len(paths) else None
-    if places is not None:
-        missing = int(places[-1]) + 1 - len(paths)
+    places = recordings.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else None
+    groups = groupby(pages, attrgetter("path"))
+    size, *lengths = (sum(page.images for page in group) for _, group in groups)
+    if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
+        spans = zip(size * places, (size, *lengths), strict=True)
+        numbers = np.concatenate([first + np.arange(length) for first, length in spans])
+        missing = int(numbers[-1]) + 1 - len(numbers)
         rule = "Must be all that were recorded: there are gaps in time in their place"
         sentences.append(f"The numbers of '{name}' leave out {missing} frames. {rule}.")
-        seconds = places * seconds[1]
-    # Their pixels, from the places that the pages state.
+        seconds = numbers * seconds[1]
+    # Pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
     flat = counts.reshape(-1)
     for page in pages:
@@ -147,6 +147,10 @@ def tiff(
             at += values.size
             release()
     recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
+    twins = [n for n in range(1, len(paths)) if np.array_equal(*counts[n - 1 : n + 1])]
+    if twins and len(counts) == len(paths):
+        label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
+        sentences.append(f"Same counts in {label}. Must be different frames: is one a copy?")
     order = " and ".join(sorted({recordings.ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
     form = "PNG" if pages[0].codec == "png" else "TIFF"
@@ -254,8 +258,9 @@ def _pages(path: Path) -> list[_Page]:
             raise ValueError(f"{label}. Must end within its {size}.")
         return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
     if stated not in {0, 1, len(pages)}:  # 1 of a file to which frames were appended
-        label = f"Truncated TIFF '{path.name}': {len(pages)} pages"
-        raise ValueError(f"{label}. Must be the {stated} that its description states.")
+        state = "Truncated" if len(pages) < stated else "Invalid"
+        rule = f"Must be the {stated} that its description states, of one band"
+        raise ValueError(f"{state} TIFF '{path.name}': {len(pages)} pages. {rule}.")
     return pages
 
 

@@ -62,7 +62,7 @@ def two_bands(
     Warns
     -----
     UserWarning
-        If the counts of all bands read as the same temperatures in hundredths of a degree.
+        If the counts of all bands read as the same temperatures, in hundredths or tenths.
 
     Examples
     --------
@@ -168,14 +168,14 @@ def _border(counts: npt.NDArray[np.uint16], name: str) -> str:
 
 
 def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
-    """Sentence on counts of two cameras that read as the same temperatures in hundredths."""
+    """Sentence on counts that read as the same temperatures, in hundredths or tenths."""
     samples = [counts[:: 1 + len(counts) // _FRAMES].ravel() for counts in films]
     low, middle, high = np.percentile(samples, [1, 50, 99], axis=1)
-    for zero, unit in ((0.0, "degC"), (zero_Celsius, "K")):
-        plausible = np.all((low >= 100 * (zero + _SCENE[0])) & (high <= 100 * (zero + _SCENE[1])))
-        if plausible and np.ptp(middle) < 100 * _ALIKE:
-            medians = " and ".join(f"{median / 100:.1f}" for median in middle)
-            label = f"The medians of the bands, over 100, are temperatures: {medians} {unit}"
+    for scale, zero, unit in ((100, 0.0, "degC"), (100, zero_Celsius, "K"), (10, 0.0, "degC")):
+        least, most = (scale * (zero + limit) for limit in _SCENE)
+        if np.all((low >= least) & (high <= most)) and np.ptp(middle) < scale * _ALIKE:
+            medians = " and ".join(f"{median / scale:.1f}" for median in middle)
+            label = f"The medians of the bands, over {scale}, are temperatures: {medians} {unit}"
             rule = "Must be counts of the detector; should these be alike by chance, go on"
             return [f"{label}. {rule}."]
     return []
@@ -187,10 +187,8 @@ def _check(recording: xr.Dataset, name: str) -> None:
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:
             actual = recording[variable].dims if variable in recording else "nothing"
-            raise ValueError(
-                f"Invalid recording of band '{name}': '{variable}' is {actual}. Must be {dims}, as "
-                "from a reader of recordings."
-            )
+            label, rule = f"'{variable}' is {actual}", f"Must be {dims}, as from a reader"
+            raise ValueError(f"Invalid recording of band '{name}': {label}. {rule}.")
         array, label = recording[variable], f"'{variable}' of band '{name}'"
         if variable in {"counts", "frame_flags"}:
             if (array.dtype.kind, array.dtype.itemsize) != ("u", 2):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import IO, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +37,21 @@ _NETCDF_HEADER: Final = 2**20  # at most [byte]
 _MOST_DIMS: Final = 32  # of a variable
 
 
-class Stream(NamedTuple):
+class Unread:
+    """Array of a file, read when it is used."""
+
+    shape: tuple[int, ...]
+    values: Any
+    ndim = property(lambda self: len(self.shape))
+    size = property(lambda self: math.prod(self.shape))
+
+    def __getitem__(self, place: Any) -> Any:
+        """Numbers at a place."""
+        return self.values[place]
+
+
+@dataclass(frozen=True)
+class Stream(Unread):
     """Array of NumPy's format, whose numbers follow in a stream."""
 
     stream: IO[bytes]
@@ -45,6 +59,12 @@ class Stream(NamedTuple):
     shape: tuple[int, ...]
     by_columns: bool
     dtype: np.dtype[Any]
+
+    @cached_property
+    def values(self) -> Any:
+        """Numbers of a line."""
+        content = self.stream.read(self.size * self.dtype.itemsize)
+        return np.frombuffer(content, self.dtype, self.size)
 
     def counts(self) -> npt.NDArray[Any]:
         """Counts, which must end where the header says."""
@@ -61,29 +81,27 @@ class Stream(NamedTuple):
         return counts.T if self.by_columns else counts
 
 
-def numpy_array(path: Path, name: str | None, stack: ExitStack) -> Stream:
-    """Array of a .npy or of a .npz, whose checksums must be right, behind its header."""
-    stream: IO[bytes] = stack.enter_context(path.open("rb"))
-    is_archive = stream.read(2) == b"PK"
-    stream.seek(0)
-    if is_archive:
-        archive = stack.enter_context(zipfile.ZipFile(stream))
-        members = archive.namelist()
-        if not all(member.endswith(".npy") for member in members):
+def numpy_arrays(path: Path, stack: ExitStack) -> dict[str, Any]:
+    """Arrays of a .npz, whose checksums must be right, by name, behind their headers."""
+    archive, listed = stack.enter_context(zipfile.ZipFile(path)), dict[str, Any]()
+    recordings.check_pieces(len(archive.namelist()), path.stat().st_size, f"files in '{path.name}'")
+    for member in archive.infolist():
+        name = member.filename.removesuffix(".npy")
+        if name == member.filename:
             rule = "Must hold arrays of NumPy alone: unpack it"
-            raise ValueError(f"Invalid files {members[:3]} in '{path.name}'. {rule}.")
-        names = [member.removesuffix(".npy") for member in members]
-        member = archive.infolist()[names.index(recordings.array_name(names, name, path))]
+            raise ValueError(f"Invalid file '{name}' in '{path.name}'. {rule}.")
         if member.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
             label = f"compression {member.compress_type} of '{member.filename}' of '{path.name}'"
             raise ValueError(f"Invalid {label}. Must be none or deflate, as of NumPy.")
-        stream = stack.enter_context(archive.open(member))
-    version = np.lib.format.read_magic(stream)
-    read, width = {
-        (1, 0): (np.lib.format.read_array_header_1_0, 2),
-        (2, 0): (np.lib.format.read_array_header_2_0, 4),
-    }[version]
-    start = stream.read(width)
+        listed[name] = numpy_array(path, stack.enter_context(archive.open(member)))
+    return {name: array for name, array in listed.items() if array.ndim == 3 or array.dtype != "O"}
+
+
+def numpy_array(path: Path, stream: IO[bytes]) -> Stream:
+    """Array in NumPy's format, behind its header."""
+    major, minor = np.lib.format.read_magic(stream)
+    read = getattr(np.lib.format, f"read_array_header_{major}_{minor}")
+    start = stream.read(2 * major)
     if (length := int.from_bytes(start, "little")) > _NUMPY_HEADER:
         raise ValueError(f"Header of {length} bytes. Must be at most {_NUMPY_HEADER}.")
     with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
@@ -91,8 +109,8 @@ def numpy_array(path: Path, name: str | None, stack: ExitStack) -> Stream:
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Array of a file, read when it is used."""
+class Numbers(Unread):
+    """Array of a file of MATLAB."""
 
     path: Path
     name: str
@@ -103,15 +121,8 @@ class Numbers:
     begin: int  # of the numbers in the variable, as it is unpacked [byte]
     whole: int  # length of the variable, unpacked [byte]; 0 if it is not packed
 
-    ndim = property(lambda self: len(self.shape))
-    size = property(lambda self: math.prod(self.shape))
-
-    def __getitem__(self, place: Any) -> Any:
-        """Numbers at a place."""
-        return self._values[place]
-
     @cached_property
-    def _values(self) -> Any:
+    def values(self) -> Any:
         """All numbers."""
         place, length = self.span
         if not self.whole:

@@ -1,10 +1,9 @@
 """Files and folders that appear whole under their names, and belong to one process meanwhile.
 
 What is written lies in a hidden folder beside its place until it is whole and on the disk; then it
-is renamed. Signals that end the program are raised as errors, so that it is ended first. A file
-system may write names and contents in any order: after a power loss a renamed file may have its new
-name and no content. So the new content is synced first, then it is renamed, then the folder that
-holds the name is synced.
+is renamed. Signals that end the program are raised as errors, so that it is ended first. After a
+power loss a renamed file may have its new name and no content: so the content is synced first, then
+it is renamed, then the folder that holds the name is synced.
 """
 
 import errno
@@ -50,9 +49,10 @@ def check_place(path: str | Path, suffix: str) -> Path:
     path = texts.as_path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
-    if path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir()):
-        rule = "Must be a store of dbthermal, which is replaced, an empty folder, or none"
-        raise ValueError(f"Foreign folder '{path}'. {rule}: delete it if it is not needed.")
+    foreign = path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir())
+    if foreign or (suffix == ".zarr" and path.is_file()):
+        rule = "Must be a store of dbthermal, an empty folder, or none: delete what is not needed"
+        raise ValueError(f"Foreign {'folder' if foreign else 'file'} '{path}'. {rule}.")
     if path.is_dir() and os.name != "nt":
         folder = os.open(path, os.O_RDONLY)
         try:

@@ -102,7 +102,9 @@ def test_zarr_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_another_reader_is_named(tmp_path: Path) -> None:
-    """A file of a format that another reader opens says which."""
+    """A file of a format that another reader opens says which; a folder is named by its files."""
+    with pytest.raises(ValueError, match=r"Invalid folder .* Must be files: .*/\*\.tif"):
+        readers.tiff(tmp_path, unit="count", clock=10.0)
     np.save(tmp_path / "a.npy", scene())
     (tmp_path / "a.seq").write_bytes(sequence(scene()))
     tifffile.imwrite(tmp_path / "a.tif", scene(), photometric="minisblack")

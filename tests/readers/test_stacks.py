@@ -72,6 +72,8 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
     assert_array_equal(read(paths).counts, scene())
     with pytest.raises(ValueError, match=r"numbers of 'frame8\.tif' do not rise"):
         read(sorted(paths))
+    with pytest.raises(ValueError, match=r"'b\.tif' are those of the file before, or none"):
+        read([tmp_path / "a.tif", tmp_path / "b.tif"])
     write(paths[1], scene()[0, :-1])
     with pytest.raises(ValueError, match=r"Invalid page of \(23, 32\) in 'frame9\.tif'"):
         read(paths)
@@ -81,13 +83,63 @@ def test_numbers_that_are_left_out_are_gaps_in_time(tmp_path: Path) -> None:
     """Frames of one file each that are missing by their numbers leave a gap, with a warning."""
     names = [f"run2_{number}" for number in (10, 12, 14, 20, 22)]
     paths = [tmp_path / f"{name}.tif" for name in names]
-    for path in paths:
-        write(path, scene()[0])
+    for path, image in zip(paths, scene(5), strict=True):
+        write(path, image)
     with pytest.warns(UserWarning, match=r"'run2_10.tif to run2_22.tif' leave out 2 frames"):
         made = read(paths)
     assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.5, 0.6], atol=1e-9)  # [s]
     assert_array_equal(made["frame_flags"] > 0, [False, False, False, True, False])
     assert_allclose(read(paths[:3])["exposure_time"], [0.0, 0.1, 0.2])  # every second one
+
+
+def test_a_stack_that_is_left_out_is_a_gap_in_time(tmp_path: Path) -> None:
+    """So is a whole stack of a recording in parts; one of two bands is not called truncated."""
+    paths = [tmp_path / f"rec_{number}.tif" for number in (1, 2, 4)]
+    for path, frames in zip(paths, (3, 3, 2), strict=True):
+        write(path, scene(frames) + np.uint16(path.stem[-1]))
+    with pytest.warns(UserWarning, match=r"'rec_1\.tif to rec_4\.tif' leave out 3 frames"):
+        made = read(paths)
+    assert_allclose(made["exposure_time"] * 10.0, [0, 1, 2, 3, 4, 5, 9, 10], atol=1e-9)  # [frame]
+    with tifffile.TiffWriter(tmp_path / "two.tif") as file:
+        for band in (scene(), scene() + np.uint16(1)):
+            file.write(band, photometric="minisblack")
+    with pytest.raises(ValueError, match=r"Invalid TIFF .* 6 pages\. Must be the 3 .* one band"):
+        read(tmp_path / "two.tif")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "a_20241027_1559{:06.3f}",
+        "2024-10-27T15.59.{:06.3f}",
+        "17300400{:06.3f}",
+        "a17300400{:06.0f}",
+    ],
+)
+def test_dates_in_names_are_gaps_in_time(tmp_path: Path, form: str) -> None:
+    """So are dates, and seconds since 1970, which jitter; a counter behind a date is none."""
+    scale = 1e3 if form.endswith(":06.0f}") else 1.0
+    seconds = [57.0, 57.102, 57.199, 57.601, 57.7]
+    paths = [tmp_path / f"{form.format(scale * second)}.tif" for second in seconds]
+    for path, image in zip(paths, scene(5), strict=True):
+        write(path, image)
+    with pytest.warns(UserWarning, match="leave out 3 frames"):
+        made = read(paths)
+    assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.6, 0.7], atol=1e-9)  # [s]
+
+
+def test_names_without_gaps(tmp_path: Path) -> None:
+    """Full minutes, counters behind dates, and dates that are none; a copy is warned of."""
+    whole = [f"20241027_{time}" for time in (155958, 155959, 160000, 160001)]
+    counted = [f"20241027_155958_{number:03}" for number in (7, 8, 9)] + ["20241027_155959_010"]
+    for names in (whole, counted, [f"20249999_15595{second}_{second}" for second in range(4)]):
+        paths = [tmp_path / f"{name}.tif" for name in names]
+        for path, image in zip(paths, scene(4), strict=True):
+            write(path, image)
+        assert_allclose(read(paths)["exposure_time"], [0.0, 0.1, 0.2, 0.3])
+    write(paths[2], scene()[1])
+    with pytest.warns(UserWarning, match=r"Same counts in '.*_1\.tif' and '.*_2\.tif', 1 in all"):
+        read(paths)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -218,6 +270,7 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
         (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
         (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
+        (scene(1)[0], {"subfiletype": 1}, "Invalid preview True of page 0"),
         (scene() // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
         (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
         (0 * scene(), {}, "Invalid counts of 'a.tif': all are 0. Must be 16-bit counts"),

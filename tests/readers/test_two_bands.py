@@ -69,13 +69,15 @@ def test_one_camera_twice_is_refused(pair: tuple[xr.Dataset, xr.Dataset]) -> Non
         readers.two_bands(pair[0], pair[0].isel(time=slice(30)), bands=BANDS)
 
 
-@pytest.mark.parametrize(("zero", "unit"), [(0.0, "degC"), (273.15, "K")])
-def test_temperatures_in_hundredths_are_doubted(zero: float, unit: str) -> None:
+@pytest.mark.parametrize(
+    ("scale", "zero", "unit"), [(100, 0.0, "degC"), (100, 273.15, "K"), (10, 0.0, "degC")]
+)
+def test_temperatures_in_hundredths_are_doubted(scale: int, zero: float, unit: str) -> None:
     """Whole numbers that read as one temperature in both bands are warned of, others are not."""
     kelvin = zero + np.random.default_rng(1).normal(30.0, 2.0, (40, 6, 8))
-    counts = [np.rint(100 * (kelvin + apart)).astype(np.uint16) for apart in (0.0, 1.5, 20.0)]
+    counts = [np.rint(scale * (kelvin + apart)).astype(np.uint16) for apart in (0.0, 1.5, 20.0)]
     one, same, other = (readers.array(part, unit="count", clock=10.0) for part in counts)
-    with pytest.warns(UserWarning, match=rf"over 100, are temperatures: .* {unit}\. Must be"):
+    with pytest.warns(UserWarning, match=rf"over {scale}, are temperatures: .* {unit}\. Must be"):
         readers.two_bands(one, same, bands=BANDS, offset=0.0)
     readers.two_bands(one, other, bands=BANDS, offset=0.0)
 
