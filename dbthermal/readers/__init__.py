@@ -12,14 +12,5 @@ from dbthermal.readers._spectra import ecostress
 from dbthermal.readers._stacks import tiff
 from dbthermal.readers._two_bands import two_bands
 
-__all__ = [
-    "array",
-    "ecostress",
-    "flir",
-    "raw",
-    "read_yaml",
-    "sequence",
-    "tiff",
-    "two_bands",
-]
+__all__ = ["array", "ecostress", "flir", "raw", "read_yaml", "sequence", "tiff", "two_bands"]
 __dir__ = __all__.copy

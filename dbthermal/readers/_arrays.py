@@ -10,9 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal.readers import _containers as containers
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _containers, _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock
 
 # Names of dims by their place, and those of an array without names, of any case.
@@ -36,7 +34,14 @@ def array(
 
     The format is that of the first bytes. Pickled objects are never loaded, and nothing is taken
     from another file. HDF5 and zarr may be without checksums; damage of their values is then not
-    seen, as in any copy. An array that another library has opened may be lazy.
+    seen, as in any copy. An array that another library has opened may be lazy. The result is as
+    from `tiff`.
+
+    FileNotFoundError if the file does not exist; ImportError if h5py, the extra ``recordings``, is
+    not installed for HDF5, which NetCDF 4 is too; TypeError or ValueError if a file is of another
+    format, or damaged; the array is not one of three dimensions and uint16, has other dims, is
+    scaled, lacks values, has times that the clock contradicts, or is not in the file; as `tiff` for
+    unit, clock, memory and 8 bits.
 
     Parameters
     ----------
@@ -50,22 +55,6 @@ def array(
         As for `tiff`; an array's own ``units``, and its times to half a frame, must agree. Without
         a clock its times are taken; those without a unit are seconds if the rate is 1 to 1000 Hz.
 
-    Returns
-    -------
-    Dataset
-        As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ImportError
-        If h5py, the extra ``recordings``, is not installed for HDF5, which NetCDF 4 is too.
-    TypeError, ValueError
-        If a file is of another format, or damaged; the array is not one of three dimensions and
-        uint16, has other dims, is scaled, lacks values, has times that the clock contradicts, or is
-        not in the file; as `tiff` for unit, clock, memory and 8 bits.
-
     Examples
     --------
     >>> import numpy as np
@@ -76,47 +65,47 @@ def array(
     # Unit and memory, before a file is opened.
     is_file = isinstance(source, str | Path)
     label = Path(source).name if isinstance(source, str | Path) else "array"
-    recordings.check_unit(unit, label)
-    recordings.check_number(memory, "memory")
-    (path,) = formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
+    _recording.check_unit(unit, label)
+    _recording.check_number(memory, "memory")
+    (path,) = _formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
     inside = path.rglob("*") if path.is_dir() else [path]
     stored = sum(file.lstat().st_size for file in inside) if is_file else np.inf
     with ExitStack() as stack:
         # The array and its times, which are checked before it is read.
         values: Any = source
         if is_file:
-            values, lines = containers.opened(path, name, stack)
+            values, lines = _containers.opened(path, name, stack)
         else:
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            lines = [axis for axis in coords if containers.are_times(axis.name, axis)][:1]
+            lines = [axis for axis in coords if _containers.are_times(axis.name, axis)][:1]
         attributes = _checked(values, label, unit)
-        recordings.check_memory(getattr(values, "shape", ()), memory, label, stored)
+        _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
         for times in lines:
             seconds = _seconds(times, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
         if clock is None:
-            recordings.stamps(clock, 0, label)  # refuses it
-        read = containers.read(values, path) if is_file else recordings.film(values)
+            _recording.stamps(clock, 0, label)  # refuses it
+        read = _containers.read(values, path) if is_file else _recording.film(values)
     counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
     judged = is_file and any(np.any(frame & 0xFF) for frame in counts)
-    if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
+    if judged and _recording.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
-    recordings.check_present(counts, fills, label)
+    _recording.check_present(counts, fills, label)
     assert clock is not None
-    return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
+    return _recording.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
 def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     """Attributes of an array, not yet read, whose dims, scale, type and unit are of counts."""
-    for dim, names in zip(containers.dims_of(values), _DIMS, strict=False):
+    for dim, names in zip(_containers.dims_of(values), _DIMS, strict=False):
         if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
             rule = "Must be (time, y, x): rename or transpose"
-            raise ValueError(f"Invalid dims {containers.dims_of(values)} of '{label}'. {rule}.")
-    texts = {name: containers.attribute(values, name) for name in _ATTRIBUTES}
+            raise ValueError(f"Invalid dims {_containers.dims_of(values)} of '{label}'. {rule}.")
+    texts = {name: _containers.attribute(values, name) for name in _ATTRIBUTES}
     attributes = {name: text for name, text in texts.items() if text is not None}
     for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
         if attributes.get(scale, neutral) != neutral:
@@ -128,7 +117,7 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
         rule = "Must be uint16: counts, neither temperatures nor objects; convert whole numbers"
         raise ValueError(f"Invalid dtype {dtype} of '{label}'. {rule}.")
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
-    recordings.check_unit(unit if text in {"", "1"} else text, label)
+    _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
 
 
@@ -137,8 +126,8 @@ def _seconds(times: Any, frames: int, clock: Clock | None, label: str, path: Pat
     if times.size != frames:
         rule = f"Must be {frames}, one for each frame"
         raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
-    containers.check_whole(times, path)
-    if (moments := containers.moments(times)) is None:
+    _containers.check_whole(times, path)
+    if (moments := _containers.moments(times)) is None:
         return clock
-    unit = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
-    return recordings.check_times(moments, str(unit or ""), clock, label)
+    unit = "s" if times.dtype.kind in "OSU" else _containers.attribute(times, "units")
+    return _recording.check_times(moments, str(unit or ""), clock, label)

@@ -1,10 +1,8 @@
 """Reader of spectra, of the ECOSTRESS library.
 
-A spectrum is a Dataset with `emissivity` (wavelength) [1], wavelength [m] increasing, and in its
-attributes what the library says of the sample (`NOTES`, empty where it is silent), the file's name
-(`source`) and the number of values outside [0, 1] (`unphysical_values`). Those come from the
-calibration of the library's spectrometers and are kept as they are. An emissivity outside
-`schema.EMISSIVITY_LIMITS` is no measurement, but a wrong unit or a damaged file, and is refused.
+Values outside [0, 1], from the calibration of the library's spectrometers, are kept as they are and
+counted (`unphysical_values`). One outside `schema.EMISSIVITY_LIMITS` is no measurement, but a wrong
+unit or a damaged file, and is refused.
 """
 
 import re
@@ -16,24 +14,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal import _text as texts
-from dbthermal import schema
+from dbthermal import _text, schema
 from dbthermal._arrays import Array
 
-NOTES: Final = MappingProxyType(
-    {
-        "name": "Name",
-        "type": "Type",
-        "class": "Class",
-        "subclass": "Subclass",
-        "genus": "Genus",
-        "species": "Species",
-        "particle_size": "Particle Size",
-        "sample_no": "Sample No.",
-        "measurement": "Measurement",
-        "description": "Description",
-    }
+_KEYS: Final = (
+    *("Name", "Type", "Class", "Subclass", "Genus", "Species", "Particle Size", "Sample No."),
+    *("Measurement", "Description"),
 )
+NOTES: Final = MappingProxyType({key.lower().rstrip(".").replace(" ", "_"): key for key in _KEYS})
 """Attribute of a spectrum -> key in the header of an ECOSTRESS file."""
 
 _HEADER_RULES: Final = {
@@ -50,6 +38,10 @@ def ecostress(path: str | Path) -> xr.Dataset:
     law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
     number of values, first and last wavelength.
 
+    OSError if the file cannot be opened; ValueError if it is truncated or longer than declared, is
+    no hemispherical reflectance in percent over micrometres, an emissivity is outside
+    `schema.EMISSIVITY_LIMITS`, or a wavelength is outside 0.001 to 1000 um or out of order.
+
     Parameters
     ----------
     path : str or Path
@@ -60,15 +52,6 @@ def ecostress(path: str | Path) -> xr.Dataset:
     Dataset
         `emissivity` (wavelength) [1] over wavelength [m]; attributes: what the library says of the
         sample (``name``, ``class``, ...), ``source`` and ``unphysical_values``.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-    ValueError
-        If it is truncated or longer than declared, is no hemispherical reflectance in percent over
-        micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
-        0.001 to 1000 um or out of order.
 
     References
     ----------
@@ -89,21 +72,19 @@ def ecostress(path: str | Path) -> xr.Dataset:
     ...     ecostress(path).emissivity.values.tolist()
     [0.96, 0.75, 0.9]
     """
-    path = texts.as_path(path)
-    lines = texts.whole_lines(texts.read_text(path, encoding="latin-1"), path.name)
+    path = _text.as_path(path)
+    lines = _text.whole_lines(_text.read_text(path, encoding="latin-1"), path.name)
     blank = next((i for i, line in enumerate(lines) if not line.strip()), len(lines))
     header = _header(lines[:blank], path)
     rows = [(i, line.split()) for i, line in enumerate(lines, 1) if i > blank and line.strip()]
-    wavelength, reflectance = texts.numbers(rows, 2, path.name).T
+    wavelength, reflectance = _text.numbers(rows, 2, path.name).T
     stated = {"Number of X Values": wavelength.size}
     stated |= {"First X Value": wavelength[0], "Last X Value": wavelength[-1]}
     for key, value in stated.items():
         declared = header.get(key, "")
-        if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
-            raise ValueError(
-                f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'. "
-                "Must be equal."
-            )
+        if not abs(_text.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
+            label = f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'"
+            raise ValueError(f"{label}. Must be equal.")
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
     return spectrum(wavelength, 1 - reflectance / 100, notes, File(path.name, rows))
 
@@ -112,11 +93,11 @@ class File(NamedTuple):
     """Name and rows of a table."""
 
     name: str
-    rows: Sequence[texts.Row]
+    rows: Sequence[_text.Row]
 
     def at(self, index: np.integer[Any]) -> str:
         """Place of a row in the file."""
-        return texts.at(self.name, self.rows[int(index)][0])
+        return _text.at(self.name, self.rows[int(index)][0])
 
 
 def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
@@ -125,8 +106,8 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
         key, colon, text = line.partition(":")
         if not colon or key.strip() in header:
             rule = "Must be a key that is listed once, a colon and a text"
-            place = texts.at(path.name, number)
-            raise ValueError(f"{place}: Invalid header {texts.shown(line)}. {rule}.")
+            place = _text.at(path.name, number)
+            raise ValueError(f"{place}: Invalid header {_text.shown(line)}. {rule}.")
         header[key.strip()] = " ".join(text.split())
     for key, rule in _HEADER_RULES.items():
         if not re.search(rule, text := header.get(key, ""), re.IGNORECASE):
@@ -155,11 +136,8 @@ def spectrum(
     # Spectrum over rising wavelengths.
     if falling:
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
-    unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
-    attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
-    coordinate = ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)
-    return xr.Dataset(
-        schema.variables("spectrum", {"emissivity": emissivity}),
-        {"wavelength": coordinate},
-        {**attrs, "unphysical_values": unphysical},
-    )
+    attrs: dict[str, Any] = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
+    attrs["unphysical_values"] = int(np.sum((emissivity < 0) | (emissivity > 1)))
+    axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
+    variables = schema.variables("spectrum", {"emissivity": emissivity})
+    return xr.Dataset(variables, axes, attrs)

@@ -34,6 +34,12 @@ def two_bands(
     Each band keeps its own frames and times; nothing is interpolated. `alignment.time_offset` and
     `alignment.align` bring all onto one clock: cameras' dates are hardly ever right to a frame.
 
+    TypeError or ValueError if a recording is not one of counts in one band, or its times are
+    unknown, infinite or fall; bands are not different names, one for each; sizes differ; an offset
+    is no number, or there is none and no date; recordings do not overlap in time, or hold the same
+    counts. UserWarning if those of all bands read as the same temperatures in hundredths of a
+    degree.
+
     Parameters
     ----------
     first, second, *further : Dataset
@@ -51,18 +57,6 @@ def two_bands(
         (band, time). Shorter bands are filled with their last frame, flagged ``padded``, without a
         time; `time` is the clock of the longest one. ``files`` has all recordings' attributes as a
         mapping by band. Copies the counts: twice their memory is needed.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a recording is not one of counts in one band, or its times are unknown, infinite or fall;
-        bands are not different names, one for each; sizes differ; an offset is no number, or there
-        is none and no date; recordings do not overlap in time, or hold the same counts.
-
-    Warns
-    -----
-    UserWarning
-        If the counts of all bands read as the same temperatures in hundredths of a degree.
 
     Examples
     --------
@@ -187,10 +181,8 @@ def _check(recording: xr.Dataset, name: str) -> None:
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:
             actual = recording[variable].dims if variable in recording else "nothing"
-            raise ValueError(
-                f"Invalid recording of band '{name}': '{variable}' is {actual}. Must be {dims}, as "
-                "from a reader of recordings."
-            )
+            message = f"Invalid recording of band '{name}': '{variable}' is {actual}"
+            raise ValueError(f"{message}. Must be {dims}, as from a reader of recordings.")
         array, label = recording[variable], f"'{variable}' of band '{name}'"
         if variable in {"counts", "frame_flags"}:
             if (array.dtype.kind, array.dtype.itemsize) != ("u", 2):
